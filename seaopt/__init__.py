@@ -1,0 +1,4 @@
+"""seaopt."""
+from seaopt.plants import *
+from seaopt.parameters import *
+from seaopt import plants

@@ -1,0 +1,118 @@
+"""The virtual test stand: a log of any plant, as sensors would record it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.bench.excitation import Excitation, excite
+from seaopt.errors import SimulationError, suggestion
+from seaopt.logs import Log
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.signals import Signal
+from seaopt.simulation import simulate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensors:
+    """What the sensors do to each output, by name; what is left out is ideal.
+
+    Parameters
+    ----------
+    noise_std : mapping
+        White Gaussian noise, in the output's unit.
+    offset : mapping
+        A constant added.
+    quantisation : mapping
+        The step that readings are rounded to.
+    saturation : mapping
+        Readings are clipped to plus and minus this.
+    """
+
+    noise_std: Mapping[str, float] = field(default_factory=dict[str, float])
+    offset: Mapping[str, float] = field(default_factory=dict[str, float])
+    quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
+    saturation: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    def read(
+        self, name: str, values: Float[np.ndarray, " n"], rng: np.random.Generator
+    ) -> Float[np.ndarray, " n"]:
+        """Return what the sensor of one output records."""
+        out = values + self.offset.get(name, 0.0) + self.noise_std.get(name, 0.0) * rng.normal(size=values.size)
+        limit, step = self.saturation.get(name), self.quantisation.get(name)
+        if limit is not None:
+            out = np.clip(out, -limit, limit)
+        return step * np.round(out / step) if step else out
+
+
+def virtual_log(
+    plant: Plant,
+    params: ParameterSet,
+    excitation: Excitation,
+    *,
+    duration_s: float,
+    rate_hz: float,
+    seed: int,
+    sensors: Sensors | None = None,
+    initial_state: Mapping[str, float] | None = None,
+    input_name: str | None = None,
+) -> Log:
+    """Record a virtual experiment.
+
+    Parameters
+    ----------
+    plant, params
+        The actuator on the bench and its true parameters.
+    excitation : tuple of Chirp, Noise
+        Summed, held between samples, fed to one input.
+    duration_s, rate_hz : float
+        Length and sample rate.
+    seed : int
+        Of the excitation's noise and the sensors'; the same seed gives the same log.
+    sensors : Sensors, optional
+        Ideal ones if left out.
+    initial_state : mapping, optional
+        At rest at zero where left out.
+    input_name : str, optional
+        The input that is excited; the plant's first if left out. The others are zero.
+
+    Returns
+    -------
+    Log
+        The inputs and every output of the plant.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.bench import PAPER_STAND
+    >>> log = virtual_log(so.plants.high_impedance(), so.plants.thor(), PAPER_STAND, duration_s=1, rate_hz=400, seed=1)
+    >>> len(log), sorted(log.signals)
+    (400, ['F1', 'F2', 'I', 'q'])
+    """
+    devices = sensors if sensors is not None else Sensors()
+    for group in (devices.noise_std, devices.offset, devices.quantisation, devices.saturation):
+        for name, value in group.items():
+            if name not in plant.outputs:
+                raise SimulationError(f'sensor of "{name}": no such output; {suggestion(name, plant.outputs)}')
+            if group is not devices.offset and value < 0.0:
+                raise SimulationError(f"sensor of {name}: {value:g} is negative; give zero or more")
+    excited = input_name if input_name is not None else next(iter(plant.inputs))
+    if excited not in plant.inputs:
+        raise SimulationError(f'input "{excited}" is not one of the plant; {suggestion(excited, plant.inputs)}')
+    streams = np.random.default_rng(seed).spawn(1 + len(plant.outputs))
+    time, drive = excite(excitation, duration_s=duration_s, rate_hz=rate_hz, rng=streams[0])
+    inputs = {name: drive if name == excited else np.zeros(time.size) for name in plant.inputs}
+    commanded = Log(
+        time=time,
+        signals={name: Signal(name=name, values=values, unit=plant.inputs[name]) for name, values in inputs.items()},
+        source=f"virtual {plant.name}",
+    )
+    truth = simulate(plant, params, commanded, initial_state=initial_state)
+    signals = dict(commanded.signals)
+    for stream, (name, unit) in zip(streams[1:], plant.outputs.items(), strict=True):
+        signals[name] = Signal(name=name, values=devices.read(name, truth[name], stream), unit=unit)
+    return Log(time=time, signals=signals, source=f"virtual {plant.name}, seed {seed}")

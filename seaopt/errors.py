@@ -1,0 +1,75 @@
+"""Errors that say what was wrong, with which value, and what to do about it.
+
+Every error that bad input can cause is a `SeaoptError`. Its text names the argument, the value and the
+remedy, on one line; the command line prints that line and exits with 2.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SeaoptError(Exception):
+    """Bad input, or a question that has no answer; the message is one line and says what to do.
+
+    Examples
+    --------
+    >>> raise SeaoptError("bandwidth_hz = 80 is outside 15 to 60; choose one inside, or give bandwidth_range_hz")
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.SeaoptError: bandwidth_hz = 80 is outside 15 to 60; choose one inside, or give bandwidth_range_hz
+    """
+
+
+class ParameterError(SeaoptError):
+    """A parameter is unknown, lacks a value, or lies outside its bounds."""
+
+
+class UnitError(SeaoptError):
+    """A unit is unknown or has the wrong dimension."""
+
+
+class PlantError(SeaoptError):
+    """A plant is not well defined, or is asked for something that it does not have."""
+
+
+class LogError(SeaoptError):
+    """A log cannot be read, or does not hold what is asked of it."""
+
+
+class SimulationError(SeaoptError):
+    """A simulation cannot be made, or left the numbers that can be trusted."""
+
+
+class EstimationError(SeaoptError):
+    """A fit is not well posed."""
+
+
+class ControlError(SeaoptError):
+    """A controller specification is contradictory or out of range."""
+
+
+class ProblemError(SeaoptError):
+    """A problem file is not valid."""
+
+
+class FileError(SeaoptError):
+    """A file cannot be read or written."""
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return what to say after an unknown `name`: the nearest known one, or all of them.
+
+    Examples
+    --------
+    >>> suggestion("bandwith_hz", ["bandwidth_hz", "measured"])
+    'did you mean "bandwidth_hz"?'
+    >>> suggestion("zzz", ["J", "b_r"])
+    'known: J, b_r'
+    """
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    if near:
+        return f'did you mean "{near[0]}"?'
+    return "known: " + (", ".join(names) if names else "none")

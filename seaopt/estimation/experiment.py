@@ -1,0 +1,148 @@
+"""An experiment: a plant, its log, and what is known about sensors, delay and initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from seaopt.errors import EstimationError, suggestion
+from seaopt.logs import Log
+from seaopt.parameters import Parameter
+from seaopt.plants import Plant
+from seaopt.simulation import Hold, Segment
+from seaopt.simulation.simulate import input_samples
+from seaopt.units import same_dimension
+
+InitialState = Literal["estimate", "rest"] | Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Experiment:
+    """One log of one plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        The model of what was on the bench.
+    log : Log
+        Channels with the names of the plant's inputs, and of the outputs that were measured.
+    name : str
+        For results and messages.
+    outputs : tuple of str
+        Measured outputs; every output of the plant that the log has, if empty.
+    sigma : mapping of output to float
+        Standard deviation of the sensor noise, in the output's unit; estimated where left out.
+    initial_state : "estimate", "rest" or mapping
+        Unknown in each segment; zero; or known (zero where left out).
+    offset : bool or mapping
+        One unknown offset an output; none; or known ones.
+    gain : mapping of output to float or Parameter
+        measured = gain * output + offset; 1 where left out. A free Parameter is estimated.
+    delay_s : float or Parameter
+        Of the input; a free Parameter is estimated.
+    hold : {"zero", "first"}
+        The input between samples: a command is held, a measured current is better drawn as a line.
+    gaps : {"split", "error"}
+        A gap in the log starts a new segment with its own initial state, or is an error.
+
+    Raises
+    ------
+    EstimationError
+        The log has no measured output or lacks an input, a unit has the wrong dimension, or a name is unknown.
+    """
+
+    plant: Plant
+    log: Log
+    name: str = "experiment"
+    outputs: tuple[str, ...] = ()
+    sigma: Mapping[str, float] = field(default_factory=dict[str, float])
+    initial_state: InitialState = "estimate"
+    offset: bool | Mapping[str, float] = True
+    gain: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
+    delay_s: float | Parameter = 0.0
+    hold: Hold = "zero"
+    gaps: Literal["split", "error"] = "split"
+
+    def __post_init__(self) -> None:
+        chosen = self.outputs or tuple(name for name in self.plant.outputs if name in self.log.signals)
+        if not chosen:
+            raise EstimationError(
+                f"experiment {self.name}: the log has none of the outputs of {self.plant.name} "
+                f"({', '.join(self.plant.outputs)}); name a channel after each measured output"
+            )
+        object.__setattr__(self, "outputs", chosen)
+        for name in chosen:
+            if name not in self.plant.outputs:
+                raise EstimationError(
+                    f'experiment {self.name}: output "{name}" is not one of {self.plant.name}; '
+                    f"{suggestion(name, self.plant.outputs)}"
+                )
+            self.log.signal(name)
+        self._check_units()
+        self._check_settings()
+
+    def _check_units(self) -> None:
+        for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
+            for name, unit in names.items():
+                found = self.log.signals[name].unit if name in self.log.signals else ""
+                if found and found != unit and not same_dimension(found, unit):
+                    raise EstimationError(
+                        f"experiment {self.name}: channel {name} is in {found}, but the {kind} of {self.plant.name} "
+                        f"is in {unit or 'no unit'}; correct the column's unit"
+                    )
+
+    def _check_settings(self) -> None:
+        known = {"sigma": self.sigma, "gain": self.gain, "offset": self.offset if self.offset is not True else {}}
+        for what, given in known.items():
+            for name in given if isinstance(given, Mapping) else ():
+                if name not in self.outputs:
+                    raise EstimationError(
+                        f'experiment {self.name}: {what} names "{name}", which is not a measured output; '
+                        f"{suggestion(name, self.outputs)}"
+                    )
+        for name, value in self.sigma.items():
+            if not 0.0 < value < np.inf:
+                raise EstimationError(
+                    f"experiment {self.name}: sigma of {name} = {value:g} is not positive; leave it out to estimate it"
+                )
+        if isinstance(self.initial_state, str):
+            if self.initial_state not in ("estimate", "rest"):
+                raise EstimationError(
+                    f'experiment {self.name}: initial_state = "{self.initial_state}" is not known; '
+                    'use "estimate", "rest" or a state-by-state mapping'
+                )
+        else:
+            for name in self.initial_state:
+                if name not in self.plant.states:
+                    raise EstimationError(
+                        f'experiment {self.name}: initial_state names "{name}", which is not a state of '
+                        f"{self.plant.name}; {suggestion(name, self.plant.states)}"
+                    )
+        if self.gaps == "error" and len(self.log.segments) > 1:
+            raise EstimationError(
+                f'experiment {self.name}: the log has {len(self.log.segments) - 1} gaps and gaps = "error"; '
+                'use gaps = "split", or slice_s to choose a stretch'
+            )
+
+    def segments(self, holdout: float = 0.0) -> list[Segment]:
+        """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""
+        u = input_samples(self.plant, self.log)
+        y = np.column_stack([self.log[name] for name in self.outputs])
+        clock = self.log.time - self.log.time[0]
+        used = np.repeat((clock <= (1.0 - holdout) * clock[-1])[:, None], y.shape[1], axis=1).astype(np.uint8)
+        return [
+            Segment(
+                u=np.ascontiguousarray(u[piece]),
+                y=np.ascontiguousarray(y[piece]),
+                keep=np.ascontiguousarray(used[piece]) if holdout else None,
+                start_s=float(self.log.time[piece.start]),
+            )
+            for piece in self.log.segments
+        ]
+
+    def renamed(self, name: str) -> Experiment:
+        """Return the experiment under another name."""
+        return replace(self, name=name)

@@ -1,0 +1,191 @@
+"""A first guess from frequency responses: where time-domain least squares starts when the given values are far off.
+
+The H1 estimate of each input-output pair is compared with the linearised plant, in log magnitude and phase, which has
+no local minima to speak of in inertias, stiffnesses and dampings. Candidates are drawn over two decades around the
+given values, screened, and the best are refined by Gauss-Newton with CasADi's derivatives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.errors import LogError
+from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.unknowns import Unknowns
+from seaopt.frequency import h1
+from seaopt.simulation import Model
+
+CANDIDATES = 128
+REFINED = 4
+POINTS = 60
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Target:
+    """A measured response of one input-output pair, and the linearised model of it."""
+
+    model: Model
+    index: list[int]
+    input: int
+    output: int
+    s: Complex[np.ndarray, " m"]
+    shift: Complex[np.ndarray, " m"]
+    log_response: Complex[np.ndarray, " m"]
+    weight: Float[np.ndarray, " m"]
+
+
+def first_guess(
+    experiments: tuple[Experiment, ...],
+    unknowns: Unknowns,
+    band_hz: tuple[float, float] | None,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, " n"] | None:
+    """Return the unknowns with shared parameters that match the frequency responses, or None.
+
+    None where no experiment has a usable response: several excited inputs, gaps, or no coherence.
+    """
+    targets = [target for e in range(len(experiments)) for target in _targets(experiments[e], unknowns, e, band_hz)]
+    if not targets:
+        return None
+    start = unknowns.start[: unknowns.shared]
+    low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
+    prior = unknowns.prior_std[: unknowns.shared]
+    spread = np.isinf(prior) & (start != 0.0)
+    best: tuple[float, Float[np.ndarray, " p"]] = (np.inf, start)
+    candidates = [start]
+    for _ in range(CANDIDATES):
+        factor = np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0)
+        candidates.append(np.clip(start * factor, low, high))
+    ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
+    for theta in ranked[:REFINED]:
+        cost, refined = _refine(targets, theta, low, high, spread)
+        if cost < best[0]:
+            best = (cost, refined)
+    guess = unknowns.start.copy()
+    guess[: unknowns.shared] = best[1]
+    return guess
+
+
+def _linearised(model: Model) -> Model:
+    """Return the model linearised at zero state and input."""
+    if model.linear:
+        return model
+    point = ca.vertcat(model.x, model.u)
+    both = ca.vertcat(model.f, model.h)
+    slope, constant = ca.substitute(
+        [ca.jacobian(both, point), both], [point, model.t], [ca.DM.zeros(point.numel()), ca.DM(0)]
+    )
+    rows: Any = ca.mtimes(slope, point) + constant
+    return replace(model, f=rows[: model.nx], h=rows[model.nx :], linear=True, functions={})
+
+
+def _targets(
+    experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None
+) -> list[_Target]:
+    log = experiment.log
+    active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
+    if len(active) != 1 or len(log.segments) != 1:
+        return []
+    model = _linearised(unknowns.models[e])
+    found: list[_Target] = []
+    for o, output in enumerate(experiment.outputs):
+        if not np.all(np.isfinite(log[output])):
+            continue
+        try:
+            estimate = h1(log[active[0]], log[output], log.period)
+        except LogError:
+            continue
+        low, high = band_hz if band_hz is not None else (0.0, np.inf)
+        f = estimate.frequency_hz
+        good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
+        if np.count_nonzero(good) < 8:
+            continue
+        chosen = _log_spaced(f, good)
+        delay = unknowns.locals_of[e].delay.value + (0.5 * log.period if experiment.hold == "zero" else 0.0)
+        s = 2j * np.pi * f[chosen]
+        found.append(
+            _Target(
+                model=model,
+                index=[unknowns.names.index(name) for name in model.free],
+                input=list(experiment.plant.inputs).index(active[0]),
+                output=o,
+                s=s,
+                shift=np.exp(-s * delay),
+                log_response=np.log(estimate.response[chosen]),
+                weight=1.0 / np.maximum(estimate.relative_std[chosen], 0.02),
+            )
+        )
+    return found
+
+
+def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
+    """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
+    candidates = np.flatnonzero(good)
+    grid = np.geomspace(f[candidates[0]], f[candidates[-1]], POINTS)
+    nearest = np.abs(np.log(f[candidates][None, :] / grid[:, None])).argmin(axis=1)
+    return candidates[np.unique(nearest)]
+
+
+def _misfit(targets: list[_Target], theta: Float[np.ndarray, " p"], derivatives: bool = False) -> tuple[float, Any, Any]:
+    """Return half the squared misfit, and its gradient and Gauss-Newton Hessian if asked."""
+    cost, gradient, hessian = 0.0, np.zeros(theta.size), np.zeros((theta.size, theta.size))
+    for target in targets:
+        nx = target.model.nx
+        g, dg = target.model.matrices(theta[target.index])
+        a, b = g[:nx, :nx], g[:nx, nx + target.input]
+        c, d = g[nx + target.output, :nx], g[nx + target.output, nx + target.input]
+        inner = target.s[:, None, None] * np.eye(nx) - a
+        try:
+            x = np.linalg.solve(inner, np.broadcast_to(b[:, None], (target.s.size, nx, 1)))[:, :, 0]
+        except np.linalg.LinAlgError:
+            return np.inf, gradient, hessian
+        response = (x @ c + d) * target.shift
+        if not np.all(np.isfinite(response)) or np.any(response == 0.0):
+            return np.inf, gradient, hessian
+        difference = np.log(response) - target.log_response
+        wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
+        r = target.weight * wrapped
+        cost += 0.5 * float(np.vdot(r, r).real)
+        if derivatives:
+            ct = np.linalg.solve(inner.transpose(0, 2, 1), np.broadcast_to(c[:, None], (target.s.size, nx, 1)))[:, :, 0]
+            columns = [
+                (x @ m[nx + target.output, :nx] + m[nx + target.output, nx + target.input])
+                + np.einsum("mi,ij,mj->m", ct, m[:nx, :nx], x)
+                + ct @ m[:nx, nx + target.input]
+                for m in dg
+            ]
+            j = (target.weight / response * target.shift)[:, None] * np.array(columns).T
+            gradient[target.index] += (j.conj().T @ r).real
+            hessian[np.ix_(target.index, target.index)] += (j.conj().T @ j).real
+    return cost, gradient, hessian
+
+
+def _refine(
+    targets: list[_Target], theta: Float[np.ndarray, " p"], low: Any, high: Any, spread: Any
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """Gauss-Newton in the logarithms of the parameters, damped."""
+    damping = 1e-2
+    cost, gradient, hessian = _misfit(targets, theta, derivatives=True)
+    for _ in range(25):
+        scale = np.where(spread, theta, 0.0)
+        h = hessian * np.outer(scale, scale)
+        h[np.diag_indices(theta.size)] += damping * np.diag(h) + 1e-9 * (1.0 + np.max(np.diag(h)))
+        step = np.clip(-np.linalg.solve(h, gradient * scale), -1.5, 1.5)
+        trial = np.clip(np.where(spread, theta * np.exp(step), theta), low, high)
+        trial_cost, trial_gradient, trial_hessian = _misfit(targets, trial, derivatives=True)
+        if trial_cost < cost:
+            small = cost - trial_cost < 1e-6 * cost
+            theta, cost, gradient, hessian = trial, trial_cost, trial_gradient, trial_hessian
+            damping = max(damping / 5, 1e-9)
+            if small:
+                break
+        else:
+            damping *= 8
+            if damping > 1e6:
+                break
+    return cost, theta

@@ -1,0 +1,128 @@
+r"""Nonlinear least squares from normal equations: Levenberg-Marquardt with bounds.
+
+At each iterate the step solves
+
+.. math:: (H + \lambda\,\mathrm{diag}(H))\, d = -g
+
+over the unknowns that are not held by a bound, with :math:`H = J^T J` and Marquardt's scaling (SIAM J. 11(2), 1963),
+is clipped to the bounds, and is taken if the cost falls; :math:`\lambda` follows Nielsen's rule (IMM-REP-1999-05).
+Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance to the minimum
+in standard deviations: the search ends when that distance is negligible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.estimation.residuals import Evaluation
+
+Status = Literal["converged", "max_iterations", "stalled"]
+Callback = Callable[[int, float], None]
+
+DECREMENT = 1e-6  # squared standard deviations still to go
+RELATIVE = 1e-12  # of the cost
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """Where the search ended."""
+
+    z: Float[np.ndarray, " n"]
+    evaluation: Evaluation
+    status: Status
+    message: str
+    iterations: int
+
+
+def minimise(
+    evaluate: Callable[[Float[np.ndarray, " n"]], Evaluation],
+    start: Float[np.ndarray, " n"],
+    low: Float[np.ndarray, " n"],
+    high: Float[np.ndarray, " n"],
+    *,
+    max_iterations: int = 50,
+    callback: Callback | None = None,
+) -> Solution:
+    """Minimise a sum of squares from `start`, inside the bounds.
+
+    Parameters
+    ----------
+    evaluate : callable
+        Cost, gradient and Gauss-Newton Hessian at a point.
+    start, low, high : array, shape (n,)
+        First point and bounds.
+    max_iterations : int
+        Evaluations after the first.
+    callback : callable, optional
+        Called with the iteration and the cost.
+    """
+    z = np.clip(start, low, high)
+    here = evaluate(z)
+    if not np.isfinite(here.cost):
+        message = "the simulation overflows at the first guess; start closer or check units"
+        return Solution(z=z, evaluation=here, status="stalled", message=message, iterations=0)
+    damping, growth = 1e-4, 2.0
+    for iteration in range(1, max_iterations + 1):
+        held = _held(z, here.gradient, low, high)
+        if _decrement(here, held) <= DECREMENT + RELATIVE * here.cost:
+            return Solution(
+                z=z, evaluation=here, status="converged", iterations=iteration - 1,
+                message="the minimum is nearer than a thousandth of a standard deviation",
+            )  # fmt: skip
+        trial = np.clip(z + _step(here, held, damping), low, high)
+        moved = trial - z
+        if not np.any(np.abs(moved) > 1e-15 * np.abs(z)):
+            return Solution(
+                z=z, evaluation=here, status="stalled", iterations=iteration,
+                message="no smaller step can be told from rounding, and the gradient is not zero",
+            )  # fmt: skip
+        predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved)
+        there = evaluate(trial)
+        ratio = (here.cost - there.cost) / predicted if predicted > 0.0 else -1.0
+        if np.isfinite(there.cost) and ratio > 1e-4:
+            z, here = trial, there
+            damping = max(damping * max(1.0 / 9.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-12)
+            growth = 2.0
+        else:
+            damping, growth = damping * growth * 2.0, growth * 2.0
+        if callback is not None:
+            callback(iteration, here.cost)
+    return Solution(
+        z=z, evaluation=here, status="max_iterations", iterations=max_iterations,
+        message=f"still moving after {max_iterations} iterations; raise max_iterations or start closer",
+    )  # fmt: skip
+
+
+def _held(
+    z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"], low: Float[np.ndarray, " n"],
+    high: Float[np.ndarray, " n"],
+) -> Bool[np.ndarray, " n"]:  # fmt: skip
+    """Tell which unknowns lie on a bound that descent would cross."""
+    return ((z <= low) & (gradient > 0.0)) | ((z >= high) & (gradient < 0.0))
+
+
+def _scaled(here: Evaluation, held: Bool[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"]]:
+    free = ~held
+    scale = np.sqrt(np.maximum(np.diag(here.hessian)[free], 1e-300))
+    return here.hessian[np.ix_(free, free)] / np.outer(scale, scale), scale
+
+
+def _decrement(here: Evaluation, held: Bool[np.ndarray, " n"]) -> float:
+    matrix, scale = _scaled(here, held)
+    g = here.gradient[~held] / scale
+    values, vectors = np.linalg.eigh(matrix)
+    seen = values > 1e-12 * max(values[-1], 1e-300) if values.size else np.zeros(0, dtype=bool)
+    return float(np.sum((vectors.T @ g)[seen] ** 2 / values[seen]))
+
+
+def _step(here: Evaluation, held: Bool[np.ndarray, " n"], damping: float) -> Float[np.ndarray, " n"]:
+    matrix, scale = _scaled(here, held)
+    damped = matrix + damping * np.eye(scale.size)
+    step = np.zeros(held.size)
+    step[~held] = -np.linalg.solve(damped, here.gradient[~held] / scale) / scale
+    return step

@@ -1,0 +1,282 @@
+"""The result of a fit: parameters with their uncertainty, what the data cannot tell, and how well it went."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import FileError
+from seaopt.estimation.covariance import Covariance, Identifiability
+from seaopt.estimation.experiment import Experiment
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.simulation import Clock, Point, make_model, run_pass
+
+SCHEMA = "seaopt/fit/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputFit:
+    """How well one output of one experiment is explained.
+
+    Parameters
+    ----------
+    fit_percent : float
+        100 (1 - |y - yhat| / |y - mean(y)|) over the samples used.
+    holdout_fit_percent : float or None
+        The same over the samples kept back; None if there are none.
+    rms_residual : float
+        Of the samples used, unfiltered, in `unit`.
+    sigma : float
+        The standard deviation that residuals were weighted with (of the filtered residual, with a band).
+    unit : str
+        The output's.
+    whiteness_p : float
+        Ljung-Box p-value of the weighted residual; small means coloured.
+    """
+
+    fit_percent: float
+    holdout_fit_percent: float | None
+    rms_residual: float
+    sigma: float
+    unit: str
+    whiteness_p: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nuisance:
+    """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment."""
+
+    delay_s: float
+    gain: dict[str, float]
+    offset: dict[str, float]
+    initial_state: tuple[dict[str, float], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Derived:
+    """A figure that follows from the parameters, with its standard deviation from the covariance."""
+
+    value: float
+    unit: str
+    std: float
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prediction:
+    """Measured and model outputs of an experiment on its clock; NaN where there is nothing."""
+
+    time: Float[np.ndarray, " n"]
+    inputs: dict[str, Float[np.ndarray, " n"]]
+    measured: dict[str, Float[np.ndarray, " n"]]
+    model: dict[str, Float[np.ndarray, " n"]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """What `fit` returns; ``print(fit)`` is a report.
+
+    Parameters
+    ----------
+    status : str
+        "converged", "max_iterations", "stalled" or "not_identifiable"; `message` says it in words.
+    parameters : ParameterSet
+        Every parameter of the plants, free ones with their std (infinite where not identifiable).
+    covariance : Covariance
+        Of the free parameters; posterior, and allowing for coloured residuals.
+    derived : mapping
+        Figures that follow from the parameters.
+    outputs : mapping of experiment to mapping of output to OutputFit
+    nuisance : mapping of experiment to Nuisance
+    identifiability : Identifiability
+    cost : float
+        Half the squared norm of the residuals in sigma, priors included.
+    iterations, samples : int
+        Least-squares iterations; samples that counted, all outputs together.
+    wall_s : float
+        Seconds from call to result.
+    step_error_sigma : float
+        Largest integration error in an output, in sigma; zero for linear plants, which are discretised exactly.
+    experiments : tuple of Experiment
+        The data; empty when read from a file.
+    """
+
+    status: str
+    message: str
+    parameters: ParameterSet
+    covariance: Covariance
+    derived: Mapping[str, Derived]
+    outputs: Mapping[str, Mapping[str, OutputFit]]
+    nuisance: Mapping[str, Nuisance]
+    identifiability: Identifiability
+    cost: float
+    iterations: int
+    samples: int
+    wall_s: float
+    step_error_sigma: float = 0.0
+    experiments: tuple[Experiment, ...] = field(default=(), repr=False)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the search converged and every free parameter can be told."""
+        return self.status == "converged"
+
+    def predict(self, experiment: Experiment) -> Prediction:
+        """Return measured and model outputs of one of the fit's experiments."""
+        own = self.nuisance[experiment.name]
+        model = make_model(experiment.plant, self.parameters, (), experiment.outputs)
+        n = len(experiment.log)
+        y = np.full((n, len(experiment.outputs)), np.nan)
+        gain = np.array([own.gain[name] for name in experiment.outputs])
+        offset = np.array([own.offset[name] for name in experiment.outputs])
+        clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=own.delay_s)
+        pieces = zip(experiment.segments(), experiment.log.segments, own.initial_state, strict=True)
+        for segment, piece, state in pieces:
+            point = Point(
+                theta=np.zeros(0), x0=np.array(list(state.values())), offset=offset, gain=gain, clock=clock,
+                substeps=16,
+            )  # fmt: skip
+            found = run_pass(model, segment, point, outputs=True).outputs
+            assert found is not None  # noqa: S101
+            y[piece] = found * gain + offset
+        log = experiment.log
+        return Prediction(
+            time=log.time,
+            inputs={name: log[name] for name in experiment.plant.inputs if name in log.signals},
+            measured={name: log[name] for name in experiment.outputs},
+            model={name: y[:, i] for i, name in enumerate(experiment.outputs)},
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of fit.json (schema seaopt/fit/1)."""
+        return {
+            "schema": SCHEMA,
+            "status": self.status,
+            "message": self.message,
+            "cost": self.cost,
+            "iterations": self.iterations,
+            "samples": self.samples,
+            "wall_s": self.wall_s,
+            "parameters": {name: _parameter_dict(item) for name, item in self.parameters.items()},
+            "derived": {
+                name: {"value": item.value, "unit": item.unit, "std": item.std, "ci95": list(item.ci95)}
+                for name, item in self.derived.items()
+            },
+            "covariance": {"names": list(self.covariance.names), "matrix": self.covariance.matrix},
+            "outputs": {
+                name: {output: _fields(item) for output, item in row.items()} for name, row in self.outputs.items()
+            },
+            "identifiability": {
+                "rank": self.identifiability.rank,
+                "free": self.identifiability.free,
+                "condition": self.identifiability.condition,
+                "unidentifiable": list(self.identifiability.unidentifiable),
+            },
+            "experiments": {name: _fields(item) for name, item in self.nuisance.items()},
+            "step_error_sigma": self.step_error_sigma,
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], experiments: tuple[Experiment, ...] = ()) -> Fit:
+        """Return the fit of a fit.json; `experiments` brings the data back for predictions.
+
+        Raises
+        ------
+        FileError
+            A field is missing or malformed.
+        """
+        try:
+            return _from_dict(content, experiments)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise FileError(f"fit.json: field {error} is missing or malformed; run the fit again") from error
+
+    def __repr__(self) -> str:
+        lines = [f"Fit: {self.status} ({self.message})"]
+        lines.append(f"  {self.samples} samples, {self.iterations} iterations, {self.wall_s:.2f} s")
+        shown = ParameterSet(item for item in self.parameters.values() if item.free)
+        lines += [f"  {line}" for line in repr(shown).splitlines()]
+        lines += [f"  {name} = {item.value:.5g} ± {item.std:.2g} {item.unit}" for name, item in self.derived.items()]
+        for name, row in self.outputs.items():
+            for output, item in row.items():
+                held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"
+                lines.append(
+                    f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
+                    f"rms residual {item.rms_residual:.4g} {item.unit}"
+                )
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _fields(item: Any) -> dict[str, Any]:
+    return {name: getattr(item, name) for name in item.__dataclass_fields__}
+
+
+def _parameter_dict(item: Parameter) -> dict[str, Any]:
+    ci95 = list(item.ci95) if item.ci95 is not None else None
+    return {
+        "value": item.value, "unit": item.unit, "free": item.free, "std": item.std, "ci95": ci95,
+        "at_bound": item.at_bound, "min": item.min, "max": item.max, "prior_std": item.prior_std,
+    }  # fmt: skip
+
+
+def _number(value: Any, missing: float) -> float:
+    return missing if value is None else float(value)
+
+
+def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) -> Fit:
+    parameters = ParameterSet(
+        Parameter(
+            name=name, value=float(item["value"]), unit=item["unit"], free=bool(item["free"]),
+            min=_number(item.get("min"), -math.inf), max=_number(item.get("max"), math.inf),
+            prior_std=item.get("prior_std"), std=_number(item["std"], math.inf) if item["free"] else None,
+        )
+        for name, item in content["parameters"].items()
+    )  # fmt: skip
+    matrix = [[_number(v, math.inf) for v in row] for row in content["covariance"]["matrix"]]
+    found = content["identifiability"]
+    size = len(content["covariance"]["names"])
+    return Fit(
+        status=content["status"],
+        message=content["message"],
+        parameters=parameters,
+        covariance=Covariance(
+            names=tuple(content["covariance"]["names"]), matrix=np.array(matrix, dtype=float).reshape(size, size)
+        ),
+        derived={
+            name: Derived(value=float(item["value"]), unit=item["unit"], std=_number(item["std"], math.inf))
+            for name, item in content["derived"].items()
+        },
+        outputs={
+            name: {output: OutputFit(**item) for output, item in row.items()}
+            for name, row in content["outputs"].items()
+        },
+        nuisance={
+            name: Nuisance(
+                delay_s=item["delay_s"], gain=item["gain"], offset=item["offset"],
+                initial_state=tuple(item["initial_state"]),
+            )
+            for name, item in content["experiments"].items()
+        },
+        identifiability=Identifiability(
+            rank=found["rank"], free=found["free"], condition=_number(found["condition"], math.inf),
+            unidentifiable=tuple(found["unidentifiable"]),
+        ),
+        cost=_number(content["cost"], math.inf),
+        iterations=content["iterations"],
+        samples=content["samples"],
+        wall_s=content["wall_s"],
+        step_error_sigma=content["step_error_sigma"],
+        experiments=experiments,
+    )  # fmt: skip

@@ -1,0 +1,93 @@
+"""Files that are either whole or absent: written to a temporary name, then moved into place."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from seaopt.errors import FileError
+
+
+def write_bytes(path: Path | str, content: bytes) -> Path:
+    """Write `content` to `path` in one step: a reader sees the old file or the new one, never a part.
+
+    Raises
+    ------
+    FileError
+        The folder cannot be made or written.
+    """
+    target = Path(path)
+    name = None
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(name, 0o666 & ~umask)  # noqa: PTH101
+        os.replace(name, target)  # noqa: PTH105
+    except OSError as error:
+        if name is not None:
+            Path(name).unlink(missing_ok=True)
+        raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
+    return target
+
+
+def write_text(path: Path | str, content: str) -> Path:
+    """Write text as UTF-8, as `write_bytes` does."""
+    return write_bytes(path, content.encode())
+
+
+def plain(value: Any) -> Any:
+    """Return `value` as what JSON can hold: arrays become lists, numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}  # pyright: ignore[reportUnknownArgumentType]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def to_json(content: dict[str, Any]) -> str:
+    """Return `content` as strict JSON (no NaN, no Infinity), indented."""
+    return json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def write_json(path: Path | str, content: dict[str, Any]) -> Path:
+    """Write `content` as strict JSON, as `write_bytes` does."""
+    return write_text(path, to_json(content))
+
+
+def read_json(path: Path | str, schema: str) -> dict[str, Any]:
+    """Read a result file and check its "schema" field.
+
+    Raises
+    ------
+    FileError
+        The file is missing, is not JSON, or carries another schema.
+    """
+    source = Path(path)
+    try:
+        content = json.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise FileError(f"{source}: no such file; run the earlier stage first") from error
+    except OSError as error:
+        raise FileError(f"{source}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise FileError(f"{source}: not valid JSON ({error}); run its stage again") from error
+    found = content.get("schema") if isinstance(content, dict) else None
+    if found != schema:
+        raise FileError(f'{source}: schema is {found!r}, expected "{schema}"; run its stage again with this version')
+    return content

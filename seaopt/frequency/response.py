@@ -1,0 +1,99 @@
+r"""Frequency response of a log: the H1 estimate and its coherence.
+
+Welch's averages of Hann-windowed stretches that overlap by half (Bendat and Piersol, Random Data, 4th ed., ch. 6):
+
+.. math:: H_1 = S_{uy} / S_{uu}, \qquad \gamma^2 = |S_{uy}|^2 / (S_{uu} S_{yy}),
+          \qquad \sigma_{|H_1|} / |H_1| = \sqrt{(1 - \gamma^2) / (2 \gamma^2 n_d)} .
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.errors import LogError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrequencyResponse:
+    """An estimate from one input to one output.
+
+    Parameters
+    ----------
+    frequency_hz : array, shape (m,)
+        Above zero, up to the Nyquist frequency.
+    response : complex array, shape (m,)
+        Output unit over input unit.
+    coherence : array, shape (m,)
+        Between 0 and 1.
+    averages : int
+        Stretches averaged.
+    """
+
+    frequency_hz: Float[np.ndarray, " m"]
+    response: Complex[np.ndarray, " m"]
+    coherence: Float[np.ndarray, " m"]
+    averages: int
+
+    @property
+    def relative_std(self) -> Float[np.ndarray, " m"]:
+        """Standard deviation of |H1| over |H1|; neighbours overlap by half, which counts as 0.7 averages each."""
+        effective = max(1.0, 0.7 * self.averages)
+        gamma = np.clip(self.coherence, 1e-6, 1.0)
+        return np.sqrt((1.0 - gamma) / (2.0 * gamma * effective))
+
+
+def h1(
+    u: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], period: float, *, stretch_s: float | None = None
+) -> FrequencyResponse:
+    """Estimate the frequency response from u to y.
+
+    Parameters
+    ----------
+    u, y : array, shape (n,)
+        Samples of input and output, none missing.
+    period : float
+        Seconds between samples.
+    stretch_s : float, optional
+        Length of a stretch, which sets the resolution 1/stretch_s; a sixteenth of the record if left out.
+
+    Raises
+    ------
+    LogError
+        The record is shorter than two stretches or 32 samples, or the input is constant.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> u = rng.normal(size=4000)
+    >>> estimate = h1(u, 3 * u, 1 / 400)
+    >>> bool(np.allclose(estimate.response, 3.0)), bool(np.all(estimate.coherence > 0.999))
+    (True, True)
+    """
+    n = u.size
+    length = int(n / 16) if stretch_s is None else round(stretch_s / period)
+    length = max(length, 16)
+    if n < 2 * length:
+        raise LogError(f"{n} samples are too few for stretches of {length * period:g} s; use a longer log")
+    if np.ptp(u) == 0.0:
+        raise LogError("the input is constant; a frequency response needs excitation")
+    starts = np.arange(0, n - length + 1, length // 2)
+    index = starts[:, None] + np.arange(length)
+    window = np.hanning(length)
+
+    def spectra(values: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
+        pieces = values[index]
+        return np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:]
+
+    uf, yf = spectra(u), spectra(y)
+    suu, syy = np.mean(np.abs(uf) ** 2, axis=0), np.mean(np.abs(yf) ** 2, axis=0)
+    suy = np.mean(np.conj(uf) * yf, axis=0)
+    floor = 1e-300
+    return FrequencyResponse(
+        frequency_hz=np.fft.rfftfreq(length, period)[1:],
+        response=suy / np.maximum(suu, floor),
+        coherence=np.abs(suy) ** 2 / np.maximum(suu * syy, floor),
+        averages=int(starts.size),
+    )

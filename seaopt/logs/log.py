@@ -1,0 +1,208 @@
+"""A log: channels sampled on one clock, in SI, that knows where it came from."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError, suggestion
+from seaopt.signals import Signal
+from seaopt.units import factor, si_unit
+
+JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
+GAP = 1.5  # periods between two samples that make a gap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Log:
+    """Channels on one clock.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds, strictly increasing.
+    signals : mapping of name to Signal
+        Channels of n samples each, in SI.
+    source : str
+        Where the log came from, for messages and reports.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(5) / 400
+    >>> log = Log.from_arrays(time=t, I=np.ones(5), F1=240 * np.ones(5), units={"I": "A", "F1": "N"})
+    >>> log.rate_hz, log["F1"][0]
+    (400.0, 240.0)
+    """
+
+    time: Float[np.ndarray, " n"]
+    signals: Mapping[str, Signal]
+    source: str = "arrays"
+    period: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        n = self.time.size
+        if self.time.ndim != 1 or n < 2:
+            raise LogError(f"{self.source}: time has shape {self.time.shape}; a log needs at least 2 samples")
+        if not np.all(np.isfinite(self.time)):
+            row = int(np.flatnonzero(~np.isfinite(self.time))[0])
+            raise LogError(f"{self.source}: time is not a number in sample {row + 1}; remove that row")
+        step = np.diff(self.time)
+        if np.any(step <= 0):
+            row = int(np.flatnonzero(step <= 0)[0]) + 1
+            how = "repeats" if step[row - 1] == 0 else "runs backwards"
+            raise LogError(
+                f"{self.source}: time {how} at sample {row + 1} (t = {self.time[row]:g} s); sort or remove such rows"
+            )
+        for name, signal in self.signals.items():
+            if signal.values.size != n:
+                raise LogError(
+                    f"{self.source}: channel {name} has {signal.values.size} samples and time has {n}; "
+                    "give arrays of one length"
+                )
+        self.time.setflags(write=False)
+        object.__setattr__(self, "period", _period(self.time))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        time: Any,
+        units: Mapping[str, str] | None = None,
+        source: str = "arrays",
+        **channels: Any,
+    ) -> Self:
+        """Build a log from arrays.
+
+        Parameters
+        ----------
+        time : array-like, shape (n,)
+            Seconds, or in ``units["time"]``.
+        units : mapping of name to unit, optional
+            Units of the arrays; what is left out is SI already.
+        source : str
+            A name for messages.
+        **channels : array-like, shape (n,)
+            The channels by name.
+
+        Raises
+        ------
+        LogError
+            Shapes differ, an array is not numeric, or time does not increase.
+        UnitError
+            A unit is unknown.
+        """
+        given = dict(units or {})
+        for name in given:
+            if name not in channels and name != "time":
+                raise LogError(f'units names "{name}", which is no channel; {suggestion(name, channels)}')
+        signals = {name: _signal(name, values, given.get(name), source) for name, values in channels.items()}
+        clock = _array("time", time, source) * factor(given.get("time", "s"), "s")
+        return cls(time=clock, signals=signals, source=source)
+
+    def __getitem__(self, name: str) -> Float[np.ndarray, " n"]:
+        """Return the samples of a channel."""
+        return self.signal(name).values
+
+    def signal(self, name: str) -> Signal:
+        """Return a channel with its unit."""
+        try:
+            return self.signals[name]
+        except KeyError:
+            raise LogError(f'{self.source}: no channel "{name}"; {suggestion(name, self.signals)}') from None
+
+    def __len__(self) -> int:
+        return int(self.time.size)
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate in Hz: one over the median step of time, to nine digits."""
+        return float(f"{1.0 / self.period:.9g}")
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first sample to the last."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def segments(self) -> list[slice]:
+        """The stretches without a gap, as slices of at least two samples.
+
+        Raises
+        ------
+        LogError
+            Inside a stretch the clock strays by more than 5 % of the period: the log is not uniformly sampled.
+        """
+        breaks = np.flatnonzero(np.diff(self.time) > GAP * self.period) + 1
+        edges = [0, *breaks.tolist(), len(self)]
+        pieces = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= 2]
+        for piece in pieces:
+            worst = float(np.max(np.abs(np.diff(self.time[piece]) - self.period)))
+            if worst > JITTER_LIMIT * self.period:
+                raise LogError(
+                    f"{self.source}: a step of time strays {worst / self.period:.0%} from the period "
+                    f"{self.period:.4g} s (5 % is allowed); resample the log on a uniform clock first"
+                )
+        return pieces
+
+    def between(self, start_s: float, stop_s: float) -> Log:
+        """Return the samples with start_s <= time - time[0] <= stop_s.
+
+        Raises
+        ------
+        LogError
+            Fewer than two samples lie there.
+        """
+        clock = self.time - self.time[0]
+        keep = (clock >= start_s - 1e-9) & (clock <= stop_s + 1e-9)
+        if np.count_nonzero(keep) < 2:
+            raise LogError(
+                f"{self.source}: slice_s = [{start_s:g}, {stop_s:g}] holds fewer than 2 of its samples; "
+                f"the log runs from 0 to {self.duration_s:g} s"
+            )
+        signals = {name: replace(item, values=item.values[keep].copy()) for name, item in self.signals.items()}
+        return Log(time=self.time[keep].copy(), signals=signals, source=self.source)
+
+    def __repr__(self) -> str:
+        lines = [f"Log {self.source}: {len(self)} samples, {self.duration_s:.6g} s at {self.rate_hz:.6g} Hz"]
+        for name, signal in self.signals.items():
+            good = signal.values[np.isfinite(signal.values)]
+            span = f"{good.min():.4g} to {good.max():.4g}" if good.size else "no finite sample"
+            lost = signal.values.size - good.size
+            lines.append(f"  {name} [{signal.unit or 'SI'}]  {span}" + (f", {lost} missing" if lost else ""))
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _period(time: Float[np.ndarray, " n"]) -> float:
+    """Return the sample period: the mean step between samples that are not across a gap.
+
+    The mean over gap-free steps is insensitive to timestamps rounded to a few digits; the median is not.
+    """
+    step = np.diff(time)
+    return float(np.mean(step[step <= GAP * np.median(step)]))
+
+
+def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise LogError(f"{source}: channel {name} is not numeric ({error}); give numbers") from error
+    if array.ndim != 1:
+        raise LogError(f"{source}: channel {name} has shape {array.shape}; give one value a sample, shape (n,)")
+    return array
+
+
+def _signal(name: str, values: Any, unit: str | None, source: str) -> Signal:
+    array = _array(name, values, source)
+    if unit is None:
+        return Signal(name=name, values=array)
+    to = si_unit(unit)
+    return Signal(name=name, values=array * factor(unit, to), unit=to)

@@ -1,0 +1,198 @@
+"""Named values with units, bounds and priors: what a plant is made of and what a fit returns."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Self
+
+from seaopt.errors import ParameterError, suggestion
+from seaopt.units import factor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """One named value in an SI unit.
+
+    Parameters
+    ----------
+    name : str
+        The field's symbol, such as "J".
+    value : float
+        In `unit`.
+    unit : str
+        SI unit text; "-" for a pure number.
+    free : bool
+        Whether a fit may change it.
+    min, max : float
+        Bounds, in `unit`; a value on a bound is allowed.
+    prior_std : float or None
+        The value is known within this standard deviation (a Gaussian prior in the fit), in `unit`.
+    std : float or None
+        Posterior standard deviation, where a fit gave one.
+    description : str
+        A few words.
+    """
+
+    name: str
+    value: float
+    unit: str
+    free: bool = False
+    min: float = -math.inf
+    max: float = math.inf
+    prior_std: float | None = None
+    std: float | None = None
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.value):
+            raise ParameterError(f"parameter {self.name} = {self.value} is not finite; give a number in {self.unit}")
+        if not self.min <= self.max:
+            raise ParameterError(f"parameter {self.name}: min = {self.min:g} is above max = {self.max:g}; swap them")
+        if not self.min <= self.value <= self.max:
+            raise ParameterError(
+                f"parameter {self.name} = {self.value:g} {self.unit} is outside its bounds "
+                f"[{self.min:g}, {self.max:g}]; change the value or the bounds"
+            )
+        if self.prior_std is not None and not 0.0 < self.prior_std < math.inf:
+            raise ParameterError(
+                f"parameter {self.name}: prior_std = {self.prior_std:g} is not a positive number; "
+                "leave it out where nothing is known, or fix the parameter"
+            )
+
+    @property
+    def ci95(self) -> tuple[float, float] | None:
+        """The 95 % interval value ± 1.96 std, where a std is known."""
+        if self.std is None:
+            return None
+        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether a free value lies on one of its bounds."""
+        width = 1e-9 * max(abs(self.value), 1e-300)
+        return self.free and (self.value - self.min <= width or self.max - self.value <= width)
+
+
+class ParameterSet(Mapping[str, Parameter]):
+    """An ordered, immutable set of parameters; every change returns a new set.
+
+    Examples
+    --------
+    >>> params = ParameterSet([Parameter(name="J", value=3e-6, unit="kg m^2", min=0.0)])
+    >>> params = params.update(J=2e-6).free("J")
+    >>> params["J"].value, params.free_names
+    (2e-06, ('J',))
+    """
+
+    __slots__ = ("_items",)
+
+    def __init__(self, parameters: Iterable[Parameter] = ()) -> None:
+        items: dict[str, Parameter] = {}
+        for parameter in parameters:
+            if parameter.name in items:
+                raise ParameterError(f"parameter {parameter.name} is given twice; keep one")
+            items[parameter.name] = parameter
+        self._items = items
+
+    @classmethod
+    def of(cls, **values: float | tuple[float, str]) -> Self:
+        """Build a set from NAME=value or NAME=(value, unit); a bare value has no unit ("-").
+
+        Examples
+        --------
+        >>> ParameterSet.of(k=(655e3, "N/m"), eta=0.95)["k"].unit
+        'N/m'
+        """
+        pairs = {name: given if isinstance(given, tuple) else (given, "-") for name, given in values.items()}
+        return cls(Parameter(name=name, value=float(value), unit=unit) for name, (value, unit) in pairs.items())
+
+    def __getitem__(self, name: str) -> Parameter:
+        try:
+            return self._items[name]
+        except KeyError:
+            raise ParameterError(f'parameter "{name}" is not in this set; {suggestion(name, self._items)}') from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._items
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in order."""
+        return tuple(name for name, parameter in self._items.items() if parameter.free)
+
+    def values_of(self, names: Iterable[str]) -> list[float]:
+        """Return the values of `names`, in their order and in SI."""
+        return [self[name].value for name in names]
+
+    def with_parameters(self, *parameters: Parameter) -> Self:
+        """Return a set in which `parameters` replace those of the same name, or are added."""
+        return type(self)({**self._items, **{parameter.name: parameter for parameter in parameters}}.values())
+
+    def update(self, **values: float | tuple[float, str]) -> Self:
+        """Return a set with new values; a tuple (value, unit) is converted to the declared unit.
+
+        Raises
+        ------
+        ParameterError
+            A name is unknown or a value outside its bounds.
+        UnitError
+            A unit is unknown or of another dimension.
+        """
+        changed: list[Parameter] = []
+        for name, given in values.items():
+            old = self[name]
+            value, unit = given if isinstance(given, tuple) else (given, old.unit)
+            changed.append(replace(old, value=float(value) * factor(unit, old.unit), std=None))
+        return self.with_parameters(*changed)
+
+    def free(self, *names: str) -> Self:
+        """Return a set in which `names` are free."""
+        return self.with_parameters(*(replace(self[name], free=True) for name in names))
+
+    def fix(self, *names: str) -> Self:
+        """Return a set in which `names` (all, if none is given) are held at their values."""
+        return self.with_parameters(*(replace(self[name], free=False) for name in names or self))
+
+    def bound(self, **bounds: tuple[float, float]) -> Self:
+        """Return a set with new bounds, NAME=(min, max), in the declared units."""
+        return self.with_parameters(
+            *(replace(self[name], min=float(low), max=float(high)) for name, (low, high) in bounds.items())
+        )
+
+    def prior(self, **stds: float) -> Self:
+        """Return a set with Gaussian priors, NAME=std, centred on the present values and made free."""
+        return self.with_parameters(
+            *(replace(self[name], prior_std=float(std), free=True) for name, std in stds.items())
+        )
+
+    def subset(self, names: Iterable[str]) -> Self:
+        """Return the parameters `names`, in that order."""
+        return type(self)(self[name] for name in names)
+
+    def _rows(self) -> list[tuple[str, str, str, str, str]]:
+        rows: list[tuple[str, str, str, str, str]] = []
+        for name, item in self._items.items():
+            std = "" if item.std is None else f"± {item.std:.2g}"
+            note = "at bound" if item.at_bound else ("free" if item.free else "")
+            rows.append((name, f"{item.value:.6g}", std, item.unit, note))
+        return rows
+
+    def __repr__(self) -> str:
+        rows = self._rows()
+        widths = [max((len(row[i]) for row in rows), default=0) for i in range(5)]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return "\n".join(lines) if lines else "ParameterSet()"
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in self._rows())
+        head = "".join(f"<th>{cell}</th>" for cell in ("name", "value", "std", "unit", ""))
+        return f"<table><tr>{head}</tr>{''.join(rows)}</table>"

@@ -1,0 +1,19 @@
+"""Symbolic CasADi plants: the paper's actuator between two links, and a user's own."""
+
+from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
+from seaopt.plants.linear import jacobians, state_space
+from seaopt.plants.plant import Plant
+from seaopt.plants.two_link import high_impedance, moving_output, thor, two_link
+
+__all__ = [
+    "KINDS",
+    "Plant",
+    "high_impedance",
+    "jacobians",
+    "known_parameters",
+    "moving_output",
+    "plant_of_kind",
+    "state_space",
+    "thor",
+    "two_link",
+]

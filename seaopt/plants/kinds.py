@@ -1,0 +1,54 @@
+"""The kinds of plant that a problem file can name: the built-in ones and those of installed packages."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any
+
+from seaopt.errors import PlantError, suggestion
+from seaopt.parameters import Parameter
+from seaopt.plants.plant import Plant
+from seaopt.plants.two_link import high_impedance, moving_output, two_link
+
+ENTRY_POINTS = "seaopt.plants"
+KINDS: dict[str, Callable[..., Plant]] = {
+    "high_impedance": high_impedance,
+    "moving_output": moving_output,
+    "two_link": two_link,
+}
+
+
+def plant_of_kind(kind: str, **options: Any) -> Plant:
+    """Return a plant by the name of its kind, built in or from the entry-point group ``seaopt.plants``.
+
+    Raises
+    ------
+    PlantError
+        The kind or one of its options is unknown, or an installed package's entry point fails.
+    """
+    installed = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    if kind not in KINDS and kind not in installed:
+        raise PlantError(f'kind = "{kind}" is not a plant; {suggestion(kind, [*KINDS, *installed])}')
+    if kind in KINDS:
+        make = KINDS[kind]
+    else:
+        try:
+            make = installed[kind].load()
+        except Exception as error:
+            raise PlantError(f'kind = "{kind}" cannot be loaded from {installed[kind].value}: {error}') from error
+    accepted = list(inspect.signature(make).parameters)
+    for name in options:
+        if name not in accepted:
+            raise PlantError(f'{name} is not an option of kind "{kind}"; {suggestion(name, accepted)}')
+    return make(**options)
+
+
+def known_parameters() -> dict[str, Parameter]:
+    """Return every parameter that some built-in plant has, by name (a problem file may name any of them)."""
+    found: dict[str, Parameter] = {}
+    for link1 in ("fixed", "mass", "pendulum"):
+        for link2 in ("fixed", "mass", "pendulum"):
+            found |= dict(two_link(link1=link1, link2=link2).defaults)
+    return dict(moving_output().defaults) | found

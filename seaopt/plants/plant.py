@@ -1,0 +1,235 @@
+r"""A plant: named states, inputs, outputs and parameters, and its equations in CasADi SX.
+
+.. math:: \dot x = f(t, x, u, p), \qquad y = h(t, x, u, p)
+
+`f` and `h` are functions of the time and three namespaces whose attributes are CasADi symbols; they return a
+mapping from state (output) names to expressions. They are called once, when the plant is made.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+
+from seaopt.errors import ParameterError, PlantError, suggestion
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.units import DIMENSIONLESS, si_unit
+
+Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
+Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plant:
+    r"""States, inputs, outputs and parameters with units, and the equations that tie them.
+
+    Parameters
+    ----------
+    name : str
+        What errors and reports call it.
+    states, inputs, outputs : mapping of name to SI unit
+        In the order of the vectors x, u and y.
+    parameters : mapping of name to unit or `Parameter`
+        A unit alone declares a parameter whose value the user must give; a `Parameter` brings a default.
+    f, h : callables ``(t, x, u, p) -> mapping``
+        Time derivatives of the states and the outputs, as CasADi expressions of the namespaces' attributes.
+    derived : callable ``p -> {name: (expression, unit)}``, optional
+        Figures of interest that follow from the parameters; a fit reports them with their uncertainty.
+    optional_inputs : collection of names
+        Inputs that a log may leave out; they are then zero (external forces).
+
+    Raises
+    ------
+    PlantError
+        A name is used twice or is not an identifier, a parameter has no unit, an equation is missing or unknown,
+        an output depends on nothing, or a state is never driven.
+
+    Examples
+    --------
+    A mass on a spring, pushed by a force:
+
+    >>> import seaopt as so
+    >>> plant = so.Plant(
+    ...     name="mass and spring",
+    ...     states={"x": "m", "v": "m/s"}, inputs={"F": "N"}, outputs={"x": "m"},
+    ...     parameters={"m": "kg", "k": "N/m", "c": "N s/m"},
+    ...     f=lambda t, x, u, p: {"x": x.v, "v": (u.F - p.k * x.x - p.c * x.v) / p.m},
+    ...     h=lambda t, x, u, p: {"x": x.x},
+    ... )
+    >>> model = plant.linearize(so.ParameterSet.of(m=(2.0, "kg"), k=(50.0, "N/m"), c=(1.0, "N s/m")))
+    >>> [round(abs(pole), 6) for pole in model.poles()]
+    [5.0, 5.0]
+    """
+
+    name: str
+    states: Mapping[str, str]
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]
+    parameters: Mapping[str, str | Parameter]
+    f: Equations
+    h: Equations
+    derived: Derived | None = None
+    optional_inputs: frozenset[str] = frozenset()
+    t: Any = field(init=False, repr=False)
+    x: Any = field(init=False, repr=False)
+    u: Any = field(init=False, repr=False)
+    p: Any = field(init=False, repr=False)
+    dynamics: Any = field(init=False, repr=False)
+    output: Any = field(init=False, repr=False)
+    cache: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_names(self)
+        put = object.__setattr__
+        symbols = {
+            key: {name: ca.SX.sym(name) for name in names}
+            for key, names in (("x", self.states), ("u", self.inputs), ("p", self.parameters))
+        }
+        time = ca.SX.sym("t")
+        spaces = [SimpleNamespace(**symbols[key]) for key in "xup"]
+        put(self, "t", time)
+        for key, named in symbols.items():
+            put(self, key, ca.vertcat(*named.values()) if named else ca.SX(0, 1))
+        put(self, "dynamics", _stack(self, "f", self.f(time, *spaces), self.states))
+        put(self, "output", _stack(self, "h", self.h(time, *spaces), self.outputs))
+        _check_structure(self)
+
+    @property
+    def defaults(self) -> ParameterSet:
+        """The parameters that have a default value."""
+        return ParameterSet(item for item in self.parameters.values() if isinstance(item, Parameter))
+
+    def parameter_unit(self, name: str) -> str:
+        """Return the SI unit of a parameter."""
+        item = self.parameters[name]
+        return item.unit if isinstance(item, Parameter) else item
+
+    def parameter_values(self, params: ParameterSet) -> list[float]:
+        """Return the parameter vector p, from `params` and, where it has none, the plant's defaults.
+
+        Raises
+        ------
+        ParameterError
+            A parameter has neither a value in `params` nor a default.
+        """
+        defaults = self.defaults
+        values: list[float] = []
+        for name in self.parameters:
+            if name in params:
+                values.append(params[name].value)
+            elif name in defaults:
+                values.append(defaults[name].value)
+            else:
+                raise ParameterError(
+                    f'parameter "{name}" of plant {self.name} has no value; give one in {self.parameter_unit(name)}'
+                )
+        return values
+
+    def complete(self, params: ParameterSet) -> ParameterSet:
+        """Return the plant's own parameters: from `params`, else the defaults, in the plant's order."""
+        defaults = self.defaults
+        self.parameter_values(params)
+        return ParameterSet(params[name] if name in params else defaults[name] for name in self.parameters)
+
+    def derived_values(self) -> dict[str, tuple[Any, str]]:
+        """Return the derived figures as {name: (expression of p, unit)}; empty where none are declared."""
+        if self.derived is None:
+            return {}
+        return dict(self.derived(SimpleNamespace(**dict(zip(self.parameters, ca.vertsplit(self.p), strict=True)))))
+
+    def linearize(
+        self,
+        params: ParameterSet,
+        x: Mapping[str, float] | None = None,
+        u: Mapping[str, float] | None = None,
+    ) -> Any:
+        """Return the continuous-time `control.StateSpace` at an operating point, signals named.
+
+        Parameters
+        ----------
+        params : ParameterSet
+            Values of the plant's parameters.
+        x, u : mapping of name to float, optional
+            Operating point; what is left out is zero.
+
+        Returns
+        -------
+        control.StateSpace
+            From `inputs` to `outputs`, states named as the plant's.
+        """
+        import control  # deferred: it imports matplotlib
+
+        from seaopt.plants.linear import state_space
+
+        a, b, c, d = state_space(self, params, x, u)
+        return control.ss(
+            a, b, c, d, states=list(self.states), inputs=list(self.inputs), outputs=list(self.outputs), name=self.name
+        )
+
+    def __repr__(self) -> str:
+        def listed(items: Mapping[str, Any]) -> str:
+            return ", ".join(f"{name} [{unit if isinstance(unit, str) else unit.unit}]" for name, unit in items.items())
+
+        return (
+            f"Plant {self.name}\n  states      {listed(self.states)}\n  inputs      {listed(self.inputs)}\n"
+            f"  outputs     {listed(self.outputs)}\n  parameters  {listed(self.parameters)}"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _check_names(plant: Plant) -> None:
+    seen: dict[str, str] = {}
+    for group in ("states", "inputs", "parameters"):
+        for name in getattr(plant, group):
+            if not name.isidentifier():
+                raise PlantError(f'plant {plant.name}: "{name}" in {group} is not a name; use letters, digits and _')
+            if name in seen:
+                raise PlantError(f'plant {plant.name}: "{name}" is in {seen[name]} and in {group}; rename one')
+            seen[name] = group
+    for name, item in plant.parameters.items():
+        unit = item.unit if isinstance(item, Parameter) else item
+        if not unit.strip():
+            raise PlantError(f'plant {plant.name}: parameter "{name}" has no unit; give one, "-" for a pure number')
+    for group in ("states", "inputs", "outputs", "parameters"):
+        for item in getattr(plant, group).values():
+            unit = item.unit if isinstance(item, Parameter) else item
+            if unit.strip() not in DIMENSIONLESS and unit not in _COMMON_UNITS:
+                si_unit(unit)
+    unknown = sorted(plant.optional_inputs - set(plant.inputs))
+    if unknown:
+        raise PlantError(f"plant {plant.name}: optional input {unknown[0]} is not an input; add it to inputs")
+
+
+# Units that need no look-up: asking pint costs 0.2 s the first time.
+_COMMON_UNITS = frozenset(
+    ("m", "s", "kg", "N", "A", "rad", "V", "m/s", "rad/s", "N/m", "kg m^2", "N m", "N m/A", "N s/m", "N m s", "m/s^2")
+)
+
+
+def _stack(plant: Plant, what: str, equations: Mapping[str, Any], names: Mapping[str, str]) -> Any:
+    """Return the expressions in the order of `names`, refusing missing and unknown ones."""
+    for name in equations:
+        if name not in names:
+            raise PlantError(f'plant {plant.name}: {what} returns "{name}"; {suggestion(name, names)}')
+    for name in names:
+        if name not in equations:
+            raise PlantError(f'plant {plant.name}: {what} returns nothing for "{name}"; add its equation')
+    return ca.vertcat(*(ca.SX(equations[name]) for name in names)) if names else ca.SX(0, 1)
+
+
+def _check_structure(plant: Plant) -> None:
+    """Refuse what can only be a mistake: an output of nothing, a state that neither moves nor is driven."""
+    moved_by = ca.vertcat(plant.t, plant.x, plant.u)
+    for index, name in enumerate(plant.outputs):
+        if not ca.depends_on(plant.output[index], moved_by):
+            raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
+    for index, name in enumerate(plant.states):
+        if not ca.depends_on(plant.dynamics[index], moved_by):
+            raise PlantError(f'plant {plant.name}: state "{name}" is driven by nothing; check f, or make it a parameter')

@@ -1,0 +1,34 @@
+"""Sampled channels with units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Signal:
+    """One channel of a log: samples in an SI unit.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name, usually that of a plant's input or output.
+    values : array, shape (n,)
+        Samples in `unit`; NaN marks a missing one.
+    unit : str
+        SI unit text; "" where it was not said (arrays from Python are SI by convention).
+    """
+
+    name: str
+    values: Float[np.ndarray, " n"]
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 1:
+            raise LogError(f"channel {self.name} has shape {self.values.shape}; give one value a sample")
+        self.values.setflags(write=False)

@@ -1,0 +1,127 @@
+"""A plant made ready for numbers: fixed parameters put in, free ones left as theta, linear or not found out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import PlantError, suggestion
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Model:
+    """Expressions of one plant in its free parameters theta, for chosen outputs.
+
+    Parameters
+    ----------
+    plant : Plant
+        The plant.
+    free : tuple of str
+        Names of theta, in order; parameters of other plants are not among them.
+    outputs : tuple of str
+        The outputs that are computed, in order.
+    linear : bool
+        Whether f and h are affine in the state and the input for every theta, and do not depend on time.
+    """
+
+    plant: Plant
+    free: tuple[str, ...]
+    outputs: tuple[str, ...]
+    t: Any
+    x: Any
+    u: Any
+    theta: Any
+    f: Any
+    h: Any
+    linear: bool
+    functions: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return int(self.x.numel())
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs; at least 1 (a plant without inputs gets one that does nothing)."""
+        return int(self.u.numel())
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def np(self) -> int:
+        """Number of free parameters."""
+        return len(self.free)
+
+    def matrices(self, theta: Float[np.ndarray, " np"]) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+        """Return the affine model [f; h] = G [x; u; 1] and its derivatives, for a linear model.
+
+        Returns
+        -------
+        G : array, shape (nx + ny, nx + nu + 1)
+        dG : array, shape (np, nx + ny, nx + nu + 1)
+        """
+        if "matrices" not in self.functions:
+            self.functions["matrices"] = _matrices(self)
+        rows, cols = self.nx + self.ny, self.nx + self.nu + 1
+        g, dg = self.functions["matrices"](theta)
+        derivative = np.array(dg).reshape(cols, rows, self.np).transpose(2, 1, 0)
+        return np.array(g), derivative
+
+
+def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> Model:
+    """Specialise a plant: the parameters outside `free` are replaced by their values.
+
+    A parameter held at zero, such as f_c, takes its term out, so that a plant is linear exactly when its
+    numbers make it so.
+
+    Raises
+    ------
+    ParameterError
+        A parameter has no value.
+    PlantError
+        An output is unknown.
+    """
+    chosen = outputs or tuple(plant.outputs)
+    for name in chosen:
+        if name not in plant.outputs:
+            raise PlantError(f'plant {plant.name} has no output "{name}"; {suggestion(name, plant.outputs)}')
+    values = dict(zip(plant.parameters, plant.parameter_values(params), strict=True))
+    symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if values else {}
+    names = tuple(name for name in free if name in values)
+    theta = ca.vertcat(*(symbols[name] for name in names)) if names else ca.SX(0, 1)
+    fixed = [name for name in values if name not in names]
+    rows = [list(plant.outputs).index(name) for name in chosen]
+    f, h = plant.dynamics, plant.output[rows]
+    if fixed:
+        f, h = ca.substitute(
+            [f, h], [ca.vertcat(*(symbols[name] for name in fixed))], [ca.DM([values[name] for name in fixed])]
+        )
+    u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
+    return Model(
+        plant=plant, free=names, outputs=chosen, t=plant.t, x=plant.x, u=u, theta=theta, f=f, h=h,
+        linear=_is_linear(f, h, plant.t, plant.x, u),
+    )  # fmt: skip
+
+
+def _is_linear(f: Any, h: Any, t: Any, x: Any, u: Any) -> bool:
+    both, point = ca.vertcat(f, h), ca.vertcat(x, u)
+    return not ca.depends_on(both, t) and not ca.depends_on(ca.jacobian(both, point), ca.vertcat(t, point))
+
+
+def _matrices(model: Model) -> Any:
+    both, point = ca.vertcat(model.f, model.h), ca.vertcat(model.x, model.u)
+    origin = ca.DM.zeros(point.numel())
+    slope, constant = ca.substitute([ca.jacobian(both, point), both], [point], [origin])
+    g = ca.densify(ca.horzcat(slope, constant))
+    dg = ca.densify(ca.jacobian(ca.vec(g), model.theta))
+    return ca.Function("matrices", [model.theta], [g, dg])

@@ -1,0 +1,149 @@
+"""Simulate any plant over the inputs of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError, SimulationError, suggestion
+from seaopt.logs import Log
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.linear import point as vector
+from seaopt.signals import Signal
+from seaopt.simulation.discretisation import Clock, Hold
+from seaopt.simulation.model import Model, make_model
+from seaopt.simulation.passes import Pass, Point, Segment
+from seaopt.simulation.run import run_pass
+
+MAX_SUBSTEPS = 1024
+
+
+def input_samples(plant: Plant, log: Log) -> Float[np.ndarray, "n nu"]:
+    """Return the plant's inputs from a log's channels of the same names, in the plant's order.
+
+    Raises
+    ------
+    LogError
+        An input is missing from the log, or has missing samples.
+    """
+    columns: list[Float[np.ndarray, " n"]] = []
+    for name in plant.inputs:
+        if name not in log.signals and name in plant.optional_inputs:
+            columns.append(np.zeros(len(log)))
+            continue
+        if name not in log.signals:
+            raise LogError(
+                f'{log.source}: no channel "{name}" for the input of {plant.name}; {suggestion(name, log.signals)}'
+            )
+        values = log[name]
+        if not np.all(np.isfinite(values)):
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise LogError(
+                f"{log.source}: input {name} is missing at t = {log.time[row]:g} s (sample {row + 1}); "
+                "cut that stretch off with slice_s, or fill it and say so"
+            )
+        columns.append(values)
+    return np.column_stack(columns) if columns else np.zeros((len(log), 1))
+
+
+def simulate(
+    plant: Plant,
+    params: ParameterSet,
+    log: Log,
+    *,
+    initial_state: Mapping[str, float] | None = None,
+    hold: Hold = "zero",
+    delay_s: float = 0.0,
+    rtol: float = 1e-7,
+) -> Log:
+    """Simulate a plant over the inputs of a log.
+
+    Parameters
+    ----------
+    plant : Plant
+        Any plant.
+    params : ParameterSet
+        Its parameters; what is left out has the plant's default.
+    log : Log
+        Channels with the names of the plant's inputs, on a uniform clock without gaps.
+    initial_state : mapping of state name to float, optional
+        Zero where left out.
+    hold : {"zero", "first"}
+        The input between samples.
+    delay_s : float
+        Delay of the input.
+    rtol : float
+        Error allowed in each output, relative to its largest value; a linear plant has none, a nonlinear one is
+        stepped finer until two step sizes agree to it.
+
+    Returns
+    -------
+    Log
+        The plant's inputs, outputs and states as channels, on the log's clock.
+
+    Raises
+    ------
+    LogError
+        An input is missing, or the log has a gap.
+    SimulationError
+        The trajectory leaves what floats can hold, or no step size reaches `rtol`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seaopt as so
+    >>> t = np.arange(400) / 400
+    >>> run = so.simulate(so.plants.high_impedance(), so.plants.thor(), so.Log.from_arrays(time=t, I=np.ones(400)))
+    >>> round(float(run["F1"][-1]), 1)  # 240.33 N/A once it has settled
+    240.3
+    """
+    model = make_model(plant, params)
+    if len(log.segments) > 1:
+        raise LogError(f"{log.source}: has {len(log.segments)} stretches with gaps between; simulate them one by one")
+    x0 = vector("state", plant.states, initial_state)
+    u = input_samples(plant, log)
+    clock = Clock(period=log.period, hold=hold, delay_s=delay_s)
+    result = _converged(model, Segment(u=u, start_s=float(log.time[0])), x0, clock, rtol)
+    outputs, states = result.outputs, result.states
+    assert outputs is not None and states is not None  # noqa: S101
+    if not (np.all(np.isfinite(outputs)) and np.all(np.isfinite(states))):
+        bad = ~(np.isfinite(outputs).all(axis=1) & np.isfinite(states).all(axis=1))
+        raise SimulationError(
+            f"plant {plant.name} leaves what numbers can hold at t = {log.time[np.argmax(bad)]:g} s; "
+            "check the parameters, their units and the input"
+        )
+    signals: dict[str, Signal] = {}
+    for names, values in ((plant.inputs, u), (plant.states, states), (plant.outputs, outputs)):
+        for index, (name, unit) in enumerate(names.items()):
+            signals[name] = Signal(name=name, values=values[:, index].copy(), unit=unit)
+    return Log(time=log.time.copy(), signals=signals, source=f"simulation of {plant.name}")
+
+
+def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
+    def run(substeps: int) -> Pass:
+        point = Point(
+            theta=np.zeros(0), x0=x0, offset=np.zeros(model.ny), gain=np.ones(model.ny), clock=clock, substeps=substeps
+        )
+        return run_pass(model, segment, point, outputs=True, states=True)
+
+    result = run(1)
+    substeps = 1
+    while not model.linear:
+        substeps *= 2
+        finer = run(substeps)
+        assert result.outputs is not None and finer.outputs is not None  # noqa: S101
+        scale = np.maximum(np.max(np.abs(finer.outputs), axis=0), 1e-300)
+        with np.errstate(invalid="ignore"):
+            error = float(np.max(np.abs(finer.outputs - result.outputs) / scale)) / 15.0  # order four: 2^4 - 1
+        result = finer
+        if error <= rtol:
+            break
+        if substeps >= MAX_SUBSTEPS:
+            raise SimulationError(
+                f"plant {model.plant.name}: {substeps} steps a sample leave an error of {error:.1e} of the signal "
+                f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
+            )
+    return result

@@ -1,0 +1,100 @@
+"""Conversion to SI, once, where data comes in (pint), and the unit texts that go out.
+
+A unit text is what an engineer writes: "N/m", "kg m^2", "mA", "deg", "usec". A space between units multiplies.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from seaopt.errors import UnitError
+
+if TYPE_CHECKING:
+    import pint
+
+DIMENSIONLESS = frozenset({"", "-", "1"})
+_SYNONYMS = {"usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC"}
+_TOKEN = re.compile(r"[A-Za-zµμΩ°%]+")
+
+
+@lru_cache(maxsize=1)
+def _registry() -> pint.UnitRegistry[Any]:
+    import pint  # deferred: 0.2 s
+
+    return pint.UnitRegistry(cache_folder=None)
+
+
+def _pint_text(unit: str) -> str:
+    """Rewrite an engineer's unit text ("kg m^2", "N m s/rad") as one that pint parses."""
+    text = unit.strip().replace("·", "*").replace("µ", "u").replace("μ", "u").replace("°", "deg")
+    text = _TOKEN.sub(lambda found: _SYNONYMS.get(found.group(0), found.group(0)), text)
+    return re.sub(r"(?<=[\w)])\s+(?=[A-Za-z(])", "*", text)
+
+
+@lru_cache(maxsize=256)
+def _parse(unit: str) -> Any:
+    if unit.strip() in DIMENSIONLESS:
+        return _registry().dimensionless
+    if len(unit) > 80 or not re.fullmatch(r"[\w\s*/^().·µμ°%Ω+-]+", unit):
+        raise UnitError(f'unit "{unit[:80]}" cannot be read; write it like "N", "kg m^2" or "rad/s"')
+    try:
+        return _registry().Unit(_pint_text(unit))
+    except Exception as error:  # pint raises many kinds, tokenizer errors among them
+        raise UnitError(f'unit "{unit}" is not known; write it like "N", "mA", "kg m^2" or "rad/s"') from error
+
+
+@lru_cache(maxsize=1024)
+def factor(unit: str, to: str) -> float:
+    """Return the number that turns a value in `unit` into one in `to`.
+
+    Parameters
+    ----------
+    unit, to : str
+        Unit texts; "", "-" and "1" are dimensionless.
+
+    Raises
+    ------
+    UnitError
+        A unit is unknown, the dimensions differ, or the scale has an offset (degrees Celsius).
+
+    Examples
+    --------
+    >>> factor("mA", "A")
+    0.001
+    >>> round(factor("deg", "rad"), 6)
+    0.017453
+    """
+    if unit.strip() == to.strip():
+        return 1.0
+    source, target = _parse(unit), _parse(to)
+    if source.dimensionality != target.dimensionality:
+        raise UnitError(f'unit "{unit}" is not one of {to or "a pure number"}; give a unit with that dimension')
+    zero, one = (_registry().Quantity(value, source).to(target).magnitude for value in (0.0, 1.0))
+    if abs(zero) > 0.0:
+        raise UnitError(f'unit "{unit}" has an offset against "{to}"; convert the values before reading them')
+    return float(f"{one:.15g}")
+
+
+@lru_cache(maxsize=1024)
+def si_unit(unit: str) -> str:
+    """Return the SI unit of the same dimension, as text: "mA" gives "A", "deg" gives "rad".
+
+    Examples
+    --------
+    >>> si_unit("mA"), si_unit("deg"), si_unit("N"), si_unit("us")
+    ('A', 'rad', 'N', 's')
+    """
+    parsed = _parse(unit)
+    for known in ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2", "V", "rad/s^2", "K", "Hz", "W"):
+        candidate = _parse(known)
+        same_angle = ("radian" in str(_registry().Quantity(1, parsed).to_root_units().units)) == ("rad" in known)
+        if parsed.dimensionality == candidate.dimensionality and same_angle:
+            return known
+    return f"{_registry().Quantity(1.0, parsed).to_base_units().units:~C}".replace("**", "^").replace("*", " ")
+
+
+def same_dimension(first: str, second: str) -> bool:
+    """Tell whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
+    return bool(_parse(first).dimensionality == _parse(second).dimensionality)
