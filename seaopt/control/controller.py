@@ -1,0 +1,154 @@
+"""A tuned controller: the law, what was asked, and what it achieves."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from seaopt.control.digital import DigitalPlant, sample
+from seaopt.control.law import TransferFunction
+from seaopt.control.loop import Loop, LoopFigures
+from seaopt.control.spec import ControllerSpec
+from seaopt.errors import FileError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+
+SCHEMA = "seaopt/controller/1"
+_NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Controller:
+    """F_m = C_r F_ref - C_y F_meas, commanded as the current I = current_per_force_A_per_N F_m.
+
+    Parameters
+    ----------
+    structure : str
+        "pd" or "pid".
+    gains : mapping
+        For reading; the law is `reference` and `measurement`.
+    sample_time_s : float
+        Seconds.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    reference, measurement : TransferFunction
+        C_r and C_y.
+    current_per_force_A_per_N : float
+        Of the design plant.
+    spec : ControllerSpec
+        What was asked.
+    achieved : LoopFigures
+        Of the design plant.
+    feasible : bool
+        Whether every limit is met, as measured.
+    active_constraints : tuple of str
+        The limits that are broken; if none is, those met with nothing to spare.
+    robust_to : tuple of str
+        The plants, besides the design plant, that Ms and Mt were kept on.
+    """
+
+    structure: str
+    gains: Mapping[str, float]
+    sample_time_s: float
+    delay_samples: int
+    reference: TransferFunction
+    measurement: TransferFunction
+    current_per_force_A_per_N: float
+    spec: ControllerSpec
+    achieved: LoopFigures
+    feasible: bool
+    active_constraints: tuple[str, ...]
+    robust_to: tuple[str, ...] = ()
+
+    def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
+        """Return a plant as this controller sees it: from motor force, through its own current per force."""
+        return sample(
+            plant, params, self.spec.measured, self.current_per_force_A_per_N, self.sample_time_s, self.delay_samples
+        )
+
+    def close(self, plant: Plant, params: ParameterSet) -> Loop:
+        """Return the loop of this controller around a plant."""
+        return Loop(plant=self.plant(plant, params), reference=self.reference, measurement=self.measurement)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of controller.json (schema seaopt/controller/1)."""
+        achieved = {field.name: getattr(self.achieved, field.name) for field in fields(LoopFigures)}
+        return {
+            "schema": SCHEMA,
+            "structure": self.structure,
+            "gains": dict(self.gains),
+            "sample_time_s": self.sample_time_s,
+            "delay_samples": self.delay_samples,
+            "reference": {"num": self.reference.num, "den": self.reference.den},
+            "measurement": {"num": self.measurement.num, "den": self.measurement.den},
+            "current_per_force_A_per_N": self.current_per_force_A_per_N,
+            "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
+            "achieved": {name: value for name, value in achieved.items() if name not in _NOT_ACHIEVED},
+            "feasible": self.feasible,
+            "active_constraints": list(self.active_constraints),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet) -> Controller:
+        """Return the controller of a controller.json; what it achieves is computed again on the design plant.
+
+        Raises
+        ------
+        FileError
+            A field is missing or malformed.
+        """
+        try:
+            given = dict(content["spec"])
+            robust_to = tuple(given.pop("robust_to", ()))
+            given["bandwidth_range_hz"] = tuple(given["bandwidth_range_hz"])
+            law = {
+                name: TransferFunction(
+                    num=np.array(content[name]["num"], dtype=float), den=np.array(content[name]["den"], dtype=float)
+                )
+                for name in ("reference", "measurement")
+            }
+            spec = ControllerSpec(**given)
+            gain, ts = float(content["current_per_force_A_per_N"]), float(content["sample_time_s"])
+            delay = int(content["delay_samples"])
+            if ts <= 0.0 or delay < 0 or any(tf.den.size == 0 or tf.den[0] != 1.0 for tf in law.values()):
+                raise ValueError("sample_time_s, delay_samples or den[0]")
+            design = sample(plant, params, spec.measured, gain, ts, delay)
+            return cls(
+                structure=content["structure"], gains=content["gains"], sample_time_s=ts, delay_samples=delay,
+                reference=law["reference"], measurement=law["measurement"], current_per_force_A_per_N=gain, spec=spec,
+                achieved=Loop(plant=design, **law).figures(), feasible=bool(content["feasible"]),
+                active_constraints=tuple(content["active_constraints"]), robust_to=robust_to,
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileError(f"controller.json: {error} is missing or malformed; tune again") from error
+
+    def __repr__(self) -> str:
+        a, s = self.achieved, self.spec
+        gains = ", ".join(f"{name} = {value:.5g}" for name, value in self.gains.items())
+        verdict = "every limit met" if self.feasible else "NOT FEASIBLE: " + ", ".join(self.active_constraints)
+        band = "none" if a.tracking_band_hz is None else f"{a.tracking_band_hz[0]:.3g} to {a.tracking_band_hz[1]:.4g} Hz"
+        return "\n".join(
+            [
+                f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
+                f"{self.delay_samples} samples of delay: {verdict}",
+                f"  {gains}",
+                f"  bandwidth {_shown(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
+                f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
+                f"  gain margin {_shown(a.gain_margin_db)} dB, phase margin {_shown(a.phase_margin_deg)} deg, "
+                f"delay margin {_shown(None if a.delay_margin_s is None else 1e3 * a.delay_margin_s)} ms",
+                f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
+                if self.feasible
+                else "",
+            ]
+        ).rstrip()
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _shown(value: float | None) -> str:
+    return "none" if value is None else f"{value:.4g}"

@@ -1,0 +1,126 @@
+"""What is asked of a controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from seaopt.control.law import Derivative, Structure
+from seaopt.errors import ControlError
+
+LIMITS = ("max_sensitivity", "max_complementary", "max_reference_peak", "max_noise_gain")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerSpec:
+    """A bandwidth and the limits to keep; a limit left out (None) is not imposed.
+
+    Parameters
+    ----------
+    measured : str
+        The output that is fed back, F1 as a rule.
+    bandwidth_hz : float
+        Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
+    bandwidth_range_hz : (low, high)
+        What bandwidth_hz may be; give another range to leave 15 to 60.
+    structure : {"pd", "pid"}
+        Each with feedforward of the reference.
+    derivative : {"error", "measurement"}
+        What is differentiated.
+    sample_rate_hz : float
+        Of the controller.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    max_sensitivity, max_complementary : float, optional
+        Ms and Mt, peaks of abs(S) and abs(L/(1+L)), on every plant.
+    max_reference_peak : float, optional
+        Peak of abs(F/F_ref) over its static value, design plant.
+    max_noise_gain : float, optional
+        Peak of abs(F_m / noise on F), N/N, design plant.
+    min_sensitivity_bandwidth_hz : float, optional
+        abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.
+    objective : {"disturbance", "noise"}
+        Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
+    current_limit_A : float, optional
+        Of the motor.
+    reserve : float
+        Ms, Mt and the other limits are met with this fraction to spare, so that parameters as uncertain as a fit
+        leaves them do not break them.
+
+    Raises
+    ------
+    ControlError
+        A value is out of range, or two contradict each other.
+    """
+
+    measured: str = "F1"
+    bandwidth_hz: float = 30.0
+    bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
+    structure: Structure = "pid"
+    derivative: Derivative = "error"
+    sample_rate_hz: float = 1000.0
+    delay_samples: int = 1
+    max_sensitivity: float | None = None
+    max_complementary: float | None = None
+    max_reference_peak: float | None = None
+    max_noise_gain: float | None = None
+    min_sensitivity_bandwidth_hz: float | None = None
+    objective: Literal["disturbance", "noise"] = "disturbance"
+    current_limit_A: float | None = None
+    reserve: float = 0.005
+
+    def __post_init__(self) -> None:
+        low, high = self.bandwidth_range_hz
+        if not 0.0 < low < high:
+            raise ControlError(f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high")
+        if not low <= self.bandwidth_hz <= high:
+            raise ControlError(
+                f"bandwidth_hz = {self.bandwidth_hz:g} is outside {low:g} to {high:g}; choose one inside, "
+                "or give another bandwidth_range_hz"
+            )
+        if self.structure not in ("pd", "pid"):
+            raise ControlError(f'structure = "{self.structure}" is not known; use "pd" or "pid"')
+        if self.derivative not in ("error", "measurement"):
+            raise ControlError(f'derivative = "{self.derivative}" is not known; use "error" or "measurement"')
+        if self.objective not in ("disturbance", "noise"):
+            raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
+        if self.delay_samples < 0 or self.delay_samples != int(self.delay_samples):
+            raise ControlError(f"delay_samples = {self.delay_samples} is not a whole number of samples; give 0, 1, ...")
+        if not self.sample_rate_hz > 4.0 * self.bandwidth_hz:
+            raise ControlError(
+                f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
+                "sample more than four times as fast"
+            )
+        self._check_limits()
+
+    def _check_limits(self) -> None:
+        for name in LIMITS:
+            value = getattr(self, name)
+            least = 0.0 if name in ("max_noise_gain", "max_complementary") else 1.0
+            if value is not None and not value > least:
+                raise ControlError(f"{name} = {value:g} can be met by no loop; give more than {least:g}")
+        wanted = self.min_sensitivity_bandwidth_hz
+        if wanted is not None and not 0.0 <= wanted < self.bandwidth_hz:
+            raise ControlError(
+                f"min_sensitivity_bandwidth_hz = {wanted:g} is not between 0 and bandwidth_hz = "
+                f"{self.bandwidth_hz:g}; lower it"
+            )
+        if self.current_limit_A is not None and not self.current_limit_A > 0.0:
+            raise ControlError(f"current_limit_A = {self.current_limit_A:g} is not positive; give the motor's limit")
+        if not 0.0 <= self.reserve < 0.5:
+            raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
+
+    @property
+    def sample_time_s(self) -> float:
+        """Seconds between samples."""
+        return 1.0 / self.sample_rate_hz
+
+    @property
+    def sensitivity_bandwidth_limit_hz(self) -> float:
+        """The least sensitivity bandwidth: as given, or bandwidth_hz/5."""
+        given = self.min_sensitivity_bandwidth_hz
+        return self.bandwidth_hz / 5.0 if given is None else given
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields, as in a problem file."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
