@@ -1,4 +1,89 @@
-"""seaopt."""
-from seaopt.plants import *
-from seaopt.parameters import *
-from seaopt import plants
+"""Series elastic actuators: from raw bench logs to a certified force controller.
+
+The names below are in the order of the data path: parameters and plants, logs, simulation, fit, controller,
+certificate, report. Each loads its package when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from seaopt import plants as plants
+    from seaopt import testing as testing
+    from seaopt.bench import Sensors as Sensors
+    from seaopt.bench import virtual_log as virtual_log
+    from seaopt.control import Controller as Controller
+    from seaopt.control import ControllerSpec as ControllerSpec
+    from seaopt.control import tune as tune
+    from seaopt.errors import SeaoptError as SeaoptError
+    from seaopt.estimation import Experiment as Experiment
+    from seaopt.estimation import Fit as Fit
+    from seaopt.estimation import Huber as Huber
+    from seaopt.estimation import OutputError as OutputError
+    from seaopt.estimation import fit as fit
+    from seaopt.frequency import h1 as h1
+    from seaopt.logs import Column as Column
+    from seaopt.logs import Log as Log
+    from seaopt.logs import read_log as read_log
+    from seaopt.logs import write_log as write_log
+    from seaopt.parameters import Parameter as Parameter
+    from seaopt.parameters import ParameterSet as ParameterSet
+    from seaopt.plants import Plant as Plant
+    from seaopt.problem import demo_path as demo_path
+    from seaopt.problem import read_problem as read_problem
+    from seaopt.reporting import write_report as write_report
+    from seaopt.robustness import Certificate as Certificate
+    from seaopt.robustness import certify as certify
+    from seaopt.simulation import simulate as simulate
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Parameter": "seaopt.parameters",
+    "ParameterSet": "seaopt.parameters",
+    "Plant": "seaopt.plants",
+    "plants": "seaopt.plants",
+    "Column": "seaopt.logs",
+    "Log": "seaopt.logs",
+    "read_log": "seaopt.logs",
+    "write_log": "seaopt.logs",
+    "simulate": "seaopt.simulation",
+    "Sensors": "seaopt.bench",
+    "virtual_log": "seaopt.bench",
+    "h1": "seaopt.frequency",
+    "Experiment": "seaopt.estimation",
+    "Huber": "seaopt.estimation",
+    "OutputError": "seaopt.estimation",
+    "Fit": "seaopt.estimation",
+    "fit": "seaopt.estimation",
+    "ControllerSpec": "seaopt.control",
+    "Controller": "seaopt.control",
+    "tune": "seaopt.control",
+    "Certificate": "seaopt.robustness",
+    "certify": "seaopt.robustness",
+    "demo_path": "seaopt.problem",
+    "read_problem": "seaopt.problem",
+    "write_report": "seaopt.reporting",
+    "testing": "seaopt.testing",
+    "SeaoptError": "seaopt.errors",
+}
+__all__ = [  # noqa: RUF022  (in the order of the data path)
+    "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "read_log", "write_log", "simulate", "Sensors",
+    "virtual_log", "h1", "Experiment", "Huber", "OutputError", "Fit", "fit", "ControllerSpec", "Controller", "tune",
+    "Certificate", "certify", "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'seaopt' has no attribute {name!r}")
+    home = import_module(_HOME[name])
+    value = home if name in ("plants", "testing") else getattr(home, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -49,6 +49,8 @@ class Controller:
         The limits that are broken; if none is, those met with nothing to spare.
     robust_to : tuple of str
         The plants, besides the design plant, that Ms and Mt were kept on.
+    design : (Plant, ParameterSet) or None
+        The design plant and its parameters.
     """
 
     structure: str
@@ -63,6 +65,7 @@ class Controller:
     feasible: bool
     active_constraints: tuple[str, ...]
     robust_to: tuple[str, ...] = ()
+    design: tuple[Plant, ParameterSet] | None = None
 
     def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
         """Return a plant as this controller sees it: from motor force, through its own current per force."""
@@ -121,7 +124,7 @@ class Controller:
                 structure=content["structure"], gains=content["gains"], sample_time_s=ts, delay_samples=delay,
                 reference=law["reference"], measurement=law["measurement"], current_per_force_A_per_N=gain, spec=spec,
                 achieved=Loop(plant=design, **law).figures(), feasible=bool(content["feasible"]),
-                active_constraints=tuple(content["active_constraints"]), robust_to=robust_to,
+                active_constraints=tuple(content["active_constraints"]), robust_to=robust_to, design=(plant, params),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise FileError(f"controller.json: {error} is missing or malformed; tune again") from error

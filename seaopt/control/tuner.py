@@ -425,4 +425,5 @@ def _controller(task: Task, gains: Gains, plant: Plant, params: ParameterSet) ->
         feasible=not broken,
         active_constraints=tuple(broken or _active(task, figures)),
         robust_to=task.names[1:],
+        design=(plant, params),
     )

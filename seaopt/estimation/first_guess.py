@@ -71,7 +71,7 @@ def first_guess(
     return guess
 
 
-def _linearised(model: Model) -> Model:
+def linearised(model: Model) -> Model:
     """Return the model linearised at zero state and input."""
     if model.linear:
         return model
@@ -91,7 +91,7 @@ def _targets(
     active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
     if len(active) != 1 or len(log.segments) != 1:
         return []
-    model = _linearised(unknowns.models[e])
+    model = linearised(unknowns.models[e])
     found: list[_Target] = []
     for o, output in enumerate(experiment.outputs):
         if not np.all(np.isfinite(log[output])):

@@ -1,0 +1,48 @@
+# Each command sets up .venv by itself, from any Python >= 3.11; uv is used where it is present.
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+CACHE  := $(VENV)/cache
+export MPLCONFIGDIR := $(CURDIR)/$(CACHE)/matplotlib
+SHELL  := /bin/sh
+PYTEST := $(BIN)/python -m pytest
+
+.PHONY: demo test check lint types contract notebooks bench nocompiler clean setup
+.DEFAULT_GOAL := demo
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt tools/setup.sh
+	@sh tools/setup.sh $(VENV)
+	@touch $(READY)
+
+demo: $(READY)
+	$(BIN)/seaopt demo -o out/demo
+
+test: $(READY)
+	$(PYTEST) -n 2 --dist worksteal -q
+
+# The same numbers without a C compiler: the tests that compare both ways, and the simulation and fit tests.
+nocompiler: $(READY)
+	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q tests/simulation tests/estimation tests/test_whole_path.py
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(READY)
+	$(BIN)/basedpyright
+
+contract: $(READY)
+	$(BIN)/lint-imports --no-cache
+
+notebooks: $(READY)
+	$(PYTEST) --nbmake --nbmake-timeout=300 -q notebooks
+
+check: test nocompiler lint types contract notebooks
+
+bench: $(READY)
+	$(PYTEST) benchmarks -q -s --benchmark-only -p no:xdist -o python_files='bench_*.py' -o filterwarnings=default
+
+clean:
+	rm -rf $(VENV) out

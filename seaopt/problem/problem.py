@@ -1,0 +1,350 @@
+"""A problem: plants, parameters, experiments, controller specification and robustness, read from one TOML file."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from seaopt.bench import Chirp, Excitation, Noise, Sensors, virtual_log
+from seaopt.control import ControllerSpec
+from seaopt.errors import ProblemError, SeaoptError, suggestion
+from seaopt.estimation import Experiment, Huber, Linear
+from seaopt.logs import Column, Log, read_log
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant, known_parameters, plant_of_kind
+from seaopt.problem.schema import (
+    ColumnTable,
+    ExperimentTable,
+    FitTable,
+    ParameterTable,
+    ProblemTable,
+    RobustnessTable,
+    UnknownTable,
+    VirtualTable,
+)
+
+MAX_BYTES = 4 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Problem:
+    """What a problem file describes; logs are read, or made, when asked for.
+
+    Parameters
+    ----------
+    title : str
+    source : str
+        The file, for messages.
+    folder : Path
+        Relative paths of logs start here.
+    parameters : ParameterSet
+        Values of the file over the plants' defaults.
+    plants : mapping of name to Plant
+    table : ProblemTable
+        The validated file.
+    spec : ControllerSpec or None
+        What is asked of the controller.
+    """
+
+    title: str
+    source: str
+    folder: Path
+    parameters: ParameterSet
+    plants: Mapping[str, Plant]
+    table: ProblemTable
+    spec: ControllerSpec | None
+
+    @property
+    def fit_options(self) -> dict[str, Any]:
+        """Keyword arguments for `seaopt.fit`."""
+        table: FitTable = self.table.fit
+        return {
+            "loss": Huber() if table.loss == "huber" else Linear(),
+            "band_hz": table.band_hz,
+            "holdout": table.holdout,
+        }
+
+    @property
+    def design_plant(self) -> Plant:
+        """The plant that the controller is designed on."""
+        if self.table.controller is None:
+            raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
+        return self.plants[self.table.controller.plant]
+
+    @property
+    def robustness(self) -> RobustnessTable:
+        """What the controller must survive; every plant if the file does not say."""
+        table = self.table.robustness
+        return table if table is not None else RobustnessTable(plants=list(self.plants))
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Ranges of parameters besides the fit's covariance."""
+        return dict(self.robustness.parameters)
+
+    def certified_plants(self) -> dict[str, Plant]:
+        """Return the design plant and those of [robustness], by name."""
+        assert self.table.controller is not None or self.design_plant  # noqa: S101
+        names = [self.table.controller.plant] if self.table.controller else []
+        return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
+
+    def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
+        """Return the plants to tune for besides the design plant: each of `robust_to`, and at the ends of the ranges."""
+        out: dict[str, tuple[Plant, ParameterSet]] = {}
+        for name in self.table.controller.robust_to if self.table.controller else []:
+            plant = self.plants[name]
+            values = plant.complete(parameters)
+            out[name] = (plant, values)
+            for parameter, ends in self.ranges.items():
+                if parameter in values:
+                    for end in ends:
+                        out[f"{name}, {parameter} = {end:g}"] = (plant, values.update(**{parameter: end}))
+        return out
+
+    def experiments(self) -> tuple[Experiment, ...]:
+        """Read the logs, and make the virtual ones.
+
+        Raises
+        ------
+        SeaoptError
+            A log cannot be read, or does not fit its plant.
+        """
+        return tuple(self._experiment(table) for table in self.table.experiment)
+
+    def _experiment(self, table: ExperimentTable) -> Experiment:
+        plant = self.plants[table.plant]
+        log = self._virtual(plant, table.virtual) if table.virtual else self._read(plant, table)
+        if table.slice_s is not None:
+            log = log.between(*table.slice_s)
+        sigma = dict(table.sigma)
+        for name, item in table.outputs.items():
+            if isinstance(item, ColumnTable) and item.sigma is not None:
+                sigma[name] = item.sigma
+        measured = tuple(table.outputs) if not table.virtual else _virtual_outputs(plant, table.virtual)
+        return Experiment(
+            plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
+            offset=table.offset, gain={name: _unknown(name, "-", item) for name, item in table.gain.items()},
+            delay_s=_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
+        )  # fmt: skip
+
+    def _read(self, plant: Plant, table: ExperimentTable) -> Log:
+        assert table.log is not None and table.time is not None  # noqa: S101
+        columns = {name: _column(item) for name, item in {**table.inputs, **table.outputs}.items()}
+        path = self.folder / table.log
+        return read_log(path, time=_column(table.time), channels=columns)
+
+    def _virtual(self, plant: Plant, table: VirtualTable) -> Log:
+        parts: list[Chirp | Noise] = []
+        if table.excitation.chirp:
+            parts.append(Chirp(**table.excitation.chirp.model_dump()))
+        if table.excitation.noise:
+            parts.append(Noise(**table.excitation.noise.model_dump()))
+        excitation: Excitation = tuple(parts)
+        truth = {**plant.complete(self.parameters)}
+        for name, value in table.truth.items():
+            if name not in truth:
+                raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, truth)}')
+            truth[name] = replace(truth[name], value=value)
+        sensors = Sensors(
+            noise_std=table.noise_std, offset=table.offset, quantisation=table.quantisation, saturation=table.saturation
+        )
+        return virtual_log(
+            plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
+            seed=table.seed, sensors=sensors,
+        )  # fmt: skip
+
+
+def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
+    """Return the outputs a virtual experiment measures: as listed, else those with noise, else the forces."""
+    if table.outputs:
+        return tuple(table.outputs)
+    noisy = tuple(name for name in plant.outputs if name in table.noise_std)
+    return noisy or tuple(name for name in ("F1", "F2") if name in plant.outputs) or tuple(plant.outputs)
+
+
+def _column(item: str | ColumnTable) -> Column:
+    return Column(column=item) if isinstance(item, str) else Column(column=item.column, unit=item.unit)
+
+
+def _unknown(name: str, unit: str, item: float | UnknownTable) -> float | Parameter:
+    if not isinstance(item, UnknownTable):
+        return item
+    bounds = {key: value for key, value in (("min", item.min), ("max", item.max)) if value is not None}
+    return Parameter(name=name, value=item.value, unit=unit, free=item.free, prior_std=item.prior_std, **bounds)
+
+
+def demo_path() -> Path:
+    """Return the path of the THOR problem that comes with the package."""
+    return Path(str(files("seaopt.problem").joinpath("thor.toml")))
+
+
+def read_problem(path: Path | str) -> Problem:
+    """Read and check a problem file.
+
+    Raises
+    ------
+    ProblemError
+        The file is missing or not TOML, a key is unknown or missing, or a value is out of range; the message names
+        the file, the key, the value and the remedy.
+    SeaoptError
+        What the plants, the parameters or the controller specification refuse.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> problem = so.read_problem(so.demo_path())
+    >>> problem.title, list(problem.plants)
+    ('THOR linear SEA', ['stand', 'swing'])
+    """
+    source = Path(path)
+    table = _validated(source, _toml(source))
+    try:
+        plants = {name: _plant(name, item.kind, item.model_extra or {}) for name, item in table.plant.items()}
+        parameters = _parameters(table.parameters, plants)
+        _check_references(table, plants)
+        spec = _spec(table)
+    except SeaoptError as error:
+        raise type(error)(f"{source}: {error}") from error
+    return Problem(
+        title=table.title, source=str(path), folder=source.parent, parameters=parameters, plants=plants, table=table,
+        spec=spec,
+    )  # fmt: skip
+
+
+def _toml(source: Path) -> dict[str, Any]:
+    try:
+        if source.is_dir():
+            raise ProblemError(f"{source}: is a folder; give a problem file (TOML)")
+        if source.stat().st_size > MAX_BYTES:
+            raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
+        return tomllib.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ProblemError(f"{source}: no such file; check the path") from error
+    except OSError as error:
+        raise ProblemError(f"{source}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ProblemError(f"{source}: is not valid TOML ({error}); correct that place") from error
+
+
+def _validated(source: Path, content: dict[str, Any]) -> ProblemTable:
+    try:
+        return ProblemTable.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = _place(first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = _known_keys(first["loc"])
+            raise ProblemError(f"{source}: unknown key {place}; {suggestion(str(first['loc'][-1]), known)}") from error
+        if first["type"] == "missing":
+            raise ProblemError(f"{source}: key {place} is missing; add it") from error
+        value = repr(first["input"])
+        shown = value if len(value) <= 60 else value[:57] + "..."
+        raise ProblemError(f"{source}: {place} = {shown}: {first['msg']}") from error
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    """Return where in the file an error lies: names of union branches are not keys and are left out."""
+    keys = [str(item + 1) if isinstance(item, int) else item for item in loc]
+    branches = ("Table", "float", "bool", "str", "literal", "dict", "tuple")
+    return ".".join(key for key in keys if not any(branch in key for branch in branches) or key in loc[:1])
+
+
+def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
+    """Return the keys that are known where `loc` points."""
+    model: Any = ProblemTable
+    for item in loc[:-1]:
+        if isinstance(item, int):
+            continue
+        if isinstance(model, type) and issubclass(model, BaseModel) and item in model.model_fields:
+            found = _models_in(model.model_fields[item].annotation)
+            model = found[0] if found else model
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _models_in(annotation: Any) -> list[Any]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for item in getattr(annotation, "__args__", ()) for model in _models_in(item)]
+
+
+def _plant(name: str, kind: str, options: Mapping[str, Any]) -> Plant:
+    try:
+        return plant_of_kind(kind, **options)
+    except SeaoptError as error:
+        raise type(error)(f"plant.{name}: {error}") from error
+
+
+def _parameters(given: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:
+    known = dict(known_parameters())
+    for plant in plants.values():
+        for name in plant.parameters:
+            if name in plant.defaults:
+                known[name] = plant.defaults[name]
+            elif name not in known:
+                if name not in given:
+                    raise ProblemError(f"parameters.{name} is missing; plant {plant.name} needs it")
+                known[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
+    used = {name for plant in plants.values() for name in plant.parameters}
+    items = {name: known[name] for name in known if name in used or name in given}
+    for name, item in given.items():
+        if name not in known:
+            raise ProblemError(f'parameters: unknown parameter "{name}"; {suggestion(name, known)}')
+        items[name] = _parameter(items[name], item if isinstance(item, ParameterTable) else ParameterTable(value=item))
+    return ParameterSet(items.values())
+
+
+def _parameter(default: Parameter, table: ParameterTable) -> Parameter:
+    from seaopt.units import factor
+
+    scale = factor(table.unit, default.unit) if table.unit is not None else 1.0
+    prior = None if table.prior_std is None else table.prior_std * scale
+    free = table.free if table.free is not None else prior is not None
+    low = default.min if table.min is None else table.min * scale
+    high = default.max if table.max is None else table.max * scale
+    return replace(default, value=table.value * scale, free=free, min=low, max=high, prior_std=prior)
+
+
+def _check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+    places = [(f"experiment.{item.name}.plant", item.plant) for item in table.experiment]
+    if table.controller:
+        places.append(("controller.plant", table.controller.plant))
+        places += [("controller.robust_to", name) for name in table.controller.robust_to]
+    if table.robustness:
+        places += [("robustness.plants", name) for name in table.robustness.plants]
+    for place, name in places:
+        if name not in plants:
+            raise ProblemError(f'{place} = "{name}" is no [plant] of this file; {suggestion(name, plants)}')
+    seen: set[str] = set()
+    for item in table.experiment:
+        if item.name in seen:
+            raise ProblemError(f'experiment.name = "{item.name}" is used twice; rename one')
+        seen.add(item.name)
+        _check_experiment(item, plants[item.plant])
+
+
+def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
+    place = f"experiment.{item.name}"
+    if (item.log is None) == (item.virtual is None):
+        raise ProblemError(f"{place}: give either log or virtual, and not both")
+    if item.log is not None:
+        if item.time is None or not item.outputs:
+            raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
+        if Path(item.log).is_absolute() or ".." in Path(item.log).parts:
+            raise ProblemError(f'{place}.log = "{item.log}" leaves the problem file\'s folder; put the log beside it')
+    for kind, given, known in (("inputs", item.inputs, plant.inputs), ("outputs", item.outputs, plant.outputs)):
+        for name in given:
+            if name not in known:
+                raise ProblemError(f'{place}.{kind} names "{name}"; {suggestion(name, known)}')
+
+
+def _spec(table: ProblemTable) -> ControllerSpec | None:
+    if table.controller is None:
+        return None
+    given = table.controller.model_dump(exclude={"plant", "robust_to"})
+    return ControllerSpec(**given)

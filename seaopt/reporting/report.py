@@ -1,0 +1,163 @@
+"""The report: one self-contained HTML page of a fit, a controller and a certificate, and its figures as files."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.errors import SeaoptError
+from seaopt.estimation import Fit
+from seaopt.files import write_bytes, write_text
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.reporting.figures import all_figures
+from seaopt.robustness import Certificate
+
+Result = Fit | Controller | Certificate
+_CAPTIONS = {
+    "time": "Measured and model outputs in the time domain",
+    "response": "Frequency response: H1 estimate of the log over the fitted model",
+    "loop": "The closed loop on every plant",
+}
+
+
+def write_report(results: Sequence[Result], path: Path | str, *, title: str = "Series elastic actuator") -> Path:
+    """Write an HTML page, and its figures beside it as SVG and PNG.
+
+    Parameters
+    ----------
+    results : sequence of Fit, Controller, Certificate
+        At most one of each; sections of what is not there are left out.
+    path : path
+        The page; figures go to the folder ``figures`` beside it.
+    title : str
+        Heading of the page.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    SeaoptError
+        There is nothing to report, or two results of a kind.
+    FileError
+        The folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile, seaopt as so
+    >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), so.ControllerSpec(bandwidth_hz=30))
+    >>> so.write_report([controller], tempfile.mkdtemp() + "/report.html").name
+    'report.html'
+    """
+    fit, controller, certificate = (_only(results, kind) for kind in (Fit, Controller, Certificate))
+    if fit is None and controller is None and certificate is None:
+        raise SeaoptError("write_report got no result; give a Fit, a Controller or a Certificate")
+    if controller is None and certificate is not None:
+        controller = certificate.controller
+    figures = all_figures(fit, controller, _plants(controller, certificate))
+    target = Path(path)
+    drawn: list[dict[str, str]] = []
+    for name, figure in figures.items():
+        svg = _rendered(figure, "svg")
+        write_bytes(target.parent / "figures" / f"{name}.svg", svg)
+        write_bytes(target.parent / "figures" / f"{name}.png", _rendered(figure, "png"))
+        drawn.append({"name": name, "kind": name.split("_")[0], "caption": _caption(name), "svg": _inline(svg.decode(), name)})
+    return write_text(target, _page(title, fit, controller, certificate, drawn))
+
+
+def _only(results: Sequence[Result], kind: type) -> Any:
+    found = [item for item in results if isinstance(item, kind)]
+    if len(found) > 1:
+        raise SeaoptError(f"write_report got {len(found)} results of kind {kind.__name__}; give one, or write two pages")
+    return found[0] if found else None
+
+
+def _plants(controller: Controller | None, certificate: Certificate | None) -> dict[str, tuple[Plant, ParameterSet]]:
+    if certificate is not None:
+        return {name: (plant, certificate.parameters) for name, plant in certificate.models.items()}
+    if controller is not None and controller.design is not None:
+        return {"design plant": controller.design}
+    return {}
+
+
+def _rendered(figure: Any, kind: str) -> bytes:
+    import matplotlib as mpl
+
+    stream = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else None
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "seaopt", "font.size": 9.0}):
+        figure.savefig(stream, format=kind, dpi=130, metadata=metadata)
+    return stream.getvalue()
+
+
+def _inline(svg: str, name: str) -> str:
+    """Return the <svg> element alone, its ids made unique in the page."""
+    body = svg[svg.index("<svg") :]
+    body = re.sub(r'\bid="', f'id="{name}-', body)
+    body = re.sub(r'(xlink:href|href)="#', rf'\1="#{name}-', body)
+    body = body.replace("url(#", f"url(#{name}-")
+    return re.sub(r'(<svg[^>]*?)\swidth="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?)\sheight="[^"]*"', r"\1", body, count=1), count=1)
+
+
+def _caption(name: str) -> str:
+    kind, _, rest = name.partition("_")
+    return _CAPTIONS[kind] + (f": {rest}" if rest else "")
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """Return a number for people: few digits, a dash where there is none."""
+    if value is None:
+        return "–"
+    if isinstance(value, (bool, np.bool_)):
+        return "yes" if value else "no"
+    if not np.isfinite(value):
+        return "∞" if value > 0 else "–"
+    return f"{value:.{digits}g}"
+
+
+def _band(value: tuple[float, float] | None) -> str:
+    return "–" if value is None else f"{number(value[0], 3)} – {number(value[1])}"
+
+
+def _page(title: str, fit: Fit | None, controller: Controller | None, certificate: Certificate | None, figures: Any) -> str:
+    from jinja2 import Environment
+
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["number"] = number
+    environment.filters["band"] = _band
+    template = environment.from_string(files("seaopt.reporting").joinpath("report.html.jinja").read_text(encoding="utf-8"))
+    return template.render(
+        title=title, fit=fit, controller=controller, certificate=certificate, figures=figures,
+        verdict=verdict(fit, controller, certificate),
+    )  # fmt: skip
+
+
+def verdict(fit: Fit | None, controller: Controller | None, certificate: Certificate | None) -> list[tuple[bool, str]]:
+    """Return one line a stage: whether it is met, and what to say."""
+    lines: list[tuple[bool, str]] = []
+    if fit is not None:
+        lines.append((fit.ok, f"Fit: {fit.status.replace('_', ' ')} – {fit.message}"))
+    if controller is not None:
+        what = "every limit met" if controller.feasible else "not met: " + ", ".join(controller.active_constraints)
+        lines.append((controller.feasible, f"Controller at {controller.spec.bandwidth_hz:g} Hz: {what}"))
+    if certificate is not None:
+        mc = certificate.monte_carlo
+        broken = [f"{item.name} ({item.where})" for item in certificate.requirements if not item.met]
+        what = (
+            f"passed – {mc.failures} failures in {mc.samples} draws, failure probability below "
+            f"{mc.failure_probability_bound:.2%}"
+            if certificate.passed
+            else "failed – " + "; ".join(broken)
+        )
+        lines.append((certificate.passed, f"Certificate: {what}"))
+    return lines
