@@ -19,6 +19,7 @@ class SeaoptError(Exception):
     Traceback (most recent call last):
     ...
     seaopt.errors.SeaoptError: bandwidth_hz = 80 is outside 15 to 60; choose one inside, or give bandwidth_range_hz
+
     """
 
 
@@ -67,6 +68,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     'did you mean "bandwidth_hz"?'
     >>> suggestion("zzz", ["J", "b_r"])
     'known: J, b_r'
+
     """
     names = list(known)
     near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)

@@ -21,6 +21,7 @@ def write_bytes(path: Path | str, content: bytes) -> Path:
     ------
     FileError
         The folder cannot be made or written.
+
     """
     target = Path(path)
     name = None
@@ -77,6 +78,7 @@ def read_json(path: Path | str, schema: str) -> dict[str, Any]:
     ------
     FileError
         The file is missing, is not JSON, or carries another schema.
+
     """
     source = Path(path)
     try:

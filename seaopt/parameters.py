@@ -34,6 +34,7 @@ class Parameter:
         Posterior standard deviation, where a fit gave one.
     description : str
         A few words.
+
     """
 
     name: str
@@ -85,6 +86,7 @@ class ParameterSet(Mapping[str, Parameter]):
     >>> params = params.update(J=2e-6).free("J")
     >>> params["J"].value, params.free_names
     (2e-06, ('J',))
+
     """
 
     __slots__ = ("_items",)
@@ -105,6 +107,7 @@ class ParameterSet(Mapping[str, Parameter]):
         --------
         >>> ParameterSet.of(k=(655e3, "N/m"), eta=0.95)["k"].unit
         'N/m'
+
         """
         pairs = {name: given if isinstance(given, tuple) else (given, "-") for name, given in values.items()}
         return cls(Parameter(name=name, value=float(value), unit=unit) for name, (value, unit) in pairs.items())
@@ -146,6 +149,7 @@ class ParameterSet(Mapping[str, Parameter]):
             A name is unknown or a value outside its bounds.
         UnitError
             A unit is unknown or of another dimension.
+
         """
         changed: list[Parameter] = []
         for name, given in values.items():

@@ -22,6 +22,7 @@ class Signal:
         Samples in `unit`; NaN marks a missing one.
     unit : str
         SI unit text; "" where it was not said (arrays from Python are SI by convention).
+
     """
 
     name: str

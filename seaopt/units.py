@@ -65,6 +65,7 @@ def factor(unit: str, to: str) -> float:
     0.001
     >>> round(factor("deg", "rad"), 6)
     0.017453
+
     """
     if unit.strip() == to.strip():
         return 1.0
@@ -85,9 +86,27 @@ def si_unit(unit: str) -> str:
     --------
     >>> si_unit("mA"), si_unit("deg"), si_unit("N"), si_unit("us")
     ('A', 'rad', 'N', 's')
+
     """
     parsed = _parse(unit)
-    for known in ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2", "V", "rad/s^2", "K", "Hz", "W"):
+    for known in (
+        "",
+        "m",
+        "s",
+        "kg",
+        "N",
+        "A",
+        "rad",
+        "N m",
+        "m/s",
+        "rad/s",
+        "m/s^2",
+        "V",
+        "rad/s^2",
+        "K",
+        "Hz",
+        "W",
+    ):
         candidate = _parse(known)
         same_angle = ("radian" in str(_registry().Quantity(1, parsed).to_root_units().units)) == ("rad" in known)
         if parsed.dimensionality == candidate.dimensionality and same_angle:

@@ -20,6 +20,7 @@ class Chirp:
         In the input's unit (A).
     f0_hz, f1_hz : float
         First and last frequency.
+
     """
 
     amplitude: float
@@ -46,6 +47,7 @@ class Noise:
         Standard deviation, in the input's unit (A).
     band_hz : float
         Highest frequency.
+
     """
 
     std: float
@@ -80,6 +82,7 @@ def excite(
     >>> time, current = excite(PAPER_STAND, duration_s=164, rate_hz=400, rng=np.random.default_rng(1))
     >>> time.size
     65600
+
     """
     n = round(duration_s * rate_hz)
     if n < 2:

@@ -31,6 +31,7 @@ class Sensors:
         The step that readings are rounded to.
     saturation : mapping
         Readings are clipped to plus and minus this.
+
     """
 
     noise_std: Mapping[str, float] = field(default_factory=dict[str, float])
@@ -38,9 +39,7 @@ class Sensors:
     quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
     saturation: Mapping[str, float] = field(default_factory=dict[str, float])
 
-    def read(
-        self, name: str, values: Float[np.ndarray, " n"], rng: np.random.Generator
-    ) -> Float[np.ndarray, " n"]:
+    def read(self, name: str, values: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Return what the sensor of one output records."""
         out = values + self.offset.get(name, 0.0) + self.noise_std.get(name, 0.0) * rng.normal(size=values.size)
         limit, step = self.saturation.get(name), self.quantisation.get(name)
@@ -92,6 +91,7 @@ def virtual_log(
     >>> log = virtual_log(so.plants.high_impedance(), so.plants.thor(), PAPER_STAND, duration_s=1, rate_hz=400, seed=1)
     >>> len(log), sorted(log.signals)
     (400, ['F1', 'F2', 'I', 'q'])
+
     """
     devices = sensors if sensors is not None else Sensors()
     for group in (devices.noise_std, devices.offset, devices.quantisation, devices.saturation):

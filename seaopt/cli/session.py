@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -64,7 +64,7 @@ class Session:
             stages[stage](tell)
 
     @contextmanager
-    def _progress(self, label: str) -> Iterator[Callable[[str], None]]:
+    def _progress(self, label: str) -> Generator[Callable[[str], None]]:
         columns = (
             SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<24}"),
             BarColumn(bar_width=16), TimeElapsedColumn(), TextColumn("{task.fields[note]}", style="dim"),
@@ -101,7 +101,9 @@ class Session:
         if "tune" not in self.results:
             path = self.folder / "controller.json"
             if not path.exists():
-                raise ProblemError(f"{path}: no such file; run seaopt tune {self.problem.source} -o {self.folder} first")
+                raise ProblemError(
+                    f"{path}: no such file; run seaopt tune {self.problem.source} -o {self.folder} first"
+                )
             content = read_json(path, "seaopt/controller/1")
             self.results["tune"] = Controller.from_dict(content, self.problem.design_plant, self.values())
         return self.results["tune"]
@@ -115,7 +117,9 @@ class Session:
         runs: dict[str, Log] = {}
         for experiment in self.experiments():
             tell(experiment.name)
-            runs[experiment.name] = simulate(experiment.plant, self.problem.parameters, experiment.log, hold=experiment.hold)
+            runs[experiment.name] = simulate(
+                experiment.plant, self.problem.parameters, experiment.log, hold=experiment.hold
+            )
             self.written.append(write_log(runs[experiment.name], self.folder / f"simulation_{experiment.name}.csv"))
         self.results["simulate"] = runs
 
@@ -137,7 +141,7 @@ class Session:
     def _tune(self, tell: Callable[[str], None]) -> None:
         design, values = self.problem.design_plant, self.values()
         spec = self.problem.spec
-        assert spec is not None  # noqa: S101
+        assert spec is not None
         tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
         result = tune(design, values, spec, self.problem.robust_to(values))
         self.results["tune"] = result
@@ -184,7 +188,9 @@ class Session:
     def _verdict(self, stage: str) -> list[tuple[bool, str]]:
         found = self.results.get(stage)
         return verdict(
-            found if stage == "fit" else None, found if stage == "tune" else None, found if stage == "certify" else None
+            found if stage == "fit" else None,
+            found if stage == "tune" else None,
+            found if stage == "certify" else None,
         )
 
     def show(self, as_json: bool, stages: list[str]) -> None:

@@ -51,6 +51,7 @@ class Controller:
         The plants, besides the design plant, that Ms and Mt were kept on.
     design : (Plant, ParameterSet) or None
         The design plant and its parameters.
+
     """
 
     structure: str
@@ -70,7 +71,12 @@ class Controller:
     def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
         """Return a plant as this controller sees it: from motor force, through its own current per force."""
         return sample(
-            plant, params, self.spec.measured, self.current_per_force_A_per_N, self.sample_time_s, self.delay_samples
+            plant,
+            params,
+            self.spec.measured,
+            self.current_per_force_A_per_N,
+            self.sample_time_s,
+            self.delay_samples,
         )
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
@@ -103,6 +109,7 @@ class Controller:
         ------
         FileError
             A field is missing or malformed.
+
         """
         try:
             given = dict(content["spec"])
@@ -110,7 +117,8 @@ class Controller:
             given["bandwidth_range_hz"] = tuple(given["bandwidth_range_hz"])
             law = {
                 name: TransferFunction(
-                    num=np.array(content[name]["num"], dtype=float), den=np.array(content[name]["den"], dtype=float)
+                    num=np.array(content[name]["num"], dtype=float),
+                    den=np.array(content[name]["den"], dtype=float),
                 )
                 for name in ("reference", "measurement")
             }
@@ -133,7 +141,9 @@ class Controller:
         a, s = self.achieved, self.spec
         gains = ", ".join(f"{name} = {value:.5g}" for name, value in self.gains.items())
         verdict = "every limit met" if self.feasible else "NOT FEASIBLE: " + ", ".join(self.active_constraints)
-        band = "none" if a.tracking_band_hz is None else f"{a.tracking_band_hz[0]:.3g} to {a.tracking_band_hz[1]:.4g} Hz"
+        band = (
+            "none" if a.tracking_band_hz is None else f"{a.tracking_band_hz[0]:.3g} to {a.tracking_band_hz[1]:.4g} Hz"
+        )
         return "\n".join(
             [
                 f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "

@@ -29,6 +29,7 @@ class DigitalPlant:
         From measurement to output, besides the hold.
     static_gain : float
         y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
+
     """
 
     a: Float[np.ndarray, "n n"]
@@ -90,6 +91,7 @@ def sample(
     ------
     ControlError
         The plant has no such output.
+
     """
     if measured not in plant.outputs:
         raise ControlError(

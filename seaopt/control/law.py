@@ -66,6 +66,7 @@ class Gains:
         N/N: feedforward of the reference.
     derivative : {"error", "measurement"}
         What is differentiated.
+
     """
 
     k_p: float
@@ -75,7 +76,9 @@ class Gains:
     k_ff: float
     derivative: Derivative = "error"
 
-    def transfer_functions(self, structure: Structure, sample_time_s: float) -> tuple[TransferFunction, TransferFunction]:
+    def transfer_functions(
+        self, structure: Structure, sample_time_s: float
+    ) -> tuple[TransferFunction, TransferFunction]:
         """Return C_r and C_y over their common denominator (1 - q) (1 - alpha q), or (1 - alpha q) for a pd."""
         alpha = self.T_f / (self.T_f + sample_time_s)
         lag = np.array([1.0, -alpha])

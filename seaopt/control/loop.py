@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -54,6 +55,7 @@ class LoopFigures:
         Symmetric disk margin, 2 / peak of abs(S - T) (Seiler, Packard, Gahinet 2020).
     noise_gain : float
         Peak of abs(F_m / noise on F), N/N.
+
     """
 
     stable: bool
@@ -165,9 +167,9 @@ class Loop:
         )
 
     def _gain_margin(self, f: Float[np.ndarray, " m"]) -> float | None:
-        at = crossings(lambda x: self.open_loop(x).imag, f)
+        at = crossings(lambda x: np.imag(self.open_loop(x)), f)
         ends = np.array([LOWEST_HZ * 1e-3, self.plant.nyquist_hz])  # where L is real, unless it integrates
-        values = self.open_loop(np.concatenate([at, ends]))
+        values: Any = self.open_loop(np.concatenate([at, ends]))
         real = np.abs(values.imag) <= 1e-6 * np.abs(values.real)
         negative = values.real[real & (values.real < 0.0)]
         return float(np.min(np.abs(20.0 * np.log10(-negative)))) if negative.size else None

@@ -51,6 +51,7 @@ class ControllerSpec:
     ------
     ControlError
         A value is out of range, or two contradict each other.
+
     """
 
     measured: str = "F1"

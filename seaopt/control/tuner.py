@@ -59,6 +59,7 @@ def current_per_force(plant: Plant, params: ParameterSet) -> float:
     ------
     ControlError
         The plant's parameters do not say what force a current makes.
+
     """
     complete = plant.complete(params)
     if all(name in complete for name in ("l", "N_p", "K_tau", "eta")):
@@ -107,6 +108,7 @@ def tune(
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> controller.feasible, round(controller.achieved.bandwidth_hz)
     (True, 30)
+
     """
     task = _task(plant, params, spec, robust_to or {})
     frequencies = _frequencies(task)
@@ -256,6 +258,7 @@ def _program(plants: int, m: int, feedback_only: bool) -> tuple[Any, Any]:
         cr_re, cr_im = cr_re - k_d * d_re, cr_im - k_d * d_im
     ms, mt, mr, noise = (data["limit"][i] for i in range(4))  # squares of the limits' inverses
     rows: list[Any] = []
+    bandwidth = energy = t_r = ca.MX()
     for i in range(plants):
         p_re, p_im = data["pr"][:, i], data["pi"][:, i]
         l_re, l_im = p_re * cy_re - p_im * cy_im, p_re * cy_im + p_im * cy_re
@@ -274,7 +277,12 @@ def _program(plants: int, m: int, feedback_only: bool) -> tuple[Any, Any]:
     objective = data["mode"] * smooth_noise * 0.05 + (1 - data["mode"]) * t + 1e3 * slack
     g = ca.vertcat(bandwidth, *relaxed, integral / data["s"][1])
     names = list(data)
-    nlp = {"x": ca.vertcat(x, t, slack), "p": ca.vertcat(*(ca.vec(data[name]) for name in names)), "f": objective, "g": g}
+    nlp = {
+        "x": ca.vertcat(x, t, slack),
+        "p": ca.vertcat(*(ca.vec(data[name]) for name in names)),
+        "f": objective,
+        "g": g,
+    }
     options = {
         "print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 150, "tol": 1e-7,
         "acceptable_tol": 1e-5, "mu_init": 1e-2, "max_wall_time": 20.0},
@@ -288,7 +296,7 @@ def _solve(task: Task, f: Float[np.ndarray, " m"], start: Float[np.ndarray, " 4"
     spec, limits, pid = task.spec, _limits(task.spec), task.spec.structure == "pid"
     solver, names = _program(len(task.plants), f.size, spec.derivative == "measurement")
     ts, w = spec.sample_time_s, 2 * np.pi * f * spec.sample_time_s
-    p = np.column_stack([plant.response(f) for plant in task.plants])
+    p: Any = np.column_stack([plant.response(f) for plant in task.plants])
     inside = f <= spec.bandwidth_hz
     logs = np.log(f / LOWEST_HZ)
     quad = np.zeros(f.size)
@@ -299,7 +307,8 @@ def _solve(task: Task, f: Float[np.ndarray, " m"], start: Float[np.ndarray, " 4"
     data = {
         "pr": p.real, "pi": p.imag, "cos": np.cos(w), "sin": np.sin(w), "ts": ts, "kff": task.k_ff, "s": scale,
         "limit": [limits[name] ** -2.0 for name in ("ms", "mt", "reference_peak", "noise_gain")],
-        "low": (f < 0.97 * spec.bandwidth_hz).astype(float), "slow": (f <= spec.sensitivity_bandwidth_limit_hz).astype(float),
+        "low": (f < 0.97 * spec.bandwidth_hz).astype(float),
+        "slow": (f <= spec.sensitivity_bandwidth_limit_hz).astype(float),
         "at": (f == spec.bandwidth_hz).astype(float), "quad": quad, "mode": float(spec.objective == "noise"),
     }  # fmt: skip
     vector = ca.vertcat(*(ca.vec(ca.DM(data[name])) for name in names))
@@ -311,9 +320,7 @@ def _solve(task: Task, f: Float[np.ndarray, " m"], start: Float[np.ndarray, " 4"
     if not pid:
         upper[-1] = np.inf
     x0 = np.concatenate([start / scale, [logs[k - 1], 0.1]])
-    found = solver(
-        x0=x0, p=vector, lbg=lower, ubg=upper, lbx=[0, 0, 0, 0, 0, 0], ubx=[*top, np.inf, np.inf]
-    )
+    found = solver(x0=x0, p=vector, lbg=lower, ubg=upper, lbx=[0, 0, 0, 0, 0, 0], ubx=[*top, np.inf, np.inf])
     return np.array(found["x"]).ravel()[:4] * scale
 
 
@@ -358,7 +365,10 @@ def _broken(task: Task, figures: list[LoopFigures], slack: float = 1e-6) -> list
             allowed = getattr(spec, limit)
             if allowed is not None and value > allowed * (1 + slack):
                 out.append(f"{limit} ({name})")
-    for limit, value in (("max_reference_peak", design.reference_peak), ("max_noise_gain", design.noise_gain)):
+    for limit, value in (
+        ("max_reference_peak", design.reference_peak),
+        ("max_noise_gain", design.noise_gain),
+    ):
         allowed = getattr(spec, limit)
         if allowed is not None and value > allowed * (1 + slack):
             out.append(limit)
@@ -380,7 +390,10 @@ def _active(task: Task, figures: list[LoopFigures]) -> list[str]:
             if allowed is not None and value > near * allowed:
                 out.append(f"{limit} ({name})")
     design = figures[0]
-    for limit, value in (("max_reference_peak", design.reference_peak), ("max_noise_gain", design.noise_gain)):
+    for limit, value in (
+        ("max_reference_peak", design.reference_peak),
+        ("max_noise_gain", design.noise_gain),
+    ):
         allowed = getattr(spec, limit)
         if allowed is not None and value > near * allowed:
             out.append(limit)

@@ -47,6 +47,7 @@ class Identifiability:
         Ratio of the largest to the smallest singular value of the normalised sensitivities.
     unidentifiable : tuple of mappings
         One a direction that is not seen: relative changes {NAME: weight} that leave every output as it is.
+
     """
 
     rank: int
@@ -64,8 +65,8 @@ def meat(problem: Residuals, z: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarr
         weights, row = problem.weights(e), [1.0] * len(problem.sigma[e])
         for s in range(len(pieces)):
             columns = problem.run(e, s, z, columns=True).columns
-            assert columns is not None  # noqa: S101
-            present = _counted(problem, e, s, weights.settle)
+            assert columns is not None
+            present = counted(problem, e, s, weights.settle)
             for o, sigma in enumerate(problem.sigma[e]):
                 v = columns[:, o] / sigma * present[:, o][:, None]
                 if np.count_nonzero(present[:, o]) < 8:
@@ -81,9 +82,10 @@ def meat(problem: Residuals, z: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarr
     return total, whiteness
 
 
-def _counted(problem: Residuals, e: int, s: int, settle: int) -> Float[np.ndarray, "n ny"]:
+def counted(problem: Residuals, e: int, s: int, settle: int) -> Float[np.ndarray, "n ny"]:
+    """Return 1 for each sample that takes part in the cost, 0 for the others."""
     segment = problem.segments[e][s]
-    assert segment.y is not None  # noqa: S101
+    assert segment.y is not None
     present = np.isfinite(segment.y).astype(float)
     if segment.keep is not None:
         present *= segment.keep

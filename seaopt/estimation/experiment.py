@@ -52,6 +52,7 @@ class Experiment:
     ------
     EstimationError
         The log has no measured output or lacks an input, a unit has the wrong dimension, or a name is unknown.
+
     """
 
     plant: Plant
@@ -95,7 +96,11 @@ class Experiment:
                     )
 
     def _check_settings(self) -> None:
-        known = {"sigma": self.sigma, "gain": self.gain, "offset": self.offset if self.offset is not True else {}}
+        known = {
+            "sigma": self.sigma,
+            "gain": self.gain,
+            "offset": self.offset if self.offset is not True else {},
+        }
         for what, given in known.items():
             for name in given if isinstance(given, Mapping) else ():
                 if name not in self.outputs:

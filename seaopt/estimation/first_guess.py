@@ -7,10 +7,9 @@ given values, screened, and the best are refined by Gauss-Newton with CasADi's d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -18,7 +17,7 @@ from seaopt.errors import LogError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.unknowns import Unknowns
 from seaopt.frequency import h1
-from seaopt.simulation import Model
+from seaopt.simulation import Model, linearised
 
 CANDIDATES = 128
 REFINED = 4
@@ -71,22 +70,7 @@ def first_guess(
     return guess
 
 
-def linearised(model: Model) -> Model:
-    """Return the model linearised at zero state and input."""
-    if model.linear:
-        return model
-    point = ca.vertcat(model.x, model.u)
-    both = ca.vertcat(model.f, model.h)
-    slope, constant = ca.substitute(
-        [ca.jacobian(both, point), both], [point, model.t], [ca.DM.zeros(point.numel()), ca.DM(0)]
-    )
-    rows: Any = ca.mtimes(slope, point) + constant
-    return replace(model, f=rows[: model.nx], h=rows[model.nx :], linear=True, functions={})
-
-
-def _targets(
-    experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None
-) -> list[_Target]:
+def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> list[_Target]:
     log = experiment.log
     active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
     if len(active) != 1 or len(log.segments) != 1:
@@ -131,7 +115,9 @@ def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
     return candidates[np.unique(nearest)]
 
 
-def _misfit(targets: list[_Target], theta: Float[np.ndarray, " p"], derivatives: bool = False) -> tuple[float, Any, Any]:
+def _misfit(
+    targets: list[_Target], theta: Float[np.ndarray, " p"], derivatives: bool = False
+) -> tuple[float, Any, Any]:
     """Return half the squared misfit, and its gradient and Gauss-Newton Hessian if asked."""
     cost, gradient, hessian = 0.0, np.zeros(theta.size), np.zeros((theta.size, theta.size))
     for target in targets:

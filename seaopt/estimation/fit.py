@@ -12,7 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import Covariance, Identifiability, identifiability, meat, posterior
+from seaopt.estimation.covariance import (
+    Covariance,
+    Identifiability,
+    counted,
+    identifiability,
+    meat,
+    posterior,
+)
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.first_guess import first_guess
 from seaopt.estimation.least_squares import Callback, Solution, minimise
@@ -23,6 +30,7 @@ from seaopt.parameters import Parameter, ParameterSet
 
 STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
 MAX_SUBSTEPS = 256
+MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +46,7 @@ class OutputError:
         values are kept where they explain the logs better.
     seed : int
         Of that search.
+
     """
 
     max_iterations: int = 60
@@ -95,6 +104,7 @@ def fit(
     >>> result = so.fit([experiment], truth.update(J=1e-6, b_r=5e-4).free("J", "b_r"))
     >>> result.status, abs(result.parameters["J"].value / 3.31e-6 - 1) < 0.001
     ('converged', True)
+
     """
     started = time.perf_counter()
     chosen = method if method is not None else OutputError()
@@ -177,22 +187,24 @@ def _solve(
 ) -> tuple[Solution, Residuals, float]:
     """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
     unknowns, z, iterations = problem.unknowns, start, 0
-    problem, _ = _refined(problem, z, 0.1)
-    for _ in range(12):
+    problem, error = _refined(problem, z, 0.1)
+    for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem.evaluate, z, unknowns.low, unknowns.high, max_iterations=method.max_iterations, callback=callback
+            problem.evaluate,
+            z,
+            unknowns.low,
+            unknowns.high,
+            max_iterations=method.max_iterations,
+            callback=callback,
         )
         z, iterations = solution.z, iterations + solution.iterations
         updated = _estimated_sigma(problem, solution.evaluation)
         settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(updated, problem.sigma, strict=True))
         finer, error = _refined(problem.with_sigma(updated), z, STEP_ERROR_SIGMA)
-        same_step = finer.substeps == problem.substeps
-        if settled and same_step:
-            break
+        if (settled and finer.substeps == problem.substeps) or attempt == MAX_ROUNDS - 1:
+            return replace(solution, iterations=iterations), problem, error
         problem = finer
-    else:
-        finer, error = _refined(problem, z, STEP_ERROR_SIGMA)
-    return replace(solution, iterations=iterations), problem, error
+    raise AssertionError  # the last attempt returns
 
 
 def _estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.ndarray, " ny"], ...]:
@@ -230,7 +242,7 @@ def _step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> float
     worst = 0.0
     for s in range(len(problem.segments[e])):
         coarse, fine = problem.run(e, s, z, outputs=True).outputs, halved.run(e, s, z, outputs=True).outputs
-        assert coarse is not None and fine is not None  # noqa: S101
+        assert coarse is not None and fine is not None
         with np.errstate(invalid="ignore"):
             worst = max(worst, float(np.max(np.abs(coarse - fine) / problem.sigma[e])) * 16.0 / 15.0)
     return worst
@@ -303,9 +315,7 @@ def _nuisance(experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.nd
     )
 
 
-def _derived(
-    experiments: tuple[Experiment, ...], fitted: ParameterSet, covariance: Covariance
-) -> dict[str, Derived]:
+def _derived(experiments: tuple[Experiment, ...], fitted: ParameterSet, covariance: Covariance) -> dict[str, Derived]:
     """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g."""
     out: dict[str, Derived] = {}
     for experiment in experiments:
@@ -316,18 +326,26 @@ def _derived(
         rows = [covariance.names.index(name) for name in free]
         matrix = covariance.matrix[np.ix_(rows, rows)]
         for name, (expression, unit) in plant.derived_values().items():
-            function: Any = ca.Function("derived", [plant.p], [expression, ca.densify(ca.gradient(expression, plant.p))])
+            function: Any = ca.Function(
+                "derived", [plant.p], [expression, ca.densify(ca.gradient(expression, plant.p))]
+            )
             value, slope = function(values)
             g = np.array(slope).ravel()[[names.index(item) for item in free]]
             used = g != 0.0
-            variance = float(g[used] @ matrix[np.ix_(used, used)] @ g[used]) if np.any(used) else 0.0
-            std = float(np.sqrt(max(variance, 0.0))) if np.isfinite(variance) else np.inf
+            block = matrix[np.ix_(used, used)]
+            variance = float(g[used] @ block @ g[used]) if np.all(np.isfinite(block)) else np.inf
+            std = float(np.sqrt(max(variance, 0.0)))
             out.setdefault(name, Derived(value=float(value), unit=unit, std=std))
     return out
 
 
 def _explained(
-    result: Fit, problem: Residuals, e: int, holdout: float, whiteness: list[float], z: Float[np.ndarray, " n"]
+    result: Fit,
+    problem: Residuals,
+    e: int,
+    holdout: float,
+    whiteness: list[float],
+    z: Float[np.ndarray, " n"],
 ) -> dict[str, OutputFit]:
     """Return how well each output is explained, on the samples used and on those held out."""
     experiment = problem.experiments[e]
@@ -348,12 +366,31 @@ def _explained(
         out[name] = OutputFit(
             fit_percent=_fit_percent(measured[used, o], residual[used]),
             holdout_fit_percent=_fit_percent(measured[rest, o], residual[rest]) if np.any(rest) else None,
+            band_fit_percent=_band_fit_percent(problem, e, o, z),
             rms_residual=float(np.sqrt(np.mean(residual[used] ** 2))),
             sigma=float(problem.sigma[e][o]),
             unit=experiment.plant.outputs[name],
             whiteness_p=whiteness[o],
         )
     return out
+
+
+def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float | None:
+    """Return the fit of the filtered signals, over the samples that counted; None without a band."""
+    weights = problem.weights(e)
+    if not len(weights.sections):
+        return None
+    residual, signal = 0.0, 0.0
+    for s, segment in enumerate(problem.segments[e]):
+        columns = problem.run(e, s, z, columns=True).columns
+        assert columns is not None and segment.y is not None
+        present = counted(problem, e, s, weights.settle)[:, o] > 0.0
+        gain, offset = problem.point(e, s, z).gain[o], problem.point(e, s, z).offset[o]
+        modelled = gain * columns[:, o, -1] + offset * columns[:, o, -2]  # the filtered model output
+        measured = (modelled - columns[:, o, 0])[present]
+        residual += float(np.sum(columns[present, o, 0] ** 2))
+        signal += float(np.sum((measured - np.mean(measured)) ** 2))
+    return 100.0 * (1.0 - float(np.sqrt(residual / max(signal, 1e-300))))
 
 
 def _fit_percent(measured: Float[np.ndarray, " n"], residual: Float[np.ndarray, " n"]) -> float:

@@ -60,6 +60,7 @@ def minimise(
         Evaluations after the first.
     callback : callable, optional
         Called with the iteration and the cost.
+
     """
     z = np.clip(start, low, high)
     here = evaluate(z)

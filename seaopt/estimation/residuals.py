@@ -33,6 +33,7 @@ class Huber:
     ----------
     threshold : float
         In sigma; 1.345 keeps 95 % of the efficiency on Gaussian noise.
+
     """
 
     threshold: float = 1.345
@@ -70,6 +71,7 @@ class Residuals:
         Residuals are filtered to this band.
     substeps : tuple of int
         Integration steps a sample, one an experiment.
+
     """
 
     experiments: tuple[Experiment, ...]
@@ -163,6 +165,7 @@ def band_filter(band_hz: tuple[float, float] | None, period: float) -> tuple[Flo
     ------
     EstimationError
         The band is empty.
+
     """
     none = np.zeros((0, 5)), 0
     if band_hz is None:

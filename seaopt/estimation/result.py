@@ -30,6 +30,8 @@ class OutputFit:
         100 (1 - |y - yhat| / |y - mean(y)|) over the samples used.
     holdout_fit_percent : float or None
         The same over the samples kept back; None if there are none.
+    band_fit_percent : float or None
+        The same for the signals filtered to the fit's band; None without one.
     rms_residual : float
         Of the samples used, unfiltered, in `unit`.
     sigma : float
@@ -38,10 +40,12 @@ class OutputFit:
         The output's.
     whiteness_p : float
         Ljung-Box p-value of the weighted residual; small means coloured.
+
     """
 
     fit_percent: float
     holdout_fit_percent: float | None
+    band_fit_percent: float | None
     rms_residual: float
     sigma: float
     unit: str
@@ -109,6 +113,7 @@ class Fit:
         Largest integration error in an output, in sigma; zero for linear plants, which are discretised exactly.
     experiments : tuple of Experiment
         The data; empty when read from a file.
+
     """
 
     status: str
@@ -147,7 +152,7 @@ class Fit:
                 substeps=16,
             )  # fmt: skip
             found = run_pass(model, segment, point, outputs=True).outputs
-            assert found is not None  # noqa: S101
+            assert found is not None
             y[piece] = found * gain + offset
         log = experiment.log
         return Prediction(
@@ -194,6 +199,7 @@ class Fit:
         ------
         FileError
             A field is missing or malformed.
+
         """
         try:
             return _from_dict(content, experiments)
@@ -209,6 +215,7 @@ class Fit:
         for name, row in self.outputs.items():
             for output, item in row.items():
                 held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"
+                held += "" if item.band_fit_percent is None else f", in the band {item.band_fit_percent:.2f} %"
                 lines.append(
                     f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
                     f"rms residual {item.rms_residual:.4g} {item.unit}"
@@ -228,6 +235,7 @@ def _parameter_dict(item: Parameter) -> dict[str, Any]:
     return {
         "value": item.value, "unit": item.unit, "free": item.free, "std": item.std, "ci95": ci95,
         "at_bound": item.at_bound, "min": item.min, "max": item.max, "prior_std": item.prior_std,
+        "description": item.description,
     }  # fmt: skip
 
 
@@ -235,12 +243,17 @@ def _number(value: Any, missing: float) -> float:
     return missing if value is None else float(value)
 
 
+def _std(item: Mapping[str, Any]) -> float | None:
+    """Return a parameter's std: null stands for an infinite one, or for none of a value that is held."""
+    return _number(item["std"], math.inf) if item["free"] and not item["at_bound"] else None
+
+
 def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) -> Fit:
     parameters = ParameterSet(
         Parameter(
             name=name, value=float(item["value"]), unit=item["unit"], free=bool(item["free"]),
             min=_number(item.get("min"), -math.inf), max=_number(item.get("max"), math.inf),
-            prior_std=item.get("prior_std"), std=_number(item["std"], math.inf) if item["free"] else None,
+            prior_std=item.get("prior_std"), description=item.get("description", ""), std=_std(item),
         )
         for name, item in content["parameters"].items()
     )  # fmt: skip

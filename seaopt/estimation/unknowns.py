@@ -55,6 +55,7 @@ class Unknowns:
         One an experiment.
     models : tuple of Model
         One an experiment, in its own free parameters.
+
     """
 
     names: tuple[str, ...]
@@ -106,6 +107,7 @@ def collect(experiments: tuple[Experiment, ...], params: ParameterSet) -> Unknow
     ------
     EstimationError
         Nothing is free, or a free parameter belongs to no plant of the experiments.
+
     """
     used = {name for experiment in experiments for name in experiment.plant.parameters}
     for name in params.free_names:

@@ -30,6 +30,7 @@ class FrequencyResponse:
         Between 0 and 1.
     averages : int
         Stretches averaged.
+
     """
 
     frequency_hz: Float[np.ndarray, " m"]
@@ -71,6 +72,7 @@ def h1(
     >>> estimate = h1(u, 3 * u, 1 / 400)
     >>> bool(np.allclose(estimate.response, 3.0)), bool(np.all(estimate.coherence > 0.999))
     (True, True)
+
     """
     n = u.size
     length = int(n / 16) if stretch_s is None else round(stretch_s / period)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -38,6 +39,7 @@ class Log:
     >>> log = Log.from_arrays(time=t, I=np.ones(5), F1=240 * np.ones(5), units={"I": "A", "F1": "N"})
     >>> log.rate_hz, log["F1"][0]
     (400.0, 240.0)
+
     """
 
     time: Float[np.ndarray, " n"]
@@ -96,6 +98,7 @@ class Log:
             Shapes differ, an array is not numeric, or time does not increase.
         UnitError
             A unit is unknown.
+
         """
         given = dict(units or {})
         for name in given:
@@ -137,10 +140,11 @@ class Log:
         ------
         LogError
             Inside a stretch the clock strays by more than 5 % of the period: the log is not uniformly sampled.
+
         """
         breaks = np.flatnonzero(np.diff(self.time) > GAP * self.period) + 1
         edges = [0, *breaks.tolist(), len(self)]
-        pieces = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= 2]
+        pieces = [slice(a, b) for a, b in pairwise(edges) if b - a >= 2]
         for piece in pieces:
             worst = float(np.max(np.abs(np.diff(self.time[piece]) - self.period)))
             if worst > JITTER_LIMIT * self.period:
@@ -157,6 +161,7 @@ class Log:
         ------
         LogError
             Fewer than two samples lie there.
+
         """
         clock = self.time - self.time[0]
         keep = (clock >= start_s - 1e-9) & (clock <= stop_s + 1e-9)

@@ -39,13 +39,14 @@ def header_unit(header: str) -> str | None:
     --------
     >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
     ('N', 'usec', None)
+
     """
     found = _BRACKETS.match(header)
     return found["unit"].strip() if found else None
 
 
 def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str | Column]) -> Log:
-    """Read a CSV file with a header line.
+    r"""Read a CSV file with a header line.
 
     Parameters
     ----------
@@ -73,9 +74,10 @@ def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str
     --------
     >>> import tempfile, pathlib
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "chirp.csv"
-    >>> _ = file.write_text("time [s],cur\\n0.0,100\\n0.0025,150\\n")
+    >>> _ = file.write_text("time [s],cur\n0.0,100\n0.0025,150\n")
     >>> read_log(file, time="time [s]", channels={"I": Column(column="cur", unit="mA")})["I"].tolist()
     [0.1, 0.15]
+
     """
     source = Path(path)
     text = _read_text(source)
@@ -186,7 +188,9 @@ def _parse(source: Path, text: str, headers: list[str], delimiter: str, wanted: 
         ).rename(lambda name: name.split(":", 1)[1])
     except (pl.exceptions.PolarsError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise LogError(f"{source}: cannot be read as CSV ({reason}); check that every row has the header's columns") from error
+        raise LogError(
+            f"{source}: cannot be read as CSV ({reason}); check that every row has the header's columns"
+        ) from error
 
 
 def _numbers(source: Path, table: pl.DataFrame, column: str) -> Float[np.ndarray, " n"]:

@@ -14,7 +14,10 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants.plant import Plant
 
 Matrices = tuple[
-    Float[np.ndarray, "nx nx"], Float[np.ndarray, "nx nu"], Float[np.ndarray, "ny nx"], Float[np.ndarray, "ny nu"]
+    Float[np.ndarray, "nx nx"],
+    Float[np.ndarray, "nx nu"],
+    Float[np.ndarray, "ny nx"],
+    Float[np.ndarray, "ny nu"],
 ]
 
 
@@ -39,6 +42,7 @@ def point(kind: str, names: Mapping[str, str], values: Mapping[str, float] | Non
     ------
     PlantError
         A name is not one of `names`.
+
     """
     given = dict(values or {})
     for name in given:

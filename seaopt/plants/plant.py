@@ -64,6 +64,7 @@ class Plant:
     >>> model = plant.linearize(so.ParameterSet.of(m=(2.0, "kg"), k=(50.0, "N/m"), c=(1.0, "N s/m")))
     >>> [round(abs(pole), 6) for pole in model.poles()]
     [5.0, 5.0]
+
     """
 
     name: str
@@ -116,6 +117,7 @@ class Plant:
         ------
         ParameterError
             A parameter has neither a value in `params` nor a default.
+
         """
         defaults = self.defaults
         values: list[float] = []
@@ -161,6 +163,7 @@ class Plant:
         -------
         control.StateSpace
             From `inputs` to `outputs`, states named as the plant's.
+
         """
         import control  # deferred: it imports matplotlib
 
@@ -168,7 +171,14 @@ class Plant:
 
         a, b, c, d = state_space(self, params, x, u)
         return control.ss(
-            a, b, c, d, states=list(self.states), inputs=list(self.inputs), outputs=list(self.outputs), name=self.name
+            a,
+            b,
+            c,
+            d,
+            states=list(self.states),
+            inputs=list(self.inputs),
+            outputs=list(self.outputs),
+            name=self.name,
         )
 
     def __repr__(self) -> str:
@@ -209,7 +219,24 @@ def _check_names(plant: Plant) -> None:
 
 # Units that need no look-up: asking pint costs 0.2 s the first time.
 _COMMON_UNITS = frozenset(
-    ("m", "s", "kg", "N", "A", "rad", "V", "m/s", "rad/s", "N/m", "kg m^2", "N m", "N m/A", "N s/m", "N m s", "m/s^2")
+    (
+        "m",
+        "s",
+        "kg",
+        "N",
+        "A",
+        "rad",
+        "V",
+        "m/s",
+        "rad/s",
+        "N/m",
+        "kg m^2",
+        "N m",
+        "N m/A",
+        "N s/m",
+        "N m s",
+        "m/s^2",
+    )
 )
 
 
@@ -232,4 +259,6 @@ def _check_structure(plant: Plant) -> None:
             raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
     for index, name in enumerate(plant.states):
         if not ca.depends_on(plant.dynamics[index], moved_by):
-            raise PlantError(f'plant {plant.name}: state "{name}" is driven by nothing; check f, or make it a parameter')
+            raise PlantError(
+                f'plant {plant.name}: state "{name}" is driven by nothing; check f, or make it a parameter'
+            )

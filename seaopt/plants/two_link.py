@@ -84,6 +84,7 @@ def thor() -> ParameterSet:
     >>> params = thor()
     >>> params["k"].value, params["J"].value
     (655000.0, 3.31e-06)
+
     """
     return ParameterSet((*_ACTUATOR, *_PENDULUM, _GRAVITY))
 
@@ -216,8 +217,8 @@ def _build(name: str, links: tuple[Link, Link], suffixes: tuple[str, str], drive
         parameters.append(_GRAVITY)
 
     def motion(x: Any, u: Any, p: Any) -> _Motion:
-        models = tuple(_link_model(links[i], i + 1, suffixes[i], x, p) for i in (0, 1))
-        return _motion(x, u, p, models, drive, spring)
+        first, second = (_link_model(links[i], i + 1, suffixes[i], x, p) for i in (0, 1))
+        return _motion(x, u, p, (first, second), drive, spring)
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
         flat = [item for pair in motion(x, u, p).rates for item in pair]
@@ -273,6 +274,7 @@ def two_link(
     >>> plant = two_link(link1="mass", link2="pendulum")
     >>> list(plant.states)
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
+
     """
     return _build(f"two_link({link1}, {link2}, {drive})", (link1, link2), ("1", "2"), drive, spring, True)
 
@@ -295,6 +297,7 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1") -> Plant
     >>> model = high_impedance().linearize(thor())
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True
+
     """
     return _build(f"high_impedance({drive})", ("fixed", "fixed"), ("1", "2"), drive, spring, False)
 
@@ -316,5 +319,6 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1") -> Plant:
     --------
     >>> list(moving_output().outputs)
     ['F1', 'F2', 'q', 'phi', 'x_2']
+
     """
     return _build(f"moving_output({drive})", ("fixed", "pendulum"), ("1", ""), drive, spring, False)

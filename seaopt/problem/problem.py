@@ -50,6 +50,7 @@ class Problem:
         The validated file.
     spec : ControllerSpec or None
         What is asked of the controller.
+
     """
 
     title: str
@@ -90,12 +91,13 @@ class Problem:
 
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name."""
-        assert self.table.controller is not None or self.design_plant  # noqa: S101
-        names = [self.table.controller.plant] if self.table.controller else []
+        if self.table.controller is None:
+            raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
+        names = [self.table.controller.plant]
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
-        """Return the plants to tune for besides the design plant: each of `robust_to`, and at the ends of the ranges."""
+        """Return the plants to tune for besides the design plant: each of `robust_to`, at the ends of the ranges too."""
         out: dict[str, tuple[Plant, ParameterSet]] = {}
         for name in self.table.controller.robust_to if self.table.controller else []:
             plant = self.plants[name]
@@ -114,6 +116,7 @@ class Problem:
         ------
         SeaoptError
             A log cannot be read, or does not fit its plant.
+
         """
         return tuple(self._experiment(table) for table in self.table.experiment)
 
@@ -134,7 +137,7 @@ class Problem:
         )  # fmt: skip
 
     def _read(self, plant: Plant, table: ExperimentTable) -> Log:
-        assert table.log is not None and table.time is not None  # noqa: S101
+        assert table.log is not None and table.time is not None
         columns = {name: _column(item) for name, item in {**table.inputs, **table.outputs}.items()}
         path = self.folder / table.log
         return read_log(path, time=_column(table.time), channels=columns)
@@ -152,7 +155,10 @@ class Problem:
                 raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, truth)}')
             truth[name] = replace(truth[name], value=value)
         sensors = Sensors(
-            noise_std=table.noise_std, offset=table.offset, quantisation=table.quantisation, saturation=table.saturation
+            noise_std=table.noise_std,
+            offset=table.offset,
+            quantisation=table.quantisation,
+            saturation=table.saturation,
         )
         return virtual_log(
             plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
@@ -175,8 +181,10 @@ def _column(item: str | ColumnTable) -> Column:
 def _unknown(name: str, unit: str, item: float | UnknownTable) -> float | Parameter:
     if not isinstance(item, UnknownTable):
         return item
-    bounds = {key: value for key, value in (("min", item.min), ("max", item.max)) if value is not None}
-    return Parameter(name=name, value=item.value, unit=unit, free=item.free, prior_std=item.prior_std, **bounds)
+    free = item.free or item.prior_std is not None
+    known = Parameter(name=name, value=item.value, unit=unit, free=free, prior_std=item.prior_std)
+    low = known.min if item.min is None else item.min
+    return replace(known, min=low, max=known.max if item.max is None else item.max)
 
 
 def demo_path() -> Path:
@@ -201,6 +209,7 @@ def read_problem(path: Path | str) -> Problem:
     >>> problem = so.read_problem(so.demo_path())
     >>> problem.title, list(problem.plants)
     ('THOR linear SEA', ['stand', 'swing'])
+
     """
     source = Path(path)
     table = _validated(source, _toml(source))
@@ -337,7 +346,10 @@ def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
             raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
         if Path(item.log).is_absolute() or ".." in Path(item.log).parts:
             raise ProblemError(f'{place}.log = "{item.log}" leaves the problem file\'s folder; put the log beside it')
-    for kind, given, known in (("inputs", item.inputs, plant.inputs), ("outputs", item.outputs, plant.outputs)):
+    for kind, given, known in (
+        ("inputs", item.inputs, plant.inputs),
+        ("outputs", item.outputs, plant.outputs),
+    ):
         for name in given:
             if name not in known:
                 raise ProblemError(f'{place}.{kind} names "{name}"; {suggestion(name, known)}')

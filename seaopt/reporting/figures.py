@@ -14,7 +14,7 @@ from seaopt.estimation import Experiment, Fit, Prediction
 from seaopt.frequency import h1
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.simulation import Clock, make_model, transition
+from seaopt.simulation import Clock, linearised, make_model, transition
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +32,7 @@ def _figure(rows: int, columns: int, height: float, **options: Any) -> tuple[Fig
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.ravel():
         axis.grid(visible=True, which="both", color="#e4e4e4", linewidth=0.5)
+        axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
     return figure, axes
 
@@ -52,7 +53,7 @@ def time_figure(prediction: Prediction, units: dict[str, str]) -> Figure:
         low, high, at = _envelope(measured - model, time)
         right.fill_between(at, low, high, color=MEASURED, linewidth=0.0)
         right.set_ylabel(f"residual [{units[name]}]")
-    axes[0, 0].legend(loc="upper right", frameon=False, ncols=2, fontsize="small")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", frameon=False, ncols=2)
     for axis, title in zip(axes[0], ("largest motion", "whole log: range of measured - model"), strict=True):
         axis.set_title(title, fontsize="medium")
     for axis in axes[-1]:
@@ -93,13 +94,18 @@ def response_figure(experiment: Experiment, parameters: ParameterSet, delay_s: f
         dense = np.geomspace(f[0], f[-1], 800)
         model = _sampled_response(plant, parameters, experiment, active[0], name, delay_s, dense)
         unit = f"{plant.outputs[name]}/{plant.inputs[active[0]]}"
-        _bode(axes[:, column], f, estimate.response[good], dict(color=MEASURED, marker=".", markersize=2.5, linestyle=""))
-        _bode(axes[:, column], dense, model, dict(color=MODEL, linewidth=1.3))
+        dots = {"color": MEASURED, "marker": ".", "markersize": 2.5, "linestyle": ""}
+        line = {"color": MODEL, "linewidth": 1.3}
+        phase = np.degrees(np.unwrap(np.angle(model)))
+        # Measured phase is drawn on the branch nearest the model's: noise at a dip must not shift the rest by a turn.
+        nearest = np.interp(f, dense, phase)
+        turned = np.degrees(np.angle(estimate.response[good] * np.exp(-1j * np.radians(nearest)))) + nearest
+        _bode(axes[:, column], f, estimate.response[good], turned, dots)
+        _bode(axes[:, column], dense, model, phase, line)
         axes[0, column].set_title(f"{name}/{active[0]} [{unit}]", fontsize="medium")
         axes[1, column].set_xlabel("frequency [Hz]")
-    axes[0, 0].lines[0].set_label("measured (H1, coherence above 0.3)")
-    axes[0, 0].lines[1].set_label("model")
-    axes[0, 0].legend(loc="lower left", frameon=False, fontsize="small")
+    labels = ("measured (H1, coherence above 0.3)", "model")
+    figure.legend(axes[0, 0].lines[:2], labels, loc="outside upper left", frameon=False, ncols=2)
     axes[0, 0].set_ylabel("magnitude [dB]")
     axes[1, 0].set_ylabel("phase [deg]")
     return figure
@@ -110,8 +116,6 @@ def _sampled_response(
     f: Float[np.ndarray, " m"],
 ) -> Any:  # fmt: skip
     """Return the response from input samples to output samples of the plant linearised at rest."""
-    from seaopt.estimation.first_guess import linearised
-
     model = linearised(make_model(plant, parameters, (), (output,)))
     clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=delay_s)
     block = transition(model, np.zeros(0), clock)[0]
@@ -125,10 +129,10 @@ def _sampled_response(
     return state @ block[nx, :nx] + drive[:, nx]
 
 
-def _bode(axes: Iterable[Axes], f: Any, response: Any, style: dict[str, Any]) -> None:
+def _bode(axes: Iterable[Axes], f: Any, response: Any, phase_deg: Any, style: dict[str, Any]) -> None:
     magnitude, phase = axes
     magnitude.semilogx(f, 20 * np.log10(np.maximum(np.abs(response), 1e-12)), **style)
-    phase.semilogx(f, np.degrees(np.unwrap(np.angle(response))), **style)
+    phase.semilogx(f, phase_deg, **style)
 
 
 def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, ParameterSet]]) -> Figure:
@@ -139,13 +143,16 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
         grid = loop.grid()
         f = grid[(grid >= 0.05) & (grid < 0.999 * loop.plant.nyquist_hz)]
         style = {"color": colour, "linewidth": 1.3, "label": name}
-        _bode((axes[0, 0], axes[1, 0]), f, loop.open_loop(f), style)
+        open_loop = loop.open_loop(f)
+        _bode((axes[0, 0], axes[1, 0]), f, open_loop, np.degrees(np.unwrap(np.angle(open_loop))), style)
         axes[0, 1].semilogx(f, 20 * np.log10(np.abs(loop.sensitivity(f))), **style)
         axes[1, 1].semilogx(f, 20 * np.log10(np.maximum(np.abs(loop.tracking(f)), 1e-6)), **style)
     spec = controller.spec
     if spec.max_sensitivity is not None:
         limit = 20 * np.log10(spec.max_sensitivity)
-        axes[0, 1].axhline(limit, color="#444444", linestyle="--", linewidth=0.9, label=f"Ms = {spec.max_sensitivity:g}")
+        axes[0, 1].axhline(
+            limit, color="#444444", linestyle="--", linewidth=0.9, label=f"Ms = {spec.max_sensitivity:g}"
+        )
     axes[1, 1].axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9)
     axes[1, 1].axvline(spec.bandwidth_hz, color="#444444", linestyle="--", linewidth=0.9, label="bandwidth asked")
     axes[1, 1].set_ylim(-30, 12)
@@ -162,11 +169,13 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
     return figure
 
 
-def all_figures(fit: Fit | None, controller: Controller | None, plants: dict[str, tuple[Plant, ParameterSet]]) -> dict[str, Figure]:
+def all_figures(
+    fit: Fit | None, controller: Controller | None, plants: dict[str, tuple[Plant, ParameterSet]]
+) -> dict[str, Figure]:
     """Return every figure that the results allow, by file name."""
     out: dict[str, Figure] = {}
     for experiment in fit.experiments if fit is not None else ():
-        assert fit is not None  # noqa: S101
+        assert fit is not None
         units = {name: experiment.plant.outputs[name] for name in experiment.outputs}
         out[f"time_{experiment.name}"] = time_figure(fit.predict(experiment), units)
         response = response_figure(experiment, fit.parameters, fit.nuisance[experiment.name].delay_s)

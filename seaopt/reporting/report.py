@@ -58,6 +58,7 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), so.ControllerSpec(bandwidth_hz=30))
     >>> so.write_report([controller], tempfile.mkdtemp() + "/report.html").name
     'report.html'
+
     """
     fit, controller, certificate = (_only(results, kind) for kind in (Fit, Controller, Certificate))
     if fit is None and controller is None and certificate is None:
@@ -71,14 +72,23 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
         svg = _rendered(figure, "svg")
         write_bytes(target.parent / "figures" / f"{name}.svg", svg)
         write_bytes(target.parent / "figures" / f"{name}.png", _rendered(figure, "png"))
-        drawn.append({"name": name, "kind": name.split("_")[0], "caption": _caption(name), "svg": _inline(svg.decode(), name)})
+        drawn.append(
+            {
+                "name": name,
+                "kind": name.split("_")[0],
+                "caption": _caption(name),
+                "svg": _inline(svg.decode(), name),
+            }
+        )
     return write_text(target, _page(title, fit, controller, certificate, drawn))
 
 
 def _only(results: Sequence[Result], kind: type) -> Any:
     found = [item for item in results if isinstance(item, kind)]
     if len(found) > 1:
-        raise SeaoptError(f"write_report got {len(found)} results of kind {kind.__name__}; give one, or write two pages")
+        raise SeaoptError(
+            f"write_report got {len(found)} results of kind {kind.__name__}; give one, or write two pages"
+        )
     return found[0] if found else None
 
 
@@ -106,7 +116,12 @@ def _inline(svg: str, name: str) -> str:
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href|href)="#', rf'\1="#{name}-', body)
     body = body.replace("url(#", f"url(#{name}-")
-    return re.sub(r'(<svg[^>]*?)\swidth="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?)\sheight="[^"]*"', r"\1", body, count=1), count=1)
+    return re.sub(
+        r'(<svg[^>]*?)\swidth="[^"]*"',
+        r"\1",
+        re.sub(r'(<svg[^>]*?)\sheight="[^"]*"', r"\1", body, count=1),
+        count=1,
+    )
 
 
 def _caption(name: str) -> str:
@@ -129,13 +144,17 @@ def _band(value: tuple[float, float] | None) -> str:
     return "–" if value is None else f"{number(value[0], 3)} – {number(value[1])}"
 
 
-def _page(title: str, fit: Fit | None, controller: Controller | None, certificate: Certificate | None, figures: Any) -> str:
+def _page(
+    title: str, fit: Fit | None, controller: Controller | None, certificate: Certificate | None, figures: Any
+) -> str:
     from jinja2 import Environment
 
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["number"] = number
     environment.filters["band"] = _band
-    template = environment.from_string(files("seaopt.reporting").joinpath("report.html.jinja").read_text(encoding="utf-8"))
+    template = environment.from_string(
+        files("seaopt.reporting").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    )
     return template.render(
         title=title, fit=fit, controller=controller, certificate=certificate, figures=figures,
         verdict=verdict(fit, controller, certificate),

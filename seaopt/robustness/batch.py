@@ -76,7 +76,9 @@ def _response(tf: TransferFunction, z: Complex[np.ndarray, "n m"]) -> Complex[np
     return np.polynomial.polynomial.polyval(q, tf.num) / np.polynomial.polynomial.polyval(q, tf.den)
 
 
-def _sampled(controller: Controller, plant: Plant, p: Float[np.ndarray, "np n"]) -> tuple[Float[np.ndarray, "..."], ...]:
+def _sampled(
+    controller: Controller, plant: Plant, p: Float[np.ndarray, "np n"]
+) -> tuple[Float[np.ndarray, "..."], ...]:
     """Return the sampled matrices of every draw: exact zero-order hold."""
     from scipy.linalg import expm
 

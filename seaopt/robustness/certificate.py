@@ -82,6 +82,7 @@ class Certificate:
         What was certified.
     models : mapping of name to Plant
         What it was certified on, at `parameters`.
+
     """
 
     passed: bool
@@ -95,7 +96,11 @@ class Certificate:
 
     @classmethod
     def from_dict(
-        cls, content: Mapping[str, Any], controller: Controller, models: Mapping[str, Plant], parameters: ParameterSet
+        cls,
+        content: Mapping[str, Any],
+        controller: Controller,
+        models: Mapping[str, Plant],
+        parameters: ParameterSet,
     ) -> Certificate:
         """Return the certificate of a robustness.json; figures at the nominal parameters are computed again.
 
@@ -103,6 +108,7 @@ class Certificate:
         ------
         FileError
             A field is missing or malformed.
+
         """
         try:
             worst = {name: Worst(**_infinite(item["worst"])) for name, item in content["plants"].items()}
@@ -225,6 +231,7 @@ def certify(
     ...                          ranges={"I_p": (0.2, 0.6)}, samples=100)
     >>> certificate.passed, certificate.monte_carlo.failures
     (True, 0)
+
     """
     if not plants:
         raise ControlError("certify needs at least one plant; give {name: plant}")
@@ -264,6 +271,7 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     --------
     >>> round(failure_bound(1375, 0, 1 - 1e-6), 4)
     0.01
+
     """
     if failures >= samples:
         return 1.0
@@ -298,8 +306,6 @@ def _worst(
     witness = witness.update(**values)
     found = controller.close(plant, witness).figures()
     return Worst(parameters=values, ms=found.ms, mt=found.mt, severity=float(severity[k]))
-
-
 
 
 def _design_requirements(controller: Controller) -> list[Requirement]:

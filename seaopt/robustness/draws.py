@@ -28,6 +28,7 @@ class Uncertainty:
         The uncertain ones of the Gaussian part, with `covariance`, shape (n, n).
     ranges : mapping of name to (low, high)
         Uniform, independent of the rest.
+
     """
 
     nominal: ParameterSet
@@ -42,6 +43,7 @@ class Uncertainty:
         ------
         ControlError
             The bounds leave next to nothing of the distribution.
+
         """
         out: dict[str, Float[np.ndarray, " n"]] = {}
         if self.names:
@@ -68,7 +70,10 @@ class Uncertainty:
 
 
 def uncertainty(
-    source: Fit | ParameterSet, others: ParameterSet, ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]
+    source: Fit | ParameterSet,
+    others: ParameterSet,
+    ranges: Mapping[str, tuple[float, float]],
+    plants: Mapping[str, Plant],
 ) -> Uncertainty:
     """Return what is not known: the fit's covariance (or prior_stds, of a ParameterSet) and the ranges.
 
@@ -78,6 +83,7 @@ def uncertainty(
     ------
     ControlError
         The fit leaves a parameter undetermined, or a range is empty or names nothing.
+
     """
     known = {name for plant in plants.values() for name in plant.parameters}
     for name, (low, high) in ranges.items():

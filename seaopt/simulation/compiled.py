@@ -83,7 +83,14 @@ def _settings(model: Model, point: Point, segment: Segment) -> Float[np.ndarray,
 
 
 def compiled_pass(
-    model: Model, segment: Segment, point: Point, weights: Weights, *, outputs: bool, columns: bool, states: bool
+    model: Model,
+    segment: Segment,
+    point: Point,
+    weights: Weights,
+    *,
+    outputs: bool,
+    columns: bool,
+    states: bool,
 ) -> Pass | None:
     """Run the compiled pass; None where there is no compiler."""
     clock = point.clock

@@ -39,6 +39,7 @@ class Clock:
         The plant gets the input this much later; with a first-order hold, a whole number of samples.
     delay_free : bool
         Whether derivatives with respect to the delay are wanted (zero-order hold only).
+
     """
 
     period: float
@@ -98,6 +99,7 @@ def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> F
     array, shape (1 + np [+ 1], nx + ny, nx + 2 nu + 1)
         First x+ = F w over y = H w with w = [x, u_a, u_b, 1]; then the derivatives with respect to theta, and with
         respect to the delay where ``clock.delay_free``.
+
     """
     nx, nu, ny = model.nx, model.nu, model.ny
     g, dg = model.matrices(theta)

@@ -25,7 +25,14 @@ Trace = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.
 
 
 def interpreted_pass(
-    model: Model, segment: Segment, point: Point, weights: Weights, *, outputs: bool, columns: bool, states: bool
+    model: Model,
+    segment: Segment,
+    point: Point,
+    weights: Weights,
+    *,
+    outputs: bool,
+    columns: bool,
+    states: bool,
 ) -> Pass:
     """Run the pass in NumPy and CasADi's virtual machine."""
     held = _held_inputs(segment, point)
@@ -75,7 +82,10 @@ def _augmented(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any
     for j in range(count + 1):
         b[j * nx : (j + 1) * nx], d[j * ny : (j + 1) * ny] = blocks[j, :nx, nx:], blocks[j, nx:, nx:]
         if j:
-            f[j * nx : (j + 1) * nx, :nx], h[j * ny : (j + 1) * ny, :nx] = blocks[j, :nx, :nx], blocks[j, nx:, :nx]
+            f[j * nx : (j + 1) * nx, :nx], h[j * ny : (j + 1) * ny, :nx] = (
+                blocks[j, :nx, :nx],
+                blocks[j, nx:, :nx],
+            )
     return f, b, h, d
 
 
@@ -189,16 +199,18 @@ def _nonlinear_trace(model: Model, segment: Segment, point: Point, held: Float[n
 
 
 def _columns(
-    segment: Segment, point: Point, weights: Weights, y: Float[np.ndarray, "n ny"], dy: Float[np.ndarray, "n ny nt"]
+    segment: Segment,
+    point: Point,
+    weights: Weights,
+    y: Float[np.ndarray, "n ny"],
+    dy: Float[np.ndarray, "n ny nt"],
 ) -> tuple[Float[np.ndarray, "n ny nc"], Any]:
-    assert segment.y is not None  # noqa: S101
+    assert segment.y is not None
     present = np.isfinite(segment.y)
     if segment.keep is not None:
         present &= segment.keep.astype(bool)
     residual = point.gain * y + point.offset - np.where(present, segment.y, 0.0)
-    v = np.concatenate(
-        [residual[:, :, None], point.gain[:, None] * dy, np.ones((*y.shape, 1)), y[:, :, None]], axis=2
-    )
+    v = np.concatenate([residual[:, :, None], point.gain[:, None] * dy, np.ones((*y.shape, 1)), y[:, :, None]], axis=2)
     v[~present] = 0.0
     if len(weights.sections):
         from scipy.signal import sosfilt

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -28,6 +28,7 @@ class Model:
         The outputs that are computed, in order.
     linear : bool
         Whether f and h are affine in the state and the input for every theta, and do not depend on time.
+
     """
 
     plant: Plant
@@ -69,6 +70,7 @@ class Model:
         -------
         G : array, shape (nx + ny, nx + nu + 1)
         dG : array, shape (np, nx + ny, nx + nu + 1)
+
         """
         if "matrices" not in self.functions:
             self.functions["matrices"] = _matrices(self)
@@ -90,6 +92,7 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
         A parameter has no value.
     PlantError
         An output is unknown.
+
     """
     chosen = outputs or tuple(plant.outputs)
     for name in chosen:
@@ -104,13 +107,28 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
     f, h = plant.dynamics, plant.output[rows]
     if fixed:
         f, h = ca.substitute(
-            [f, h], [ca.vertcat(*(symbols[name] for name in fixed))], [ca.DM([values[name] for name in fixed])]
+            [f, h],
+            [ca.vertcat(*(symbols[name] for name in fixed))],
+            [ca.DM([values[name] for name in fixed])],
         )
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
     return Model(
         plant=plant, free=names, outputs=chosen, t=plant.t, x=plant.x, u=u, theta=theta, f=f, h=h,
         linear=_is_linear(f, h, plant.t, plant.x, u),
     )  # fmt: skip
+
+
+def linearised(model: Model) -> Model:
+    """Return the model linearised at zero state and input."""
+    if model.linear:
+        return model
+    point = ca.vertcat(model.x, model.u)
+    both = ca.vertcat(model.f, model.h)
+    slope, constant = ca.substitute(
+        [ca.jacobian(both, point), both], [point, model.t], [ca.DM.zeros(point.numel()), ca.DM(0)]
+    )
+    rows: Any = ca.mtimes(slope, point) + constant
+    return replace(model, f=rows[: model.nx], h=rows[model.nx :], linear=True, functions={})
 
 
 def _is_linear(f: Any, h: Any, t: Any, x: Any, u: Any) -> bool:

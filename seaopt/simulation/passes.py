@@ -26,6 +26,7 @@ class Weights:
         Samples left out while the filter settles.
     knee : array, shape (ny,)
         Huber's threshold on the filtered residual, in the output's unit; infinite for least squares.
+
     """
 
     sections: Float[np.ndarray, "m 5"]
@@ -52,6 +53,7 @@ class Segment:
         0 where a sample gets no weight.
     start_s : float
         Time of the first sample, for plants that depend on time.
+
     """
 
     u: Float[np.ndarray, "n nu"]
@@ -76,6 +78,7 @@ class Point:
         Period, hold and delay.
     substeps : int
         Runge-Kutta steps a period (a linear model needs none).
+
     """
 
     theta: Float[np.ndarray, " np"]
@@ -106,6 +109,7 @@ class Pass:
         State trajectory.
     last : array, shape (nx,)
         State one step after the last sample.
+
     """
 
     gram: Float[np.ndarray, "ny nc nc"]

@@ -31,6 +31,7 @@ def run_pass(
     -------
     Pass
         Numbers that are not finite where the simulation left what floats can hold.
+
     """
     chosen = weights if weights is not None else Weights.plain(model.ny)
     keep = {"outputs": outputs, "columns": columns, "states": states}

@@ -28,6 +28,7 @@ def input_samples(plant: Plant, log: Log) -> Float[np.ndarray, "n nu"]:
     ------
     LogError
         An input is missing from the log, or has missing samples.
+
     """
     columns: list[Float[np.ndarray, " n"]] = []
     for name in plant.inputs:
@@ -99,6 +100,7 @@ def simulate(
     >>> run = so.simulate(so.plants.high_impedance(), so.plants.thor(), so.Log.from_arrays(time=t, I=np.ones(400)))
     >>> round(float(run["F1"][-1]), 1)  # 240.33 N/A once it has settled
     240.3
+
     """
     model = make_model(plant, params)
     if len(log.segments) > 1:
@@ -108,7 +110,7 @@ def simulate(
     clock = Clock(period=log.period, hold=hold, delay_s=delay_s)
     result = _converged(model, Segment(u=u, start_s=float(log.time[0])), x0, clock, rtol)
     outputs, states = result.outputs, result.states
-    assert outputs is not None and states is not None  # noqa: S101
+    assert outputs is not None and states is not None
     if not (np.all(np.isfinite(outputs)) and np.all(np.isfinite(states))):
         bad = ~(np.isfinite(outputs).all(axis=1) & np.isfinite(states).all(axis=1))
         raise SimulationError(
@@ -125,7 +127,12 @@ def simulate(
 def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
     def run(substeps: int) -> Pass:
         point = Point(
-            theta=np.zeros(0), x0=x0, offset=np.zeros(model.ny), gain=np.ones(model.ny), clock=clock, substeps=substeps
+            theta=np.zeros(0),
+            x0=x0,
+            offset=np.zeros(model.ny),
+            gain=np.ones(model.ny),
+            clock=clock,
+            substeps=substeps,
         )
         return run_pass(model, segment, point, outputs=True, states=True)
 
@@ -134,7 +141,7 @@ def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clo
     while not model.linear:
         substeps *= 2
         finer = run(substeps)
-        assert result.outputs is not None and finer.outputs is not None  # noqa: S101
+        assert result.outputs is not None and finer.outputs is not None
         scale = np.maximum(np.max(np.abs(finer.outputs), axis=0), 1e-300)
         with np.errstate(invalid="ignore"):
             error = float(np.max(np.abs(finer.outputs - result.outputs) / scale)) / 15.0  # order four: 2^4 - 1

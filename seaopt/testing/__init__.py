@@ -37,6 +37,7 @@ def assert_recovered(
     Examples
     --------
     In a test of your own: ``so.testing.assert_recovered(fit, {"J": 3.31e-6, "b_r": 1.31e-4}, sigmas=3)``.
+
     """
     rows: list[str] = []
     failed = not fit.ok
