@@ -6,7 +6,6 @@ import html
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Self
 
 from seaopt.errors import ParameterError, suggestion
 from seaopt.units import factor
@@ -100,7 +99,7 @@ class ParameterSet(Mapping[str, Parameter]):
         self._items = items
 
     @classmethod
-    def of(cls, **values: float | tuple[float, str]) -> Self:
+    def of(cls, **values: float | tuple[float, str]) -> ParameterSet:
         """Build a set from NAME=value or NAME=(value, unit); a bare value has no unit ("-").
 
         Examples
@@ -136,11 +135,11 @@ class ParameterSet(Mapping[str, Parameter]):
         """Return the values of `names`, in their order and in SI."""
         return [self[name].value for name in names]
 
-    def with_parameters(self, *parameters: Parameter) -> Self:
+    def with_parameters(self, *parameters: Parameter) -> ParameterSet:
         """Return a set in which `parameters` replace those of the same name, or are added."""
         return type(self)({**self._items, **{parameter.name: parameter for parameter in parameters}}.values())
 
-    def update(self, **values: float | tuple[float, str]) -> Self:
+    def update(self, **values: float | tuple[float, str]) -> ParameterSet:
         """Return a set with new values; a tuple (value, unit) is converted to the declared unit.
 
         Raises
@@ -158,27 +157,27 @@ class ParameterSet(Mapping[str, Parameter]):
             changed.append(replace(old, value=float(value) * factor(unit, old.unit), std=None))
         return self.with_parameters(*changed)
 
-    def free(self, *names: str) -> Self:
+    def free(self, *names: str) -> ParameterSet:
         """Return a set in which `names` are free."""
         return self.with_parameters(*(replace(self[name], free=True) for name in names))
 
-    def fix(self, *names: str) -> Self:
+    def fix(self, *names: str) -> ParameterSet:
         """Return a set in which `names` (all, if none is given) are held at their values."""
         return self.with_parameters(*(replace(self[name], free=False) for name in names or self))
 
-    def bound(self, **bounds: tuple[float, float]) -> Self:
+    def bound(self, **bounds: tuple[float, float]) -> ParameterSet:
         """Return a set with new bounds, NAME=(min, max), in the declared units."""
         return self.with_parameters(
             *(replace(self[name], min=float(low), max=float(high)) for name, (low, high) in bounds.items())
         )
 
-    def prior(self, **stds: float) -> Self:
+    def prior(self, **stds: float) -> ParameterSet:
         """Return a set with Gaussian priors, NAME=std, centred on the present values and made free."""
         return self.with_parameters(
             *(replace(self[name], prior_std=float(std), free=True) for name, std in stds.items())
         )
 
-    def subset(self, names: Iterable[str]) -> Self:
+    def subset(self, names: Iterable[str]) -> ParameterSet:
         """Return the parameters `names`, in that order."""
         return type(self)(self[name] for name in names)
 

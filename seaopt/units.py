@@ -37,7 +37,7 @@ def _pint_text(unit: str) -> str:
 def _parse(unit: str) -> Any:
     if unit.strip() in DIMENSIONLESS:
         return _registry().dimensionless
-    if len(unit) > 80 or not re.fullmatch(r"[\w\s*/^().·µμ°%Ω+-]+", unit):
+    if len(unit) > 80 or not re.fullmatch(r"[\w *\t/^().·µμ°%Ω+-]+", unit):
         raise UnitError(f'unit "{unit[:80]}" cannot be read; write it like "N", "kg m^2" or "rad/s"')
     try:
         return _registry().Unit(_pint_text(unit))

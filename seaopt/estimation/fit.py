@@ -258,7 +258,9 @@ def _result(
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
     b, whiteness = meat(problem, z)
     held = ((z <= unknowns.low) | (z >= unknowns.high)).astype(float)
-    full = posterior(evaluation.hessian, b, unknowns.prior_std**-2.0, held)
+    prior = unknowns.prior_std**-2.0
+    full = posterior(evaluation.hessian, b, prior, held)
+    white = posterior(evaluation.hessian, evaluation.hessian - np.diag(prior), prior, held)
     names = unknowns.names[:p]
     covariance = Covariance(names=names, matrix=full[:p, :p])
     seen = identifiability(evaluation.hessian, names, z[:p])
@@ -275,6 +277,7 @@ def _result(
         message=message,
         parameters=fitted,
         covariance=covariance,
+        white_covariance=Covariance(names=names, matrix=white[:p, :p]),
         derived=_derived(experiments, fitted, covariance),
         outputs={},
         nuisance=nuisance,

@@ -24,7 +24,7 @@ from seaopt.estimation.residuals import Evaluation
 Status = Literal["converged", "max_iterations", "stalled"]
 Callback = Callable[[int, float], None]
 
-DECREMENT = 1e-6  # squared standard deviations still to go
+DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE = 1e-12  # of the cost
 
 

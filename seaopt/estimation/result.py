@@ -98,6 +98,8 @@ class Fit:
         Every parameter of the plants, free ones with their std (infinite where not identifiable).
     covariance : Covariance
         Of the free parameters; posterior, and allowing for coloured residuals.
+    white_covariance : Covariance
+        What it would be if the residuals were white: beside the other, it shows what their colour costs.
     derived : mapping
         Figures that follow from the parameters.
     outputs : mapping of experiment to mapping of output to OutputFit
@@ -120,6 +122,7 @@ class Fit:
     message: str
     parameters: ParameterSet
     covariance: Covariance
+    white_covariance: Covariance
     derived: Mapping[str, Derived]
     outputs: Mapping[str, Mapping[str, OutputFit]]
     nuisance: Mapping[str, Nuisance]
@@ -178,6 +181,7 @@ class Fit:
                 for name, item in self.derived.items()
             },
             "covariance": {"names": list(self.covariance.names), "matrix": self.covariance.matrix},
+            "white_covariance": {"names": list(self.white_covariance.names), "matrix": self.white_covariance.matrix},
             "outputs": {
                 name: {output: _fields(item) for output, item in row.items()} for name, row in self.outputs.items()
             },
@@ -243,6 +247,12 @@ def _number(value: Any, missing: float) -> float:
     return missing if value is None else float(value)
 
 
+def _covariance(item: Mapping[str, Any]) -> Covariance:
+    names = tuple(item["names"])
+    rows = [[_number(value, math.inf) for value in row] for row in item["matrix"]]
+    return Covariance(names=names, matrix=np.array(rows, dtype=float).reshape(len(names), len(names)))
+
+
 def _std(item: Mapping[str, Any]) -> float | None:
     """Return a parameter's std: null stands for an infinite one, or for none of a value that is held."""
     return _number(item["std"], math.inf) if item["free"] and not item["at_bound"] else None
@@ -257,16 +267,13 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
         )
         for name, item in content["parameters"].items()
     )  # fmt: skip
-    matrix = [[_number(v, math.inf) for v in row] for row in content["covariance"]["matrix"]]
     found = content["identifiability"]
-    size = len(content["covariance"]["names"])
     return Fit(
         status=content["status"],
         message=content["message"],
         parameters=parameters,
-        covariance=Covariance(
-            names=tuple(content["covariance"]["names"]), matrix=np.array(matrix, dtype=float).reshape(size, size)
-        ),
+        covariance=_covariance(content["covariance"]),
+        white_covariance=_covariance(content["white_covariance"]),
         derived={
             name: Derived(value=float(item["value"]), unit=item["unit"], std=_number(item["std"], math.inf))
             for name, item in content["derived"].items()

@@ -40,8 +40,8 @@ class FrequencyResponse:
 
     @property
     def relative_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of |H1| over |H1|; neighbours overlap by half, which counts as 0.7 averages each."""
-        effective = max(1.0, 0.7 * self.averages)
+        """Standard deviation of |H1| over |H1|; overlapping neighbours count as 0.947 averages (Welch 1967, Hann)."""
+        effective = max(1.0, 0.947 * self.averages)
         gamma = np.clip(self.coherence, 1e-6, 1.0)
         return np.sqrt((1.0 - gamma) / (2.0 * gamma * effective))
 

@@ -6,7 +6,7 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -78,7 +78,7 @@ class Log:
         units: Mapping[str, str] | None = None,
         source: str = "arrays",
         **channels: Any,
-    ) -> Self:
+    ) -> Log:
         """Build a log from arrays.
 
         Parameters

@@ -81,7 +81,9 @@ def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str
     """
     source = Path(path)
     text = _read_text(source)
-    first = text[: text.find("\n")] if "\n" in text else text
+    first, _, rows = text.partition("\n")
+    if not rows.strip():
+        raise LogError(f"{source}: 0 rows below the header; record the log again")
     headers, delimiter = _headers(first.rstrip("\r"))
     wanted = {"time": _as_column(time)} | {name: _as_column(given) for name, given in channels.items()}
     if "time" in channels:

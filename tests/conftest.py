@@ -1,0 +1,78 @@
+"""Shared fixtures. Array shapes and types of seaopt are checked while the tests run (jaxtyping and beartype)."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+from typing import Literal
+
+os.environ.setdefault("SEAOPT_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"seaopt-tests-{os.getuid()}"))
+
+import pytest
+from beartype import BeartypeConf, FrozenDict, beartype
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+# A whole number is a float, and choices are strings: the tests give wrong ones on purpose, to see seaopt's own errors.
+CHOICES = (
+    ("unlumped", "lumped"),
+    ("link1", "link2"),
+    ("fixed", "mass", "pendulum"),
+    ("zero", "first"),
+    ("split", "error"),
+    ("pd", "pid"),
+    ("error", "measurement"),
+    ("disturbance", "noise"),
+)
+OVERRIDES = FrozenDict({Literal[choices]: str for choices in CHOICES})
+checker = ModuleType("seaopt_type_checker")
+checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
+sys.modules["seaopt_type_checker"] = checker
+install_import_hook("seaopt", "seaopt_type_checker.check")
+
+import seaopt as so  # noqa: E402
+from seaopt.bench import PAPER_STAND  # noqa: E402
+
+settings.register_profile("seaopt", deadline=None, max_examples=25, derandomize=True)
+settings.load_profile("seaopt")
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Return the folder of measured logs, or skip."""
+    if not DATA.is_dir():
+        pytest.skip(f"measured logs are not at {DATA}")
+    return DATA
+
+
+@pytest.fixture(scope="session")
+def thor() -> so.ParameterSet:
+    return so.plants.thor()
+
+
+@pytest.fixture(scope="session")
+def stand() -> so.Plant:
+    return so.plants.high_impedance()
+
+
+@pytest.fixture(scope="session")
+def swing() -> so.Plant:
+    return so.plants.moving_output()
+
+
+@pytest.fixture(scope="session")
+def stand_log(stand, thor) -> so.Log:
+    """Return the paper's 164 s experiment with 2 N noise, 65,600 samples."""
+    sensors = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}, offset={"F1": 3.0})
+    return so.virtual_log(stand, thor, PAPER_STAND, duration_s=164, rate_hz=400, seed=11, sensors=sensors)
+
+
+@pytest.fixture(scope="session")
+def short_log(stand, thor) -> so.Log:
+    sensors = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}, offset={"F1": 3.0})
+    return so.virtual_log(stand, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=12, sensors=sensors)

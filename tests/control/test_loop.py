@@ -1,0 +1,171 @@
+"""Loop figures against python-control and plain NumPy: own hold, own delay, own polynomials."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import cont2discrete
+
+import seaopt as so
+from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, current_per_force, sample
+from seaopt.control.loop import crossings, peak
+
+
+def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains):
+    plant, params = plant or so.plants.high_impedance(), params or so.plants.thor()
+    law = Gains(**{"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_ff": 1.0, **gains})
+    reference, measurement = law.transfer_functions(structure, ts)
+    digital = sample(plant, params, "F1", current_per_force(plant, params), ts, delay)
+    return Loop(plant=digital, reference=reference, measurement=measurement)
+
+
+def test_the_sampled_plant_is_scipys_zero_order_hold(swing, thor):
+    model = swing.linearize(thor)
+    gain = current_per_force(swing, thor)
+    found = sample(swing, thor, "F1", gain, 1e-3, 1)
+    a, b, c, d, _ = cont2discrete((model.A, model.B * gain, model.C[:1], model.D[:1] * gain), 1e-3, "zoh")
+    np.testing.assert_allclose(found.a, a, rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(found.b, b[:, 0], rtol=1e-9, atol=1e-16)
+    np.testing.assert_allclose(found.c, c[0])
+    assert found.static_gain == pytest.approx(1.0)
+    assert found.d == d[0, 0]
+
+
+def test_the_law_is_the_written_one():
+    """Run the definition sample by sample: trapezoidal integral, filtered difference, feedforward."""
+    ts, law = 1e-3, Gains(k_p=3.0, k_i=20.0, k_d=0.03, T_f=2e-3, k_ff=0.9)
+    rng = np.random.default_rng(0)
+    ref, meas = rng.normal(size=(2, 200))
+    for derivative in ("error", "measurement"):
+        law = Gains(k_p=3.0, k_i=20.0, k_d=0.03, T_f=2e-3, k_ff=0.9, derivative=derivative)
+        e, integral, rate, out = ref - meas, 0.0, 0.0, []
+        v = e if derivative == "error" else -meas
+        for k in range(200):
+            before_e, before_v = (e[k - 1], v[k - 1]) if k else (0.0, 0.0)
+            integral += 20.0 * ts / 2 * (e[k] + before_e)
+            rate = (2e-3 * rate + (v[k] - before_v)) / (2e-3 + ts)
+            out.append(0.9 * ref[k] + 3.0 * e[k] + integral + 0.03 * rate)
+        from scipy.signal import lfilter
+
+        c_r, c_y = law.transfer_functions("pid", ts)
+        found = lfilter(c_r.num, c_r.den, ref) - lfilter(c_y.num, c_y.den, meas)
+        np.testing.assert_allclose(found, out, rtol=1e-9)
+        assert c_y.den[0] == 1.0
+
+
+def independent(loop, f):
+    """Return L and F/F_ref in NumPy alone, from matrices and coefficients."""
+    z = np.exp(2j * np.pi * f * loop.plant.sample_time_s)
+    p = np.array([loop.plant.c @ np.linalg.inv(x * np.eye(len(loop.plant.b)) - loop.plant.a) @ loop.plant.b for x in z])
+    p = (p + loop.plant.d) * z**-loop.plant.delay_samples
+    value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
+    c_y = value(loop.measurement.num) / value(loop.measurement.den)
+    c_r = value(loop.reference.num) / value(loop.reference.den)
+    return p * c_y, p * c_r / (1 + p * c_y), c_y / (1 + p * c_y)
+
+
+@pytest.mark.parametrize("structure", ["pd", "pid"])
+@pytest.mark.parametrize("name", ["stand", "swing"])
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_figures_by_an_independent_calculation(structure, name, delay, request, thor):
+    loop = loop_of(structure, request.getfixturevalue(name), thor, delay)
+    figures = loop.figures()
+    f = np.unique(np.r_[np.geomspace(1e-3, 499.99, 60_000), np.linspace(10, 60, 40_000)])
+    open_loop, tracking, noise = independent(loop, f)
+    s = 1 / (1 + open_loop)
+    assert figures.ms == pytest.approx(np.abs(s).max(), rel=1e-4)
+    assert figures.mt == pytest.approx(np.abs(open_loop * s).max(), rel=1e-4)
+    assert figures.noise_gain == pytest.approx(np.abs(noise).max(), rel=1e-4)
+    static = abs(tracking[0])
+    assert figures.reference_peak == pytest.approx(np.abs(tracking).max() / static, rel=1e-4)
+    below = f[np.flatnonzero(np.abs(tracking) < static / np.sqrt(2))[0]]
+    assert figures.bandwidth_hz == pytest.approx(below, rel=1e-3)
+    inside = (np.abs(tracking) > np.sqrt(0.5)) & (np.abs(tracking) < np.sqrt(2))
+    edges = np.flatnonzero(np.diff(inside.astype(int)))
+    bands = [(f[a], f[b]) for a, b in zip(np.r_[0, edges], np.r_[edges, f.size - 1], strict=True) if inside[a + 1]]
+    widest = max(bands, key=lambda band: band[1] - band[0])
+    assert figures.tracking_band_hz == pytest.approx(widest, rel=2e-3, abs=2e-3)
+    assert figures.disk_margin == pytest.approx(2 / np.abs(2 * s - 1).max(), rel=1e-4)
+
+
+def test_margins_are_python_controls_on_a_stable_loop(stand, thor):
+    loop = loop_of("pid", stand, thor)
+    z = control.tf("z")
+    z.dt = 1e-3
+    plant = control.ss2tf(control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3))
+    c = control.tf(loop.measurement.num, loop.measurement.den, 1e-3)
+    open_loop = plant * c * control.tf([1], [1, 0], 1e-3)
+    gm, pm, _, _, wpc, _ = control.stability_margins(open_loop)
+    figures = loop.figures()
+    assert figures.gain_margin_db == pytest.approx(20 * np.log10(gm), rel=1e-3)
+    assert figures.phase_margin_deg == pytest.approx(pm, rel=1e-3)
+    assert figures.delay_margin_s == pytest.approx(np.radians(pm) / wpc, rel=1e-2)
+    assert figures.crossover_hz == pytest.approx(wpc / 2 / np.pi, rel=1e-3)
+
+
+def test_an_unstable_loop_has_no_margins(stand, thor):
+    """python-control's disk_margins reports good ones for such a loop; eigenvalues decide here."""
+    figures = loop_of("pd", stand, thor, k_p=400.0, k_d=3.0).figures()
+    assert not figures.stable
+    assert figures.spectral_radius > 1
+    assert (figures.gain_margin_db, figures.phase_margin_deg, figures.delay_margin_s, figures.disk_margin) == (0, 0, 0, 0)
+    assert np.isinf(figures.ms)
+
+
+def test_a_light_mode_between_grid_points_is_found():
+    """zeta = 1e-5 at 77.123 Hz under unit feedback: the peak of S stands on a line 1e-3 Hz wide."""
+    wn, zeta, ts = 2 * np.pi * 77.123, 1e-5, 1e-3
+    a, b, c, d, _ = cont2discrete(
+        (np.array([[0, 1], [-(wn**2), -2 * zeta * wn]]), np.array([[0], [wn**2]]), np.array([[1e-6, 0]]), np.zeros((1, 1))), ts
+    )
+    plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=0, static_gain=1e-6)
+    one = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
+    loop = Loop(plant=plant, reference=one, measurement=one)
+    f = np.linspace(77.1, 77.15, 400_001)
+    exact = np.abs(1 / (1 + independent(loop, f)[0])).max()
+    assert loop.figures().ms == pytest.approx(exact, rel=1e-4)
+    assert exact > 1.02
+
+
+@pytest.mark.parametrize("name", ["stand", "swing"])
+def test_stability_is_what_a_simulation_shows(name, request, thor):
+    """Step the loop sample by sample for gains about the edge of stability."""
+    plant = request.getfixturevalue(name)
+    for factor in (1.0, 4.0, 7.0, 9.0, 14.0):
+        loop = loop_of("pd", plant, thor, k_p=3.2 * factor, k_d=0.033 * factor)
+        a, b, c, _ = loop.plant.delayed()
+        ac, bc, cc, dc = loop.measurement.state_space()
+        x, xc = np.full(len(b), 1e-3), np.zeros(len(bc))
+        sizes = []
+        for _ in range(6000):
+            y = c @ x
+            u = -(cc @ xc + dc * y)
+            x, xc = a @ x + b * u, ac @ xc + bc * y
+            sizes.append(np.abs(u))
+            if sizes[-1] > 1e12:
+                break
+        grew = max(sizes[-500:]) > max(sizes[:500])
+        assert loop.figures().stable != grew
+
+
+@given(st.floats(0.3, 2.0), st.integers(0, 3))
+@settings(max_examples=10)
+def test_margins_scale_as_they_must(factor, extra):
+    """A loop gain of x takes x off the gain margin; a sample of delay takes a sample off the delay margin."""
+    base = loop_of("pd")
+    scaled = loop_of("pd", k_p=3.2 * factor, k_d=0.033 * factor, k_ff=1.0)
+    assert scaled.figures().gain_margin_db == pytest.approx(
+        abs(base.figures().gain_margin_db - 20 * np.log10(factor)), abs=1e-3
+    )
+    late = loop_of("pd", delay=1 + extra).figures()
+    assert late.delay_margin_s == pytest.approx(base.figures().delay_margin_s - extra * 1e-3, abs=1e-8)
+
+
+def test_peak_and_crossings_on_hand_curves():
+    f = np.linspace(0, 10, 101)
+    at, top = peak(lambda x: 1 / (1 + (x - 3.1416) ** 2), f)
+    assert (at, top) == (pytest.approx(3.1416, abs=1e-5), pytest.approx(1.0))
+    np.testing.assert_allclose(crossings(lambda x: (x - 2.345) * (x - 7.1), f), [2.345, 7.1], rtol=1e-9)

@@ -1,0 +1,146 @@
+"""The tuner's claims, recomputed; what it cannot do, said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import Controller
+from seaopt.errors import ControlError, FileError
+
+from .test_loop import independent
+
+LIMITS = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
+
+
+def tuned(stand, swing, thor, **spec):
+    return so.tune(stand, thor, so.ControllerSpec(**{**LIMITS, **spec}), robust_to={"swing": swing})
+
+
+@pytest.mark.parametrize("structure", ["pd", "pid"])
+@pytest.mark.parametrize("bandwidth", [15, 30, 45, 60])
+def test_thor_from_15_to_60_hz(stand, swing, thor, structure, bandwidth):
+    """Every limit, recomputed in NumPy alone on both plants, at Ms 1.6 with the swing plant in robust_to."""
+    controller = tuned(stand, swing, thor, structure=structure, bandwidth_hz=bandwidth)
+    assert controller.feasible
+    f = np.unique(np.r_[np.geomspace(1e-3, 499.9, 20_000), np.linspace(5, 90, 20_000), bandwidth])
+    loops = {name: controller.close(plant, thor) for name, plant in (("stand", stand), ("swing", swing))}
+    for loop in loops.values():
+        open_loop, _, _ = independent(loop, f)
+        s = 1 / (1 + open_loop)
+        assert np.abs(s).max() <= 1.6
+        assert np.abs(open_loop * s).max() <= 1.3
+        assert np.abs(loop.eigenvalues()).max() < 1
+    open_loop, tracking, noise = independent(loops["stand"], f)
+    assert np.abs(tracking).max() / abs(tracking[0]) <= 1.3
+    assert np.abs(noise).max() <= 60
+    below = f[np.flatnonzero(np.abs(tracking) < abs(tracking[0]) / np.sqrt(2))[0]]
+    assert below == pytest.approx(bandwidth, rel=0.005)
+    slow = np.abs(1 / (1 + open_loop))[f <= bandwidth / 5]
+    assert slow.max() <= np.sqrt(0.5) * 1.001
+    gains = controller.gains
+    if structure == "pid":
+        assert gains["k_i"] / (1 + gains["k_p"]) >= 2 * np.pi * 0.05 * 0.999
+    else:
+        assert gains["k_i"] == 0.0
+
+
+def test_it_is_as_good_as_a_long_global_search(stand, thor):
+    """scipy's differential evolution over the same four numbers, penalised, a hundred times the time."""
+    from scipy.optimize import differential_evolution
+
+    from seaopt.control.tuner import _loop, _task, disturbance
+
+    spec = so.ControllerSpec(structure="pd", bandwidth_hz=30, max_noise_gain=25, **{**LIMITS, "max_noise_gain": 25})
+    task = _task(stand, thor, spec, {})
+
+    def cost(v):
+        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), np.exp(v[2])])
+        loop = _loop(task, x)
+        f = np.geomspace(0.1, 499, 200)
+        open_loop, tracking, noise = independent(loop, np.r_[f, 30.0])
+        s = 1 / np.abs(1 + open_loop)
+        miss = max(s.max() / 1.6, (np.abs(open_loop) * s).max() / 1.3, np.abs(tracking).max() / 1.3, np.abs(noise).max() / 25, 1)
+        miss += 20 * abs(abs(tracking[-1]) * np.sqrt(2) - 1)
+        if np.abs(loop.eigenvalues()).max() >= 1:
+            return 1e3
+        return disturbance(loop, 30.0) * (1 + 10 * (miss - 1))
+
+    best = differential_evolution(cost, [(-2, 4), (-8, 0), (-9, -4)], seed=1, maxiter=40, popsize=10, polish=False, tol=1e-8)
+    controller = so.tune(stand, thor, spec)
+    assert controller.feasible
+    assert disturbance(controller.close(stand, thor), 30.0) <= 1.03 * best.fun
+
+
+def test_what_cannot_be_met_is_said(stand, swing, thor):
+    controller = tuned(stand, swing, thor, bandwidth_hz=60, max_noise_gain=5)
+    assert not controller.feasible
+    assert controller.active_constraints
+    assert "NOT FEASIBLE" in repr(controller)
+
+
+def test_noise_objective_is_quieter(stand, swing, thor):
+    loud, quiet = (tuned(stand, swing, thor, bandwidth_hz=30, objective=o) for o in ("disturbance", "noise"))
+    assert quiet.feasible
+    assert quiet.achieved.noise_gain < loud.achieved.noise_gain
+
+
+def test_derivative_on_the_measurement(stand, swing, thor):
+    controller = tuned(stand, swing, thor, bandwidth_hz=30, derivative="measurement", max_noise_gain=None)
+    assert controller.feasible
+    assert controller.achieved.bandwidth_hz == pytest.approx(30, rel=0.005)
+
+
+def test_efficiency_changes_the_loop_gain(stand, thor):
+    """The controller commands current: a plant with 20 % less efficiency has 20 % less loop gain."""
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    f = np.array([1.0, 10.0, 100.0])
+    strong, weak = (controller.close(stand, thor.update(eta=eta)).open_loop(f) for eta in (1.0, 0.8))
+    np.testing.assert_allclose(weak, 0.8 * strong)
+
+
+def test_json_round_trip(stand, swing, thor, tmp_path):
+    from seaopt.files import read_json, write_json
+
+    controller = tuned(stand, swing, thor, bandwidth_hz=30)
+    path = write_json(tmp_path / "controller.json", controller.to_dict())
+    again = Controller.from_dict(read_json(path, "seaopt/controller/1"), stand, thor)
+    assert repr(again) == repr(controller)
+    broken = controller.to_dict()
+    broken["measurement"] = {"num": [1.0], "den": [2.0]}
+    with pytest.raises(FileError, match="den"):
+        Controller.from_dict(broken, stand, thor)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"bandwidth_hz": 80}, "outside 15 to 60"),
+        ({"bandwidth_hz": 14.9}, "outside 15 to 60"),
+        ({"structure": "pdf"}, "structure"),
+        ({"max_sensitivity": 0.9}, "max_sensitivity"),
+        ({"sample_rate_hz": 100}, "sample_rate_hz"),
+        ({"delay_samples": -1}, "delay_samples"),
+        ({"min_sensitivity_bandwidth_hz": 40}, "min_sensitivity_bandwidth_hz"),
+        ({"current_limit_A": 0}, "current_limit_A"),
+        ({"bandwidth_range_hz": (60, 15)}, "bandwidth_range_hz"),
+        ({"objective": "speed"}, "objective"),
+    ],
+)
+def test_bad_specifications(changes, words):
+    with pytest.raises(ControlError, match=words):
+        so.ControllerSpec(**{"bandwidth_hz": 30, **changes})
+
+
+def test_another_range_may_be_asked_for(stand, thor):
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=10, bandwidth_range_hz=(5, 15)))
+    assert controller.achieved.bandwidth_hz == pytest.approx(10, rel=0.005)
+
+
+def test_unknown_output_and_free_mass_are_refused(stand, thor):
+    with pytest.raises(ControlError, match='"F3"'):
+        so.tune(stand, thor, so.ControllerSpec(measured="F3"))
+    free = so.plants.two_link(link2="mass")
+    with pytest.raises(ControlError, match="static gain"):
+        so.tune(free, so.plants.thor(), so.ControllerSpec())

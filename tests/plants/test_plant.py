@@ -1,0 +1,71 @@
+"""A user's own plant: what is refused, and how."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.errors import ParameterError, PlantError
+
+GOOD = {
+    "name": "cart",
+    "states": {"x": "m", "v": "m/s"},
+    "inputs": {"F": "N"},
+    "outputs": {"x": "m"},
+    "parameters": {"m": "kg", "c": "N s/m"},
+    "f": lambda t, x, u, p: {"x": x.v, "v": (u.F - p.c * x.v) / p.m},
+    "h": lambda t, x, u, p: {"x": x.x},
+}
+
+
+def build(**changes):
+    return so.Plant(**{**GOOD, **changes})
+
+
+def test_a_plant_in_a_few_lines():
+    model = build().linearize(so.ParameterSet.of(m=(2.0, "kg"), c=(4.0, "N s/m")))
+    np.testing.assert_allclose(np.sort(model.poles().real), [-2.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"parameters": {"m": "", "c": "N s/m"}}, '"m" has no unit'),
+        ({"parameters": {"m": "kg", "c": "N s/m", "x": "m"}}, '"x" is in states and in parameters'),
+        ({"h": lambda t, x, u, p: {"x": p.m}}, '"x" depends on no state'),
+        ({"f": lambda t, x, u, p: {"x": x.v, "v": p.c}}, '"v" is driven by nothing'),
+        ({"f": lambda t, x, u, p: {"x": x.v}}, 'returns nothing for "v"'),
+        ({"f": lambda t, x, u, p: {"x": x.v, "v": u.F, "w": 0}}, 'returns "w"'),
+        ({"inputs": {"my force": "N"}}, '"my force"'),
+    ],
+)
+def test_mistakes_are_named(changes, words):
+    with pytest.raises(PlantError, match=words):
+        build(**changes)
+
+
+def test_an_unknown_unit_is_refused():
+    with pytest.raises(so.SeaoptError, match="blorp"):
+        build(parameters={"m": "blorp", "c": "N s/m"})
+
+
+def test_a_missing_value_is_named():
+    with pytest.raises(ParameterError, match='"c" of plant cart has no value'):
+        build().linearize(so.ParameterSet.of(m=(2.0, "kg")))
+
+
+def test_printing_says_names_and_units():
+    text = repr(build())
+    assert "x [m], v [m/s]" in text
+    assert "m [kg]" in text
+    assert build()._repr_html_().startswith("<pre>")
+
+
+def test_unknown_kind_and_option_are_refused():
+    from seaopt.plants import plant_of_kind
+
+    with pytest.raises(PlantError, match="did you mean"):
+        plant_of_kind("high_impedanse")
+    with pytest.raises(PlantError, match="drife"):
+        plant_of_kind("high_impedance", drife="lumped")

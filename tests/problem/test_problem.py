@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import seaopt as so
+from seaopt.problem import json_schema
+
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = so.demo_path().read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def write(tmp_path):
+    def _write(text):
+        path = tmp_path / "problem.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return _write
+
+
+def test_the_packaged_problem_is_the_one_in_problems():
+    assert (ROOT / "problems" / "thor.toml").read_text(encoding="utf-8") == TEXT
+
+
+def test_values_units_bounds_and_priors(write):
+    path = write(
+        """
+schema = 1
+[parameters]
+k = { value = 655, unit = "N/mm", prior_std = 3 }
+J = { value = 2e-6, free = true, min = 1e-7, max = 1e-4 }
+L_a = 0.08
+[plant.stand]
+kind = "high_impedance"
+"""
+    )
+    problem = so.read_problem(path)
+    k, j = problem.parameters["k"], problem.parameters["J"]
+    assert (k.value, k.prior_std, k.free) == (655e3, 3e3, True)
+    assert (j.free, j.min, j.max) == (True, 1e-7, 1e-4)
+    assert problem.parameters["L_a"].value == 0.08  # kept though no plant of the file uses it
+    assert problem.parameters["m_l"].value == 0.646  # the plant's default
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("bandwidth_hz = 30", "bandwith_hz = 30", 'unknown key controller.bandwith_hz; did you mean "bandwidth_hz"'),
+        ("bandwidth_hz = 30", "bandwidth_hz = 80", "bandwidth_hz = 80 is outside 15 to 60"),
+        ("bandwidth_hz = 30\n", "", "controller.bandwidth_hz is missing"),
+        ('unit = "kg m^2", free', 'unit = "kg m^3", free', "kg m\\^3"),
+        ('unit = "kg m^2", free', 'unit = "flurb", free', "flurb"),
+        ("value = 1.5e-6", "value = 1.5e-9", "J = 1.5e-09 kg m\\^2 is outside its bounds"),
+        ("J   =", "JJ  =", 'unknown parameter "JJ"'),
+        ('kind = "high_impedance"', 'kind = "high"', "plant.stand"),
+        ('drive = "unlumped"', 'drive = "unlumpt"', "unlumpt"),
+        ('drive = "unlumped"', 'drave = "unlumped"', "drave"),
+        ('plant = "swing"\nvirtual', 'plant = "swung"\nvirtual', "swung"),
+        ('robust_to = ["swing"]', 'robust_to = ["swong"]', 'did you mean "swing"'),
+        ("schema = 1", "schema = 2", "schema"),
+        ("schema = 1", "schema = 1\n[[[", "not valid TOML"),
+        ("seed = 1,", "seed = 'x',", "seed"),
+        ("f0_hz = 0.01", "f0_hz = 0.01, f2_hz = 3", "f2_hz"),
+        ("samples = 1375", "samples = 0", "samples"),
+    ],
+)
+def test_mistakes_are_one_clear_line(write, old, new, words):
+    assert old in TEXT
+    with pytest.raises(so.SeaoptError, match=words) as raised:
+        so.read_problem(write(TEXT.replace(old, new, 1)))
+    assert "\n" not in str(raised.value)
+    assert "problem.toml" in str(raised.value)
+
+
+@pytest.mark.parametrize("log", ["/etc/passwd", "../secret.csv"])
+def test_logs_stay_in_the_folder(write, log):
+    experiment = f'[[experiment]]\nname = "a"\nplant = "stand"\nlog = "{log}"\ntime = "t [s]"\noutputs = {{ F1 = "F1 [N]" }}\n'
+    with pytest.raises(so.SeaoptError, match="leaves the problem file's folder"):
+        so.read_problem(write('schema = 1\n[plant.stand]\nkind = "high_impedance"\n' + experiment))
+
+
+def test_an_experiment_from_a_csv(write, tmp_path, stand, thor, short_log):
+    lines = ["time [s],cur,F1 [N]"]
+    lines += [f"{t:.6f},{1e3 * i:.9g},{f:.9g}" for t, i, f in zip(short_log.time, short_log["I"], short_log["F1"], strict=True)]
+    (tmp_path / "chirp.csv").write_text("\n".join(lines), encoding="utf-8")
+    path = write(
+        """
+schema = 1
+[parameters]
+J = { value = 1e-6, free = true }
+[plant.stand]
+kind = "high_impedance"
+[[experiment]]
+name = "chirp"
+plant = "stand"
+log = "chirp.csv"
+time = "time [s]"
+inputs = { I = { column = "cur", unit = "mA" } }
+outputs = { F1 = { column = "F1 [N]", sigma = 2.0 } }
+slice_s = [1.0, 15.0]
+"""
+    )
+    problem = so.read_problem(path)
+    fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
+    assert fit.parameters["J"].value == pytest.approx(3.31e-6, rel=1e-3)
+    assert fit.outputs["chirp"]["F1"].sigma == 2.0
+
+
+def test_json_schema_is_one():
+    schema = json_schema()
+    assert schema["type"] == "object"
+    assert "schema" in schema["properties"]
+    json.dumps(schema)
+
+
+def test_import_is_light():
+    """`import seaopt` loads no plotting library, no reader, no optimiser."""
+    code = "import sys, seaopt; print([m for m in ('matplotlib','polars','control','pydantic','scipy','casadi') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"

@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+import pytest
+
+import seaopt as so
+
+
+def test_text_from_problems_is_escaped(stand, thor, tmp_path):
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    page = so.write_report([controller], tmp_path / "r.html", title="<script>alert(1)</script>")
+    text = page.read_text(encoding="utf-8")
+    assert "<script>" not in text
+    assert "&lt;script&gt;" in text
+
+
+def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path):
+    with pytest.raises(so.SeaoptError, match="no result"):
+        so.write_report([], tmp_path / "r.html")
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    with pytest.raises(so.SeaoptError, match="2 results of kind Controller"):
+        so.write_report([controller, controller], tmp_path / "r.html")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_log_with_gaps_and_missing_samples_is_drawn(stand, short_log, thor, tmp_path):
+    import numpy as np
+
+    keep = np.r_[0:3000, 4000:8000]
+    force = short_log["F1"][keep].copy()
+    force[100:110] = np.nan
+    log = so.Log.from_arrays(time=short_log.time[keep], I=short_log["I"][keep], F1=force)
+    fit = so.fit([so.Experiment(plant=stand, log=log, name="gappy")], thor.free("J"))
+    so.write_report([fit], tmp_path / "r.html")
+    assert (tmp_path / "figures" / "time_gappy.png").stat().st_size > 5000

@@ -1,0 +1,217 @@
+"""Simulation against scipy's DOP853 at rtol 1e-10; both ways of the pass against each other and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.signal import butter
+
+import seaopt as so
+from seaopt.errors import LogError, SimulationError
+from seaopt.simulation import Clock, Point, Segment, Weights, make_model, run_pass
+from seaopt.simulation.compiled import compiled_pass
+from seaopt.simulation.compiler import find_compiler
+from seaopt.simulation.interpreted import interpreted_pass
+
+RATE = 400.0
+
+
+def reference(plant, params, u, x0, hold):
+    """Integrate sample by sample with DOP853, so that the hold's corners fall on step ends."""
+    p = plant.parameter_values(params)
+    f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
+    h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+    x, out = np.array(x0, float), []
+    for k in range(len(u)):
+        out.append(np.array(h(k / RATE, x, u[k], p)).ravel())
+        after = u[min(k + 1, len(u) - 1)] if hold == "first" else u[k]
+
+        def rate(t, state, k=k, after=after):
+            part = (t - k / RATE) * RATE
+            return np.array(f(t, state, u[k] + (after - u[k]) * part, p)).ravel()
+
+        x = solve_ivp(rate, (k / RATE, (k + 1) / RATE), x, method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
+    return np.array(out)
+
+
+CASES = {
+    "stand": (so.plants.high_impedance(), {}),
+    "stand lumped": (so.plants.high_impedance(drive="lumped"), {}),
+    "stand link2": (so.plants.high_impedance(spring="link2"), {}),
+    "stand friction": (so.plants.high_impedance(), {"f_c": 40.0, "v_s": 5e-3}),
+    "swing": (so.plants.moving_output(), {}),
+    "swing lumped": (so.plants.moving_output(drive="lumped"), {}),
+    "swing friction": (so.plants.moving_output(), {"f_c": 40.0, "v_s": 5e-3, "d": 0.2}),
+}
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+@pytest.mark.parametrize("name", CASES)
+def test_simulation_is_dop853s(name, hold, thor):
+    plant, changes = CASES[name]
+    params = thor.update(**changes)
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=(80, 1)) * 3
+    x0 = {state: 1e-3 * rng.normal() for state in plant.states}
+    log = so.Log.from_arrays(time=np.arange(80) / RATE, I=u[:, 0])
+    run = so.simulate(plant, params, log, initial_state=x0, hold=hold)
+    expected = reference(plant, params, u, list(x0.values()), hold)
+    for column, output in enumerate(plant.outputs):
+        scale = np.max(np.abs(expected[:, column]))
+        np.testing.assert_allclose(run[output], expected[:, column], atol=1e-6 * scale, rtol=0)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=8)
+def test_random_pendulums_are_dop853s(seed):
+    rng = np.random.default_rng(seed)
+    plant = so.plants.moving_output()
+    around = {n: v.value * 10 ** rng.uniform(-0.4, 0.4) for n, v in so.plants.thor().items() if v.value and n != "g"}
+    params = so.plants.thor().update(**{**around, "f_c": rng.uniform(0, 30), "v_s": 0.01})
+    u = rng.normal(size=(40, 1)) * 3
+    log = so.Log.from_arrays(time=np.arange(40) / RATE, I=u[:, 0])
+    run = so.simulate(plant, params, log)
+    expected = reference(plant, params, u, [0.0] * 4, "zero")
+    for column, output in enumerate(plant.outputs):
+        scale = np.max(np.abs(expected[:, column]))
+        np.testing.assert_allclose(run[output], expected[:, column], atol=1e-6 * scale, rtol=0)
+
+
+def test_a_whole_sample_of_delay_shifts_the_response(stand, thor):
+    u = np.r_[np.zeros(5), np.ones(60)]
+    log = so.Log.from_arrays(time=np.arange(65) / RATE, I=u)
+    plain = so.simulate(stand, thor, log)["F1"]
+    late = so.simulate(stand, thor, log, delay_s=2 / RATE)["F1"]
+    np.testing.assert_allclose(late[2:], plain[:-2], atol=1e-9)
+
+
+@pytest.mark.parametrize("plant_name", ["stand", "swing friction"])
+def test_half_a_sample_of_delay_is_the_finer_simulation(plant_name, thor):
+    """A delay of half a period is a whole sample of a log at twice the rate."""
+    plant, changes = CASES[plant_name]
+    params = thor.update(**changes)
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=60)
+    coarse = so.Log.from_arrays(time=np.arange(60) / RATE, I=u)
+    fine = so.Log.from_arrays(time=np.arange(120) / (2 * RATE), I=np.repeat(u, 2))
+    expected = so.simulate(plant, params, fine, delay_s=0.5 / RATE)["F1"][::2]
+    found = so.simulate(plant, params, coarse, delay_s=0.5 / RATE)["F1"]
+    np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
+
+
+def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "eta")):
+    plant, changes = CASES[case]
+    params = thor.update(**changes)
+    free = (*free, "f_c") if changes.get("f_c") else free
+    model = make_model(plant, params, free, ("F1", "F2"))
+    rng = np.random.default_rng(2)
+    y = 300 * rng.normal(size=(n, 2))
+    y[7, 1] = np.nan
+    keep = np.ones((n, 2), dtype=np.uint8)
+    keep[100:120] = 0
+    segment = Segment(u=rng.normal(size=(n, 1)), y=y, keep=keep)
+    point = Point(
+        theta=np.array(params.values_of(free)), x0=1e-3 * rng.normal(size=model.nx), offset=rng.normal(size=2),
+        gain=np.array([1.1, 0.9]), clock=clock or Clock(period=1 / RATE), substeps=2,
+    )  # fmt: skip
+    weights = Weights.plain(2)
+    if filtered:
+        sos = butter(4, [5, 100], "bandpass", fs=RATE, output="sos")
+        weights = Weights(sections=np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]]), settle=50, knee=np.array([200.0, 9e9]))
+    return model, segment, point, weights
+
+
+SETTINGS = [
+    {},
+    {"filtered": True},
+    {"clock": Clock(period=1 / RATE, hold="first")},
+    {"clock": Clock(period=1 / RATE, delay_s=0.0033, delay_free=True)},
+]
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("case", ["stand", "swing", "swing friction"])
+@pytest.mark.parametrize("options", SETTINGS)
+def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
+    keep = {"outputs": True, "columns": True, "states": True}
+    arguments = passes(case, thor, **options)
+    fast, slow = compiled_pass(*arguments, **keep), interpreted_pass(*arguments, **keep)
+    for name in ("gram", "loss", "count", "outputs", "columns", "states", "last"):
+        a, b = getattr(fast, name), getattr(slow, name)
+        np.testing.assert_allclose(a, b, atol=1e-10 * np.max(np.abs(b)), rtol=1e-10, err_msg=name)
+
+
+@pytest.mark.parametrize("case", ["stand", "swing friction"])
+@pytest.mark.parametrize("options", SETTINGS)
+def test_derivatives_are_finite_differences(case, options, thor):
+    model, segment, point, weights = passes(case, thor, n=250, **options)
+
+    def residual(moved):
+        return run_pass(model, segment, moved, weights, columns=True).columns[:, :, 0]
+
+    columns = run_pass(model, segment, point, weights, columns=True).columns
+    moves = [("theta", i, 1e-5 * value) for i, value in enumerate(point.theta)]
+    moves += [("x0", i, 1e-6) for i in range(model.nx)]
+    if point.clock.delay_free:
+        moves.insert(len(point.theta), ("delay", 0, 1e-7))
+    for column, (what, i, step) in enumerate(moves, start=1):
+        if what == "delay":
+            ends = [replace(point, clock=replace(point.clock, delay_s=point.clock.delay_s + s * step)) for s in (1, -1)]
+        else:
+            base = getattr(point, what)
+            ends = [replace(point, **{what: base + s * step * np.eye(base.size)[i]}) for s in (1, -1)]
+        numeric = (residual(ends[0]) - residual(ends[1])) / (2 * step)
+        scale = np.max(np.abs(numeric))
+        np.testing.assert_allclose(columns[:, :, column], numeric, atol=2e-6 * scale, err_msg=f"{what} {i}")
+        wrong = columns[:, :, column] * 1.001
+        assert np.max(np.abs(wrong - numeric)) > 2e-6 * scale  # such an error would be caught
+
+
+def test_gram_is_the_product_of_the_columns(thor):
+    model, segment, point, weights = passes("stand", thor)
+    found = run_pass(model, segment, point, weights, columns=True)
+    for o in range(2):
+        v = found.columns[:, o]
+        v = v[(segment.keep[:, o] > 0) & np.isfinite(segment.y[:, o])]
+        np.testing.assert_allclose(found.gram[o], v.T @ v, rtol=1e-9)
+        assert found.count[o] == len(v)
+        assert found.loss[o] == pytest.approx(0.5 * np.sum(v[:, 0] ** 2))
+
+
+def test_bad_input_is_refused(stand, swing, thor):
+    log = so.Log.from_arrays(time=np.arange(10) / RATE, J=np.ones(10))
+    with pytest.raises(LogError, match='no channel "I"'):
+        so.simulate(stand, thor, log)
+    gap = so.Log.from_arrays(time=np.r_[0:10, 20:30] / RATE, I=np.ones(20))
+    with pytest.raises(LogError, match="gaps"):
+        so.simulate(stand, thor, gap)
+    holed = so.Log.from_arrays(time=np.arange(3) / RATE, I=[1.0, np.nan, 1.0])
+    with pytest.raises(LogError, match="missing at t"):
+        so.simulate(stand, thor, holed)
+    with pytest.raises(SimulationError, match="hold"):
+        so.simulate(stand, thor, so.Log.from_arrays(time=np.arange(3) / RATE, I=np.ones(3)), hold="cubic")
+
+
+def test_an_overflow_is_said(thor):
+    runaway = so.Plant(
+        name="runaway", states={"x": "m"}, inputs={"u": "N"}, outputs={"x": "m"}, parameters={"a": "1/s"},
+        f=lambda t, x, u, p: {"x": p.a * x.x**3 + u.u}, h=lambda t, x, u, p: {"x": x.x},
+    )  # fmt: skip
+    log = so.Log.from_arrays(time=np.arange(400) / 10, u=np.ones(400))
+    with pytest.raises(SimulationError, match="runaway"):
+        so.simulate(runaway, so.ParameterSet.of(a=(5.0, "1/s")), log)
+
+
+def test_the_kernel_folder_is_private(tmp_path, monkeypatch):
+    from seaopt.simulation.compiler import cache_folder
+
+    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "cache"))
+    folder = cache_folder()
+    assert folder is not None
+    assert folder.stat().st_mode & 0o777 == 0o700
