@@ -28,6 +28,8 @@ def test_twomass_resonances(data):
 
 
 def test_twomass_says_what_is_missing():
-    out = subprocess.run([sys.executable, PROBLEMS / "twomass.py", "no.mat"], capture_output=True, text=True, check=False)
+    out = subprocess.run(
+        [sys.executable, PROBLEMS / "twomass.py", "no.mat"], capture_output=True, text=True, check=False
+    )
     assert out.returncode == 2
     assert "is not there" in out.stdout

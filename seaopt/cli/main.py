@@ -108,7 +108,3 @@ def main() -> None:
         raise SystemExit(2) from None
     except BrokenPipeError:
         raise SystemExit(0) from None
-
-
-if __name__ == "__main__":
-    main()

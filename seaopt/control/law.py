@@ -95,7 +95,7 @@ class Gains:
         return TransferFunction(num=reference, den=den), TransferFunction(num=measurement, den=den)
 
 
-def _added(*polynomials: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+def _added(*polynomials: Float[np.ndarray, " _"]) -> Float[np.ndarray, " m"]:
     out = np.zeros(max(p.size for p in polynomials))
     for p in polynomials:
         out[: p.size] += p

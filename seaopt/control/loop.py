@@ -111,7 +111,7 @@ class Loop:
         closed[:n, n:] = -np.outer(b, cc) * loop
         closed[n:, :n] = np.outer(bc, c) * loop
         closed[n:, n:] = ac - np.outer(bc, cc) * d * loop
-        return np.linalg.eigvals(closed)
+        return np.linalg.eigvals(closed).astype(complex)
 
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""

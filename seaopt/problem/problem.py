@@ -97,7 +97,7 @@ class Problem:
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
-        """Return the plants to tune for besides the design plant: each of `robust_to`, at the ends of the ranges too."""
+        """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges."""
         out: dict[str, tuple[Plant, ParameterSet]] = {}
         for name in self.table.controller.robust_to if self.table.controller else []:
             plant = self.plants[name]
@@ -245,7 +245,9 @@ def _validated(source: Path, content: dict[str, Any]) -> ProblemTable:
     try:
         return ProblemTable.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        found = error.errors(include_url=False)
+        # A misspelt key is also a missing one: the misspelling is the mistake.
+        first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
         place = _place(first["loc"])
         if first["type"] == "extra_forbidden":
             known = _known_keys(first["loc"])

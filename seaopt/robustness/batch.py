@@ -17,6 +17,7 @@ Curves = Callable[[Float[np.ndarray, "n m"]], Float[np.ndarray, "n m"]]
 
 CHUNK = 128
 BASE_POINTS = 160
+MAXIMA = 3  # local maxima refined
 FAN = np.array([0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0])
 
 
@@ -51,7 +52,7 @@ def _chunk(controller: Controller, plant: Plant, p: Float[np.ndarray, "np n"]) -
     a, b, c, d = _sampled(controller, plant, p)
     eigenvalues = _closed_eigenvalues(controller, a, b, c, d)
     radius = np.max(np.abs(eigenvalues), axis=1)
-    f = _grids(controller.sample_time_s, np.linalg.eigvals(a), eigenvalues)
+    f = _grids(controller.sample_time_s, np.linalg.eigvals(a).astype(complex), eigenvalues)
 
     def loop_gain(x: Float[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
         z = np.exp(2j * np.pi * x * controller.sample_time_s)
@@ -121,7 +122,7 @@ def _closed_eigenvalues(
     closed[:, :n, n:] = -loop[:, None, None] * drive[:, :, None] * cc
     closed[:, n:, :n] = loop[:, None, None] * bc[:, None] * sense[:, None, :]
     closed[:, n:, n:] = ac - (loop * through)[:, None, None] * np.outer(bc, cc)
-    return np.linalg.eigvals(closed)
+    return np.linalg.eigvals(closed).astype(complex)
 
 
 def _grids(
@@ -139,16 +140,22 @@ def _grids(
 
 
 def _peaks(curve: Curves, f: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
-    """Return the largest value of each row's curve, refined by zooming in on the best grid point."""
+    """Return the largest value of each row's curve: the highest local maxima of its grid, refined by zooming."""
     values = curve(f)
     rows = np.arange(f.shape[0])
     top = np.max(values, axis=1)
-    at = np.clip(np.argmax(values, axis=1), 1, f.shape[1] - 2)
-    low, high = f[rows, at - 1], f[rows, at + 1]
-    for _ in range(5):
-        x = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-        y = curve(x)
-        top = np.maximum(top, np.max(y, axis=1))
-        k = np.clip(np.argmax(y, axis=1), 1, x.shape[1] - 2)
-        low, high = x[rows, k - 1], x[rows, k + 1]
+    inner = values[:, 1:-1]
+    local = np.where((inner >= values[:, :-2]) & (inner >= values[:, 2:]), inner, -np.inf)
+    for _ in range(MAXIMA):
+        at = np.argmax(local, axis=1)
+        # Of a plateau or of doubled points, the neighbours are the same maximum.
+        for near in (at - 1, at, at + 1):
+            local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
+        low, high = f[rows, np.maximum(at - 1, 0)], f[rows, np.minimum(at + 3, f.shape[1] - 1)]
+        for _ in range(6):
+            x = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
+            y = curve(x)
+            top = np.maximum(top, np.max(y, axis=1))
+            k = np.clip(np.argmax(y, axis=1), 1, x.shape[1] - 2)
+            low, high = x[rows, k - 1], x[rows, k + 1]
     return top

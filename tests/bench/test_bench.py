@@ -20,7 +20,7 @@ def test_the_papers_stand_experiment():
 
 
 def test_the_chirp_sweeps_exponentially():
-    """Its phase grows by a factor in equal times: instantaneous frequency by zero crossings, against f0 (f1/f0)^(t/T)."""
+    """Instantaneous frequency by zero crossings, against f0 (f1/f0)^(t/T)."""
     time = np.arange(0, 10, 1e-4)
     signal = Chirp(amplitude=1.0, f0_hz=1.0, f1_hz=100.0).samples(time, np.random.default_rng(0))
     crossings = time[1:][np.diff(np.sign(signal)) > 0]

@@ -19,7 +19,7 @@ SHORT = so.demo_path().read_text(encoding="utf-8").replace("duration_s = 164", "
 
 def seaopt(*arguments, cwd=None, **environment):
     return subprocess.run(
-        [sys.executable, "-W", "error", "-m", "seaopt.cli.main", *map(str, arguments)],
+        [sys.executable, "-W", "error", "-m", "seaopt.cli", *map(str, arguments)],
         capture_output=True, text=True, check=False, cwd=cwd, env={**os.environ, "COLUMNS": "200", **environment},
     )  # fmt: skip
 
@@ -38,7 +38,14 @@ def done(folder):
 
 def test_run_leaves_everything(folder, done):
     assert done.returncode == 0, done.stderr
-    for name in ("fit.json", "controller.json", "robustness.json", "report.html", "figures/loop.svg", "figures/loop.png"):
+    for name in (
+        "fit.json",
+        "controller.json",
+        "robustness.json",
+        "report.html",
+        "figures/loop.svg",
+        "figures/loop.png",
+    ):
         assert (folder / "all" / name).stat().st_size > 500
     assert "Certificate: passed" in done.stdout
     assert "fitting the logs" in done.stderr
@@ -47,7 +54,14 @@ def test_run_leaves_everything(folder, done):
     assert fit["status"] == "converged"
     for field in ("cost", "iterations", "samples", "wall_s", "derived", "covariance", "outputs", "identifiability"):
         assert field in fit
-    assert set(fit["outputs"]["chirp"]["F1"]) >= {"fit_percent", "holdout_fit_percent", "rms_residual", "sigma", "unit", "whiteness_p"}
+    assert set(fit["outputs"]["chirp"]["F1"]) >= {
+        "fit_percent",
+        "holdout_fit_percent",
+        "rms_residual",
+        "sigma",
+        "unit",
+        "whiteness_p",
+    }
     assert set(fit["derived"]) >= {"r", "m_k", "b_m", "natural_frequency_hz", "damping_ratio"}
 
 

@@ -98,7 +98,7 @@ def test_margins_are_python_controls_on_a_stable_loop(stand, thor):
     plant = control.ss2tf(control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3))
     c = control.tf(loop.measurement.num, loop.measurement.den, 1e-3)
     open_loop = plant * c * control.tf([1], [1, 0], 1e-3)
-    gm, pm, _, _, wpc, _ = control.stability_margins(open_loop)
+    gm, pm, _, _, wpc, _ = control.stability_margins(open_loop, method="poly")
     figures = loop.figures()
     assert figures.gain_margin_db == pytest.approx(20 * np.log10(gm), rel=1e-3)
     assert figures.phase_margin_deg == pytest.approx(pm, rel=1e-3)
@@ -111,15 +111,26 @@ def test_an_unstable_loop_has_no_margins(stand, thor):
     figures = loop_of("pd", stand, thor, k_p=400.0, k_d=3.0).figures()
     assert not figures.stable
     assert figures.spectral_radius > 1
-    assert (figures.gain_margin_db, figures.phase_margin_deg, figures.delay_margin_s, figures.disk_margin) == (0, 0, 0, 0)
+    assert (figures.gain_margin_db, figures.phase_margin_deg, figures.delay_margin_s, figures.disk_margin) == (
+        0,
+        0,
+        0,
+        0,
+    )
     assert np.isinf(figures.ms)
 
 
 def test_a_light_mode_between_grid_points_is_found():
     """zeta = 1e-5 at 77.123 Hz under unit feedback: the peak of S stands on a line 1e-3 Hz wide."""
     wn, zeta, ts = 2 * np.pi * 77.123, 1e-5, 1e-3
-    a, b, c, d, _ = cont2discrete(
-        (np.array([[0, 1], [-(wn**2), -2 * zeta * wn]]), np.array([[0], [wn**2]]), np.array([[1e-6, 0]]), np.zeros((1, 1))), ts
+    a, b, c, _, _ = cont2discrete(
+        (
+            np.array([[0, 1], [-(wn**2), -2 * zeta * wn]]),
+            np.array([[0], [wn**2]]),
+            np.array([[1e-6, 0]]),
+            np.zeros((1, 1)),
+        ),
+        ts,
     )
     plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=0, static_gain=1e-6)
     one = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
@@ -147,7 +158,7 @@ def test_stability_is_what_a_simulation_shows(name, request, thor):
             sizes.append(np.abs(u))
             if sizes[-1] > 1e12:
                 break
-        grew = max(sizes[-500:]) > max(sizes[:500])
+        grew = max(sizes[-50:]) > max(sizes[:50])
         assert loop.figures().stable != grew
 
 

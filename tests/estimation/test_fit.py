@@ -22,7 +22,9 @@ def experiment(plant, log, **options):
     return so.Experiment(plant=plant, log=log, **{"outputs": ("F1", "F2"), "name": "chirp", **options})
 
 
-@pytest.mark.parametrize("factors", [(0.3, 3, 0.3), (3, 0.3, 3), (3, 3, 1), (0.3, 0.3, 0.5), (10, 0.1, 1), (0.1, 10, 1)])
+@pytest.mark.parametrize(
+    "factors", [(0.3, 3, 0.3), (3, 0.3, 3), (3, 3, 1), (0.3, 0.3, 0.5), (10, 0.1, 1), (0.1, 10, 1)]
+)
 def test_the_stand_log_gives_the_published_values(stand, stand_log, thor, factors):
     """164 s, 2 N noise: J, b_r, eta within 0.5 % and 4 std; residual rms is the noise within 2 %."""
     start = {name: thor[name].value * factor for name, factor in zip(FREE, factors, strict=True)}
@@ -77,7 +79,7 @@ def exponential(name, f, h, states):
                     parameters={f"b{i}": "-" for i in range(1, 3)}, f=f, h=h)  # fmt: skip
 
 
-# NIST StRD nonlinear regression, Misra1a (https://www.itl.nist.gov/div898/strd): y = b1 (1 - exp(-b2 x)), certified values.
+# NIST StRD nonlinear regression, Misra1a (www.itl.nist.gov/div898/strd): y = b1 (1 - exp(-b2 x)); certified values.
 MISRA_X = [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0]
 MISRA_Y = [10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01, 66.40, 75.47, 81.78]
 MISRA = {"b1": (2.3894212918e2, 2.7070075241), "b2": (5.5015643181e-4, 7.2668688436e-6)}
@@ -109,7 +111,9 @@ def test_intervals_cover_the_truth(stand, thor):
     inside = 0
     for seed in range(60):
         noise = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
-        log = so.virtual_log(stand, thor, (Noise(std=1.0, band_hz=50),), duration_s=6, rate_hz=400, seed=seed, sensors=noise)
+        log = so.virtual_log(
+            stand, thor, (Noise(std=1.0, band_hz=50),), duration_s=6, rate_hz=400, seed=seed, sensors=noise
+        )
         fit = so.fit([experiment(stand, log)], thor.free(*FREE), method=so.OutputError(search=False))
         for name in FREE:
             low, high = fit.parameters[name].ci95
@@ -127,7 +131,9 @@ def test_coloured_residuals_widen_the_intervals(stand, thor):
         for k in range(1, len(log)):
             coloured[k] = 0.975 * coloured[k - 1] + rng.normal()
         noisy = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + coloured)
-        fit = so.fit([experiment(stand, noisy, outputs=("F1",))], thor.free("J", "b_r"), method=so.OutputError(search=False))
+        fit = so.fit(
+            [experiment(stand, noisy, outputs=("F1",))], thor.free("J", "b_r"), method=so.OutputError(search=False)
+        )
         found.append(fit.parameters["b_r"].value)
         stated.append(fit.parameters["b_r"].std)
     assert np.mean(stated) == pytest.approx(np.std(found), rel=0.35)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -82,10 +84,8 @@ def test_missing_and_wrong_units(csv):
 def test_any_bytes_end_in_a_log_or_a_seaopt_error(tmp_path_factory, content):
     path = tmp_path_factory.mktemp("fuzz") / "f.csv"
     path.write_bytes(content)
-    try:
+    with contextlib.suppress(SeaoptError):
         so.read_log(path, time="a [s]", channels={"b": so.Column(column="b", unit="N")})
-    except SeaoptError:
-        pass
 
 
 def test_gaps_become_segments():

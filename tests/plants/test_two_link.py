@@ -68,7 +68,9 @@ def test_high_impedance_is_the_papers(drive, values):
     found = {output: response(plant, params, output, s) for output in ("F1", "F2")}
     # (7) writes the damper's force as part of F2: F2 = F_m - b_m s x, which is (m_k s^2 + k)/den times F_m.
     np.testing.assert_allclose(found["F1"], expected[drive, "F1"], rtol=1e-9)
-    np.testing.assert_allclose(found["F2"], expected[drive, "F2"], rtol=1e-9, atol=1e-9 * abs(expected[drive, "F2"]).max())
+    np.testing.assert_allclose(
+        found["F2"], expected[drive, "F2"], rtol=1e-9, atol=1e-9 * abs(expected[drive, "F2"]).max()
+    )
     ratio = found["F1"] / found["F2"]
     keep = np.abs(found["F2"]) > 1e-4 * np.abs(found["F2"]).max()  # beside the zero of F2
     np.testing.assert_allclose(ratio[keep], expected[drive, "F1/F2"][keep], rtol=1e-6)

@@ -80,14 +80,19 @@ def test_mistakes_are_one_clear_line(write, old, new, words):
 
 @pytest.mark.parametrize("log", ["/etc/passwd", "../secret.csv"])
 def test_logs_stay_in_the_folder(write, log):
-    experiment = f'[[experiment]]\nname = "a"\nplant = "stand"\nlog = "{log}"\ntime = "t [s]"\noutputs = {{ F1 = "F1 [N]" }}\n'
+    experiment = (
+        f'[[experiment]]\nname = "a"\nplant = "stand"\nlog = "{log}"\ntime = "t [s]"\noutputs = {{ F1 = "F1 [N]" }}\n'
+    )
     with pytest.raises(so.SeaoptError, match="leaves the problem file's folder"):
         so.read_problem(write('schema = 1\n[plant.stand]\nkind = "high_impedance"\n' + experiment))
 
 
 def test_an_experiment_from_a_csv(write, tmp_path, stand, thor, short_log):
     lines = ["time [s],cur,F1 [N]"]
-    lines += [f"{t:.6f},{1e3 * i:.9g},{f:.9g}" for t, i, f in zip(short_log.time, short_log["I"], short_log["F1"], strict=True)]
+    lines += [
+        f"{t:.6f},{1e3 * i:.9g},{f:.9g}"
+        for t, i, f in zip(short_log.time, short_log["I"], short_log["F1"], strict=True)
+    ]
     (tmp_path / "chirp.csv").write_text("\n".join(lines), encoding="utf-8")
     path = write(
         """
@@ -121,6 +126,7 @@ def test_json_schema_is_one():
 
 def test_import_is_light():
     """`import seaopt` loads no plotting library, no reader, no optimiser."""
-    code = "import sys, seaopt; print([m for m in ('matplotlib','polars','control','pydantic','scipy','casadi') if m in sys.modules])"
+    heavy = ("matplotlib", "polars", "control", "pydantic", "scipy", "casadi")
+    code = f"import sys, seaopt; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -123,7 +123,9 @@ def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "
     weights = Weights.plain(2)
     if filtered:
         sos = butter(4, [5, 100], "bandpass", fs=RATE, output="sos")
-        weights = Weights(sections=np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]]), settle=50, knee=np.array([200.0, 9e9]))
+        weights = Weights(
+            sections=np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]]), settle=50, knee=np.array([200.0, 9e9])
+        )
     return model, segment, point, weights
 
 
