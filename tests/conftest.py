@@ -27,7 +27,11 @@ CHOICES = (
     ("error", "measurement"),
     ("disturbance", "noise"),
 )
-OVERRIDES = FrozenDict({Literal[choices]: str for choices in CHOICES})
+PARTS = (
+    "stribeck", "backlash", "hardening", "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay",
+    "measurement_delay",
+)  # fmt: skip
+OVERRIDES = FrozenDict({Literal[choices]: str for choices in (*CHOICES, PARTS)})
 checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker

@@ -37,7 +37,7 @@ class Log:
     >>> import numpy as np
     >>> t = np.arange(5) / 400
     >>> log = Log.from_arrays(time=t, I=np.ones(5), F1=240 * np.ones(5), units={"I": "A", "F1": "N"})
-    >>> log.rate_hz, log["F1"][0]
+    >>> log.rate_hz, float(log["F1"][0])
     (400.0, 240.0)
 
     """

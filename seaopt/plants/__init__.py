@@ -2,18 +2,23 @@
 
 from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
 from seaopt.plants.linear import jacobians, state_space
+from seaopt.plants.parts import PARTS, wrapped
 from seaopt.plants.plant import Plant
+from seaopt.plants.rotary import rotary
 from seaopt.plants.two_link import high_impedance, moving_output, thor, two_link
 
 __all__ = [
     "KINDS",
+    "PARTS",
     "Plant",
     "high_impedance",
     "jacobians",
     "known_parameters",
     "moving_output",
     "plant_of_kind",
+    "rotary",
     "state_space",
     "thor",
     "two_link",
+    "wrapped",
 ]

@@ -9,14 +9,17 @@ from typing import Any
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
+from seaopt.plants.parts import PARTS
 from seaopt.plants.plant import Plant
-from seaopt.plants.two_link import high_impedance, moving_output, two_link
+from seaopt.plants.rotary import rotary, rotary_parameters
+from seaopt.plants.two_link import all_parameters, high_impedance, moving_output, two_link
 
 ENTRY_POINTS = "seaopt.plants"
 KINDS: dict[str, Callable[..., Plant]] = {
     "high_impedance": high_impedance,
     "moving_output": moving_output,
     "two_link": two_link,
+    "rotary": rotary,
 }
 
 
@@ -48,8 +51,5 @@ def plant_of_kind(kind: str, **options: Any) -> Plant:
 
 def known_parameters() -> dict[str, Parameter]:
     """Return every parameter that some built-in plant has, by name (a problem file may name any of them)."""
-    found: dict[str, Parameter] = {}
-    for link1 in ("fixed", "mass", "pendulum"):
-        for link2 in ("fixed", "mass", "pendulum"):
-            found |= dict(two_link(link1=link1, link2=link2).defaults)
-    return dict(moving_output().defaults) | found
+    parts = [item for items in PARTS.values() for item in items]
+    return {item.name: item for item in (*all_parameters(), *rotary_parameters(), *parts)}

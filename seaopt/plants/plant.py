@@ -62,7 +62,7 @@ class Plant:
     ...     h=lambda t, x, u, p: {"x": x.x},
     ... )
     >>> model = plant.linearize(so.ParameterSet.of(m=(2.0, "kg"), k=(50.0, "N/m"), c=(1.0, "N s/m")))
-    >>> [round(abs(pole), 6) for pole in model.poles()]
+    >>> [round(float(abs(pole)), 6) for pole in model.poles()]
     [5.0, 5.0]
 
     """

@@ -38,13 +38,16 @@ for the unlumped drive, and :math:`F_2 = F_m - b_m \dot q` for the lumped one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import casadi as ca
 
-from seaopt.errors import PlantError
+from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import parts as part_laws
+from seaopt.plants.parts import PARTS, Part
 from seaopt.plants.plant import Plant
 
 Drive = Literal["unlumped", "lumped"]
@@ -71,6 +74,17 @@ _PENDULUM = (
     Parameter(name="d", value=0.0, unit="N m s", min=0.0, description="pivot damping"),
 )
 _GRAVITY = Parameter(name="g", value=9.81, unit="m/s^2", description="gravity")
+
+
+def all_parameters() -> list[Parameter]:
+    """Return every parameter that some `two_link`, `high_impedance` or `moving_output` has."""
+    links = [item for suffix in ("", "1", "2") for item in _pendulum_parameters(suffix)]
+    masses = [_link_mass(number) for number in (1, 2)]
+    return [*_ACTUATOR, *links, *masses, _GRAVITY]
+
+
+def _link_mass(number: int) -> Parameter:
+    return Parameter(name=f"m_{number}", value=10.0, unit="kg", min=0.0, description=f"mass of link {number}")
 
 
 def thor() -> ParameterSet:
@@ -151,87 +165,120 @@ class _Motion:
     links: tuple[_LinkModel, _LinkModel]
 
 
-def _motion(x: Any, u: Any, p: Any, links: tuple[_LinkModel, _LinkModel], drive: Drive, spring: Spring) -> _Motion:
-    """Lagrange's equations of the module docstring."""
-    r, rotary, b_m = _drive_figures(p)
-    moving = [link for link in links if link.coordinate is not None]
-    y = ca.vertcat(x.q, *(link.coordinate for link in moving))
-    yd = ca.vertcat(x.qd, *(link.rate for link in moving))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Build:
+    """What kind of actuator is built: its links with the endings of their names, drive, spring and parts."""
 
-    sprung = p.m_l if drive == "unlumped" else p.m_l + rotary
-    rotary = rotary if drive == "unlumped" else 0.0
+    links: tuple[Link, Link]
+    suffixes: tuple[str, str]
+    drive: Drive
+    spring: Spring
+    parts: tuple[Part, ...]
+
+
+def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
+    """Lagrange's equations of the module docstring."""
+    links = tuple(_link_model(build.links[i], i + 1, build.suffixes[i], x, p) for i in (0, 1))
+    r, rotary, b_m = _drive_figures(p)
+    unlumped, screw = build.drive == "unlumped", "screw_mode" in build.parts
+    moving = [link for link in links if link.coordinate is not None]
+    y = ca.vertcat(x.q, *([x.s] if screw else []), *(link.coordinate for link in moving))
+    yd = ca.vertcat(x.qd, *([x.sd] if screw else []), *(link.rate for link in moving))
+
+    sprung = p.m_l if unlumped else p.m_l + rotary
+    rotary = rotary if unlumped else 0.0
+    stretch = x.s if screw else 0.0
     x_1, x_2 = links[0].position, links[1].position
-    x_s = x.q + x_2 if spring == "link1" else (x_1 if drive == "unlumped" else x_1 - x.q)
-    compression = x.q + x_2 - x_1
+    if build.spring == "link1":
+        x_n = x_2 + stretch  # the nut
+        x_s, compression = x.q + x_n, x.q + x_n - x_1
+    elif unlumped:
+        x_n = x_1 - x.q + stretch
+        x_s, compression = x_1, x_2 - x_n
+    else:  # the mirror of spring at link 1
+        x_n = x_1 + stretch
+        x_s, compression = x_n - x.q, x_2 - x_n + x.q
+
+    def speed(position: Any) -> Any:
+        return ca.jtimes(position, y, yd)
+
+    nut = p.m_n if screw else 0.0
+    kinetic = 0.5 * (rotary * x.qd**2 + sprung * speed(x_s) ** 2 + nut * speed(x_n) ** 2)
+    kinetic += links[0].kinetic + links[1].kinetic
+    potential = links[0].potential + links[1].potential
+    tension = part_laws.spring_force(build.parts, compression, speed(compression), p)
+    bolt = (p.k_b * x.s + p.c_b * x.sd) if screw else 0.0
 
     # T = yd' H(y) yd / 2, so that H ydd = Q - dV/dy - (dH/dt yd - dT/dy).
-    speed_s = ca.jtimes(x_s, y, yd)
-    kinetic = 0.5 * rotary * x.qd**2 + 0.5 * sprung * speed_s**2 + links[0].kinetic + links[1].kinetic
-    potential = 0.5 * p.k * compression**2 + links[0].potential + links[1].potential
     inertia, _ = ca.hessian(kinetic, yd)
-    momentum = ca.gradient(kinetic, yd)
-    gyroscopic = ca.jtimes(momentum, y, yd) - ca.gradient(kinetic, y)
-
-    motor = p.eta * (p.K_tau / r) * u.I - b_m * x.qd - p.f_c * ca.tanh(x.qd / p.v_s)
+    gyroscopic = ca.jtimes(ca.gradient(kinetic, yd), y, yd) - ca.gradient(kinetic, y)
+    motor = p.eta * (p.K_tau / r) * u.I - b_m * x.qd - part_laws.dry_friction(build.parts, x.qd, p)
     external = getattr(u, "Fe1", 0.0) * x_1 + getattr(u, "Fe2", 0.0) * x_2
-    damping = ca.vertcat(0.0, *(link.damping for link in moving))
-    generalised = ca.gradient(external, y) - damping
+    damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping for link in moving))
+    generalised = ca.gradient(external - potential, y) - damping - tension * ca.gradient(compression, y)
     generalised[0] += motor
-    ydd = ca.mtimes(ca.inv_minor(inertia), generalised - ca.gradient(potential, y) - gyroscopic)
+    ydd = ca.mtimes(ca.inv_minor(inertia), generalised - gyroscopic)
 
-    tension = p.k * compression
-    thrust = sprung * (ca.jtimes(speed_s, y, yd) + ca.jtimes(x_s, y, ydd))
-    forces = (tension, tension + thrust) if spring == "link1" else (tension - thrust, tension)
-    return _Motion(rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=links)
+    def thrust(mass: Any, position: Any) -> Any:
+        return mass * (ca.jtimes(speed(position), y, yd) + ca.jtimes(position, y, ydd))
+
+    if build.spring == "link1":
+        forces = (tension, -bolt if screw else tension + thrust(sprung, x_s))
+    else:
+        forces = (tension - thrust(sprung, x_s) - (thrust(nut, x_n) if screw else 0.0), tension)
+    return _Motion(rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]))
 
 
 def _pendulum_parameters(suffix: str) -> list[Parameter]:
     return [replace(item, name=f"{item.name}{suffix}") for item in _PENDULUM]
 
 
-def _build(name: str, links: tuple[Link, Link], suffixes: tuple[str, str], drive: Drive, spring: Spring,
-           external: bool) -> Plant:  # fmt: skip
-    """Return the plant; `suffixes` is what the names of each link's pendulum end with."""
-    if drive not in ("unlumped", "lumped"):
-        raise PlantError(f'drive = "{drive}" is not known; use "unlumped" or "lumped"')
-    if spring not in ("link1", "link2"):
-        raise PlantError(f'spring = "{spring}" is not known; use "link1" or "link2"')
-    for number, link in enumerate(links, start=1):
-        if link not in ("fixed", "mass", "pendulum"):
-            raise PlantError(f'link{number} = "{link}" is not known; use "fixed", "mass" or "pendulum"')
+def _checked(build: _Build) -> _Build:
+    for what, given, known in (
+        ("drive", build.drive, ("unlumped", "lumped")),
+        ("spring", build.spring, ("link1", "link2")),
+        ("link1", build.links[0], ("fixed", "mass", "pendulum")),
+        ("link2", build.links[1], ("fixed", "mass", "pendulum")),
+    ):
+        if given not in known:
+            raise PlantError(f'{what} = "{given}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
+    for part in build.parts:
+        if part not in PARTS:
+            raise PlantError(f'part "{part}" is not known; {suggestion(str(part), PARTS)}')
+    return build
 
-    states = {"q": "m", "qd": "m/s"}
+
+def _actuator(name: str, build: _Build, external: bool) -> Plant:
+    """Return the plant of a build: its own states and parameters, then the parts that wrap any plant."""
+    _checked(build)
+    states = {"q": "m", "qd": "m/s"} | ({"s": "m", "sd": "m/s"} if "screw_mode" in build.parts else {})
     outputs = {"F1": "N", "F2": "N", "q": "m"}
-    parameters = list(_ACTUATOR)
-    for number, (link, suffix) in enumerate(zip(links, suffixes, strict=True), start=1):
+    parameters = [*_ACTUATOR, *part_laws.parameters(build.parts)]
+    for number, (link, suffix) in enumerate(zip(build.links, build.suffixes, strict=True), start=1):
         if link == "mass":
             states |= {f"x_{number}": "m", f"v_{number}": "m/s"}
-            parameters.append(Parameter(name=f"m_{number}", value=10.0, unit="kg", min=0.0, description="link mass"))
+            parameters.append(_link_mass(number))
         if link == "pendulum":
             states |= {f"phi{suffix}": "rad", f"phid{suffix}": "rad/s"}
             outputs |= {f"phi{suffix}": "rad"}
             parameters += _pendulum_parameters(suffix)
         if link != "fixed":
             outputs[f"x_{number}"] = "m"
-    if "pendulum" in links:
+    if "pendulum" in build.links:
         parameters.append(_GRAVITY)
 
-    def motion(x: Any, u: Any, p: Any) -> _Motion:
-        first, second = (_link_model(links[i], i + 1, suffixes[i], x, p) for i in (0, 1))
-        return _motion(x, u, p, (first, second), drive, spring)
-
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        flat = [item for pair in motion(x, u, p).rates for item in pair]
+        flat = [item for pair in _motion(x, u, p, build).rates for item in pair]
         return dict(zip(states, flat, strict=True))
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        result = motion(x, u, p)
+        result = _motion(x, u, p, build)
         values = {"F1": result.forces[0], "F2": result.forces[1], "q": x.q}
         for number, link in enumerate(result.links, start=1):
-            values |= {f"x_{number}": link.position, f"phi{suffixes[number - 1]}": link.coordinate}
+            values |= {f"x_{number}": link.position, f"phi{build.suffixes[number - 1]}": link.coordinate}
         return {name: values[name] for name in outputs}
 
-    return Plant(
+    plant = Plant(
         name=name,
         states=states,
         inputs={"I": "A"} | ({"Fe1": "N", "Fe2": "N"} if external else {}),
@@ -242,12 +289,17 @@ def _build(name: str, links: tuple[Link, Link], suffixes: tuple[str, str], drive
         derived=derived_figures,
         optional_inputs=frozenset({"Fe1", "Fe2"}) if external else frozenset(),
     )
+    return part_laws.wrapped(plant, build.parts)
 
 
 def two_link(
-    link1: Link = "fixed", link2: Link = "fixed", drive: Drive = "unlumped", spring: Spring = "link1"
+    link1: Link = "fixed",
+    link2: Link = "fixed",
+    drive: Drive = "unlumped",
+    spring: Spring = "link1",
+    parts: Sequence[Part] = (),
 ) -> Plant:
-    """Return the general plant: an actuator between two links, each fixed, a free mass or a pendulum.
+    r"""Return the general plant: an actuator between two links, each fixed, a free mass or a pendulum.
 
     Parameters
     ----------
@@ -258,6 +310,8 @@ def two_link(
         The rack and pinion of Orekhov et al. 2015 (Fig. 4b), or the conventional lumped mass (Fig. 4a).
     spring : {"link1", "link2"}
         Between housing and link 1 (the paper), or between ball nut and link 2 (its future work).
+    parts : sequence of str
+        What a real actuator has besides; see `seaopt.plants.parts`.
 
     Returns
     -------
@@ -265,26 +319,37 @@ def two_link(
         Inputs I (A) and the external forces Fe1, Fe2 (N, positive along x; on a fixed link the ground takes them;
         zero where a log leaves them out). Outputs F1, F2 (N), q (m), and of each moving link x_i (m) and phi (rad).
 
+    Raises
+    ------
+    PlantError
+        An option is unknown.
+
     Notes
     -----
-    The equations are derived in `seaopt.plants.two_link`; they reduce to (6)-(8) and (13)-(15) of the paper.
+    Spring at link 1, unlumped, with :math:`\delta = q + x_2 - x_1`, :math:`x_l = q + x_2` (5), :math:`M = J/r^2`:
+
+    .. math:: F_1 = k\delta, \quad m_l \ddot x_l = F_2 - F_1, \quad M \ddot q = F_m - b_m \dot q - F_2
+
+    and the links feel +F1 and -F2: :math:`m_1 \ddot x_1 = F_1 + F_{e1}`, :math:`m_2 \ddot x_2 = -F_2 + F_{e2}`,
+    :math:`I_p \ddot\varphi = -F_2 L_a \cos\varphi - m g L \sin\varphi - d \dot\varphi`. The other drives and
+    springs are in `seaopt.plants.two_link`, with the derivation (Orekhov et al. 2015, Figs. 3, 4 and (1)-(12)).
 
     Examples
     --------
     >>> plant = two_link(link1="mass", link2="pendulum")
     >>> list(plant.states)
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
-
     """
-    return _build(f"two_link({link1}, {link2}, {drive})", (link1, link2), ("1", "2"), drive, spring, True)
+    build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=tuple(parts))
+    return _actuator(f"two_link({link1}, {link2}, {drive})", build, external=True)
 
 
-def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1") -> Plant:
-    """Return the test stand: both links fixed (Orekhov et al. 2015, Fig. 5 and (6)-(15)).
+def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = ()) -> Plant:
+    r"""Return the test stand: both links fixed (Orekhov et al. 2015, Fig. 5 and (6)-(15)).
 
     Parameters
     ----------
-    drive, spring
+    drive, spring, parts
         As in `two_link`.
 
     Returns
@@ -292,22 +357,32 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1") -> Plant
     Plant
         Input I (A), outputs F1, F2 (N) and q (m).
 
+    Notes
+    -----
+    With :math:`F_m = \eta (K_\tau/r) I` (3), spring at link 1:
+
+    .. math:: \frac{F_1}{F_m} = \frac{k}{m_k s^2 + b_m s + k}, \qquad
+              \frac{F_2}{F_m} = \frac{m s^2 + k}{m_k s^2 + b_m s + k}
+
+    where m is :math:`m_k` for the lumped drive (6)-(8) and :math:`m_l` for the unlumped one (13)-(15). Spring at
+    link 2, unlumped: :math:`F_1 = F_2 = k F_m/(M s^2 + b_m s + k)`, the housing being at rest.
+
     Examples
     --------
     >>> model = high_impedance().linearize(thor())
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True
-
     """
-    return _build(f"high_impedance({drive})", ("fixed", "fixed"), ("1", "2"), drive, spring, False)
+    build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=tuple(parts))
+    return _actuator(f"high_impedance({drive})", build, external=False)
 
 
-def moving_output(drive: Drive = "unlumped", spring: Spring = "link1") -> Plant:
-    """Return the swing phase: link 1 fixed, a pendulum on link 2 (Orekhov et al. 2015, Fig. 8, Sec. III-E).
+def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = ()) -> Plant:
+    r"""Return the swing phase: link 1 fixed, a pendulum on link 2 (Orekhov et al. 2015, Fig. 8, Sec. III-E).
 
     Parameters
     ----------
-    drive, spring
+    drive, spring, parts
         As in `two_link`.
 
     Returns
@@ -315,10 +390,15 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1") -> Plant:
     Plant
         Input I (A), outputs F1, F2 (N), q (m), phi (rad) and x_2 (m); pendulum parameters I_p, m, L, L_a, d, g.
 
+    Notes
+    -----
+    :math:`x_2 = L_a \sin\varphi`, :math:`I_p \ddot\varphi = -F_2 L_a \cos\varphi - m g L \sin\varphi -
+    d \dot\varphi`, and the actuator's equations as in `two_link` with :math:`x_1 = 0`.
+
     Examples
     --------
     >>> list(moving_output().outputs)
     ['F1', 'F2', 'q', 'phi', 'x_2']
-
     """
-    return _build(f"moving_output({drive})", ("fixed", "pendulum"), ("1", ""), drive, spring, False)
+    build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=tuple(parts))
+    return _actuator(f"moving_output({drive})", build, external=False)

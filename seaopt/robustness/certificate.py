@@ -225,10 +225,10 @@ def certify(
     Examples
     --------
     >>> import seaopt as so
-    >>> params = so.plants.thor()
-    >>> controller = so.tune(so.plants.high_impedance(), params, so.ControllerSpec(bandwidth_hz=30))
-    >>> certificate = so.certify(controller, {"swing": so.plants.moving_output()}, params,
-    ...                          ranges={"I_p": (0.2, 0.6)}, samples=100)
+    >>> params, swing = so.plants.thor(), so.plants.moving_output()
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    >>> controller = so.tune(so.plants.high_impedance(), params, spec, robust_to={"swing": swing})
+    >>> certificate = so.certify(controller, {"swing": swing}, params, ranges={"I_p": (0.3, 0.5)}, samples=100)
     >>> certificate.passed, certificate.monte_carlo.failures
     (True, 0)
 

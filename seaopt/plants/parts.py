@@ -1,0 +1,241 @@
+r"""What real actuators have besides: optional parts that compose, each with its own parameters.
+
+Inside the actuator (of `two_link` and its special cases):
+
+``stribeck``
+    Friction rises at low speed (Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994),
+    smoothed through zero: :math:`F_f = [f_c + (f_s - f_c) e^{-(\dot q/v_{st})^2}] \tanh(\dot q/v_s)`; without it
+    :math:`F_f = f_c \tanh(\dot q/v_s)`. Viscous friction is b_r, in every plant.
+``backlash``
+    Play of total width :math:`2 g_b` in series with the spring: the spring sees
+    :math:`z(\delta) = \delta + \tfrac12\big(\sqrt{(\delta-g_b)^2+\epsilon^2} - \sqrt{(\delta+g_b)^2+\epsilon^2}\big)`,
+    which is nearly 0 within the play and :math:`\delta \mp g_b` beyond it; :math:`\epsilon` rounds the corners.
+``hardening``
+    :math:`F = k z + k_3 z^3`.
+``spring_damping``
+    :math:`F = \dots + c_k \dot\delta`, parallel to spring and play.
+``screw_mode``
+    The ball screw is axially elastic: it stretches by s, of stiffness k_b and damping c_b, and moves an effective mass
+    m_n at the nut: with both links fixed and a heavy rotor, a mode at
+    :math:`\tfrac{1}{2\pi}\sqrt{(k + k_b)/(m_l + m_n)}`. The defaults put it at 80 Hz with a damping ratio of 0.03, where
+    the paper saw one (between 70 and 80 Hz, with the actuator's length). They leave the static stiffness within a tenth,
+    which takes an m_n of 28 kg: an effective mass, much more than the screw's own.
+
+Around any plant:
+
+``current_loop``
+    The motor current lags the command: first order, bandwidth current_loop_hz.
+``load_cell``
+    F1 and F2 are read through a first-order sensor of bandwidth load_cell_hz.
+``command_delay``, ``measurement_delay``
+    Dead times T_c before the input and T_m behind F1 and F2, as Padé approximants of order three: the phase is right to
+    one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are for
+    linearisation and continuous-time loops.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import casadi as ca
+
+from seaopt.errors import PlantError, suggestion
+from seaopt.parameters import Parameter
+from seaopt.plants.plant import Plant
+
+Part = Literal[
+    "stribeck", "backlash", "hardening", "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay",
+    "measurement_delay",
+]  # fmt: skip
+
+PARTS: dict[str, tuple[Parameter, ...]] = {
+    "stribeck": (
+        Parameter(name="f_s", value=0.0, unit="N", min=0.0, description="breakaway friction at the screw"),
+        Parameter(name="v_st", value=5e-3, unit="m/s", min=1e-9, description="Stribeck speed"),
+    ),
+    "backlash": (
+        Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play"),
+        Parameter(name="eps_b", value=2e-6, unit="m", min=1e-12, description="rounding of the play's corners"),
+    ),
+    "hardening": (Parameter(name="k_3", value=0.0, unit="N/m^3", min=0.0, description="cubic stiffness"),),
+    "spring_damping": (Parameter(name="c_k", value=0.0, unit="N s/m", min=0.0, description="spring damping"),),
+    "screw_mode": (
+        Parameter(name="k_b", value=6.55e6, unit="N/m", min=0.0, description="axial stiffness of the screw"),
+        Parameter(name="c_b", value=860.0, unit="N s/m", min=0.0, description="damping of the screw"),
+        Parameter(name="m_n", value=27.9, unit="kg", min=0.0, description="effective mass at the nut"),
+    ),
+    "current_loop": (
+        Parameter(name="current_loop_hz", value=500.0, unit="Hz", min=1e-6, description="current loop bandwidth"),
+    ),
+    "load_cell": (
+        Parameter(name="load_cell_hz", value=500.0, unit="Hz", min=1e-6, description="load cell bandwidth"),
+    ),
+    "command_delay": (Parameter(name="T_c", value=1e-3, unit="s", min=1e-9, description="delay of the command"),),
+    "measurement_delay": (
+        Parameter(name="T_m", value=1e-3, unit="s", min=1e-9, description="delay of the measurement"),
+    ),
+}  # fmt: skip
+INSIDE = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
+FORCES = ("F1", "F2")
+
+
+def parameters(parts: Sequence[str]) -> list[Parameter]:
+    """Return the parameters of the parts that sit inside the actuator."""
+    return [item for part in parts if part in INSIDE for item in PARTS[part]]
+
+
+def play(compression: Any, p: Any) -> Any:
+    """Return what the spring sees of a compression behind the play."""
+    before = ca.sqrt((compression - p.g_b) ** 2 + p.eps_b**2)
+    return compression + 0.5 * (before - ca.sqrt((compression + p.g_b) ** 2 + p.eps_b**2))
+
+
+def spring_force(parts: Sequence[str], compression: Any, rate: Any, p: Any) -> Any:
+    """Return the spring's force at a compression (m) and its rate (m/s), N."""
+    z = play(compression, p) if "backlash" in parts else compression
+    force = p.k * z
+    if "hardening" in parts:
+        force += p.k_3 * z**3
+    return force + p.c_k * rate if "spring_damping" in parts else force
+
+
+def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
+    """Return Coulomb's and, with the part, Stribeck's friction at the screw, N."""
+    level = p.f_c
+    if "stribeck" in parts:
+        level = level + (p.f_s - p.f_c) * ca.exp(-((speed / p.v_st) ** 2))
+    return level * ca.tanh(speed / p.v_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Filter:
+    """A linear filter z' = A z + b v, out = c z + d v, its entries expressions of the parameters."""
+
+    a: Any
+    b: Any
+    c: Any
+    d: Any
+
+
+def _lag(p: Any, name: str) -> _Filter:
+    rate = 2 * math.pi * getattr(p, name)
+    return _Filter(a=-ca.SX(rate), b=ca.SX(rate), c=ca.SX(1), d=ca.SX(0))
+
+
+def _pade(p: Any, name: str) -> _Filter:
+    """exp(-s T) by Padé's (3, 3): (120 - 60 sT + 12 (sT)^2 - (sT)^3) / (120 + 60 sT + 12 (sT)^2 + (sT)^3)."""
+    t = getattr(p, name)
+    den = [120 / t**3, 60 / t**2, 12 / t]  # ascending powers of s, monic
+    num = [120 / t**3, -60 / t**2, 12 / t]  # leading coefficient -1
+    a = ca.vertcat(
+        ca.horzcat(0, 1, 0),
+        ca.horzcat(0, 0, 1),
+        ca.horzcat(*(-item for item in den)),
+    )  # fmt: skip
+    c = ca.horzcat(*(n + d for n, d in zip(num, den, strict=True)))
+    return _Filter(a=a, b=ca.vertcat(0, 0, 1), c=c, d=ca.SX(-1))
+
+
+_FILTERS = {
+    "current_loop": (_lag, "current_loop_hz", "input", 1),
+    "load_cell": (_lag, "load_cell_hz", "output", 1),
+    "command_delay": (_pade, "T_c", "input", 3),
+    "measurement_delay": (_pade, "T_m", "output", 3),
+}
+
+
+def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, outputs: Sequence[str] = FORCES) -> Plant:
+    """Return a plant behind its current loop and delays, read through its load cells; any plant will do.
+
+    Parameters
+    ----------
+    plant : Plant
+        The plant inside.
+    parts : sequence of str
+        Of these, current_loop, load_cell, command_delay and measurement_delay are put around it; the rest is left.
+    source : str, optional
+        The input that passes current loop and command delay; the first if left out.
+    outputs : sequence of str
+        The outputs that pass load cell and measurement delay; those that the plant has.
+
+    Raises
+    ------
+    PlantError
+        A part, the input or every output is unknown.
+
+    Examples
+    --------
+    >>> from seaopt.plants import high_impedance
+    >>> list(wrapped(high_impedance(), ["current_loop", "load_cell"]).states)
+    ['q', 'qd', 'I_current_loop_1', 'F1_load_cell_1', 'F2_load_cell_1']
+    """
+    for part in parts:
+        if part not in PARTS:
+            raise PlantError(f'part "{part}" is not known; {suggestion(part, PARTS)}')
+    for part in ("current_loop", "command_delay", "load_cell", "measurement_delay"):
+        if part not in parts:
+            continue
+        where = _FILTERS[part][2]
+        if where == "input":
+            name = source if source is not None else next(iter(plant.inputs))
+            if name not in plant.inputs:
+                raise PlantError(f'plant {plant.name} has no input "{name}"; {suggestion(name, plant.inputs)}')
+            signals = [name]
+        else:
+            signals = [name for name in outputs if name in plant.outputs]
+            if not signals:
+                raise PlantError(
+                    f"plant {plant.name} has none of the outputs {', '.join(outputs)} that {part} reads; name others"
+                )
+        plant = _filtered(plant, part, signals)
+    return plant
+
+
+def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
+    """Return a plant with one filter on each of the named inputs or outputs."""
+    law, parameter, where, order = _FILTERS[part]
+    own = {signal: [f"{signal}_{part}_{i}" for i in range(1, order + 1)] for signal in signals}
+    units = plant.inputs if where == "input" else plant.outputs
+    added = {state: units[signal] for signal in signals for state in own[signal]}
+
+    def split(x: Any, u: Any, p: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """Return inner inputs, inner outputs' replacement, and derivatives of the filters' states."""
+        filters = law(p, parameter)
+        states = {signal: ca.vertcat(*(getattr(x, name) for name in own[signal])) for signal in signals}
+        inner_u = {name: getattr(u, name) for name in plant.inputs}
+        if where == "input":
+            passed = {s: ca.mtimes(filters.c, states[s]) + filters.d * inner_u[s] for s in signals}
+            sources, inner_u = dict(inner_u), inner_u | passed
+            out = plant.h(0, x, SimpleNamespace(**inner_u), p)
+        else:
+            out = dict(plant.h(0, x, SimpleNamespace(**inner_u), p))
+            sources = dict(out)
+            out |= {s: ca.mtimes(filters.c, states[s]) + filters.d * sources[s] for s in signals}
+        rates: dict[str, Any] = {}
+        for s in signals:
+            rate = ca.mtimes(filters.a, states[s]) + filters.b * sources[s]
+            rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
+        return inner_u, dict(out), rates
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        inner_u, _, rates = split(x, u, p)
+        return {**plant.f(t, x, SimpleNamespace(**inner_u), p), **rates}
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return split(x, u, p)[1]
+
+    return Plant(
+        name=f"{plant.name} with {part}",
+        states={**plant.states, **added},
+        inputs=plant.inputs,
+        outputs=plant.outputs,
+        parameters={**plant.parameters, **{item.name: item for item in PARTS[part]}},
+        f=f,
+        h=h,
+        derived=plant.derived,
+        optional_inputs=plant.optional_inputs,
+    )
