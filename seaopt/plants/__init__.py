@@ -1,7 +1,9 @@
 """Symbolic CasADi plants: the paper's actuator between two links, and a user's own."""
 
+from seaopt.plants.exchange import export_fmu, to_control
 from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
 from seaopt.plants.linear import jacobians, state_space
+from seaopt.plants.modes import Modes, Resonance, modes
 from seaopt.plants.parts import PARTS, wrapped
 from seaopt.plants.plant import Plant
 from seaopt.plants.rotary import rotary
@@ -10,15 +12,20 @@ from seaopt.plants.two_link import high_impedance, moving_output, thor, two_link
 __all__ = [
     "KINDS",
     "PARTS",
+    "Modes",
     "Plant",
+    "Resonance",
+    "export_fmu",
     "high_impedance",
     "jacobians",
     "known_parameters",
+    "modes",
     "moving_output",
     "plant_of_kind",
     "rotary",
     "state_space",
     "thor",
+    "to_control",
     "two_link",
     "wrapped",
 ]

@@ -15,8 +15,8 @@ Inside the actuator (of `two_link` and its special cases):
 ``spring_damping``
     :math:`F = \dots + c_k \dot\delta`, parallel to spring and play.
 ``screw_mode``
-    The ball screw is axially elastic: it stretches by s, of stiffness k_b and damping c_b, and moves an effective mass
-    m_n at the nut: with both links fixed and a heavy rotor, a mode at
+    The ball screw is axially elastic: it stretches by s, with stiffness k_b and damping c_b, and moves an effective
+    mass m_n at the nut: with both links fixed and a heavy rotor, a mode at
     :math:`\tfrac{1}{2\pi}\sqrt{(k + k_b)/(m_l + m_n)}`. The defaults put it at 80 Hz with a damping ratio of 0.03, where
     the paper saw one (between 70 and 80 Hz, with the actuator's length). They leave the static stiffness within a tenth,
     which takes an m_n of 28 kg: an effective mass, much more than the screw's own.
@@ -172,6 +172,7 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
     >>> from seaopt.plants import high_impedance
     >>> list(wrapped(high_impedance(), ["current_loop", "load_cell"]).states)
     ['q', 'qd', 'I_current_loop_1', 'F1_load_cell_1', 'F2_load_cell_1']
+
     """
     for part in parts:
         if part not in PARTS:

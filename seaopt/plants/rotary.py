@@ -66,6 +66,7 @@ def rotary(parts: Sequence[Part] = ()) -> Plant:
     >>> model = plant.linearize(plant.defaults)
     >>> model.output_labels
     ['tau_s', 'theta_m', 'theta_l', 'tau_h']
+
     """
 
     def torques(x: Any, u: Any, p: Any) -> tuple[Any, Any]:

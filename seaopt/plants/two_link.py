@@ -339,6 +339,7 @@ def two_link(
     >>> plant = two_link(link1="mass", link2="pendulum")
     >>> list(plant.states)
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
+
     """
     build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=tuple(parts))
     return _actuator(f"two_link({link1}, {link2}, {drive})", build, external=True)
@@ -372,6 +373,7 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
     >>> model = high_impedance().linearize(thor())
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True
+
     """
     build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=tuple(parts))
     return _actuator(f"high_impedance({drive})", build, external=False)
@@ -399,6 +401,7 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Se
     --------
     >>> list(moving_output().outputs)
     ['F1', 'F2', 'q', 'phi', 'x_2']
+
     """
     build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=tuple(parts))
     return _actuator(f"moving_output({drive})", build, external=False)

@@ -1,0 +1,109 @@
+"""Plants for other tools: a python-control `NonlinearIOSystem`, and an FMU (CasADi's exporter, FMI 3.0)."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from seaopt.errors import PlantError
+from seaopt.files import write_bytes
+from seaopt.parameters import ParameterSet
+from seaopt.plants.plant import Plant
+
+
+def to_control(plant: Plant, params: ParameterSet) -> Any:
+    """Return the plant as a continuous-time `control.NonlinearIOSystem` with named signals, at fixed parameters."""
+    import control  # deferred: it imports matplotlib
+
+    p = plant.parameter_values(params)
+    f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
+    h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+
+    def update(t: float, x: Any, u: Any, _: Any) -> Any:
+        return np.array(f(t, x, u, p)).ravel()
+
+    def output(t: float, x: Any, u: Any, _: Any) -> Any:
+        return np.array(h(t, x, u, p)).ravel()
+
+    return control.NonlinearIOSystem(
+        update, output, states=list(plant.states), inputs=list(plant.inputs), outputs=list(plant.outputs),
+        name=plant.name.replace(" ", "_"), dt=0,
+    )  # fmt: skip
+
+
+def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include: Path | str | None = None) -> Path:
+    """Write the plant as an FMU for model exchange, FMI 3.0, with its C sources; parameters stay tunable.
+
+    Parameters
+    ----------
+    plant, params
+        The plant, and the start values of its parameters.
+    path : path
+        The .fmu file.
+    include : path, optional
+        A folder with the FMI 3.0 headers: with it and a C compiler, a binary for this platform goes in too. Without,
+        the importing tool compiles the sources.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    PlantError
+        The installed CasADi has no exporter, the plant depends on time explicitly, or the sources do not compile.
+
+    Notes
+    -----
+    States start at zero. An output with the name of a state is called NAME_out.
+    """
+    if not hasattr(ca.DaeBuilder, "export_fmu"):
+        raise PlantError(f"CasADi {ca.__version__} has no FMU exporter; install CasADi 3.8 or newer")
+    if ca.depends_on(ca.vertcat(plant.dynamics, plant.output), plant.t):
+        raise PlantError(f"plant {plant.name} depends on time explicitly, which the export leaves out")
+    target = Path(path)
+    builder = _builder(plant, params, "".join(c if c.isalnum() else "_" for c in target.stem))
+    archive = io.BytesIO()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        try:
+            content = builder.export_fmu({"no_warning": True, "with_serialization": False})
+            if include is not None:
+                content = builder.compile_fmu(content, {"include_dirs": [str(Path(include).resolve())]})
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise PlantError(
+                f"plant {plant.name}: the FMU cannot be made ({reason}); check compiler and include"
+            ) from error
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
+            for source, place in content.items():
+                packed.write(source, str(Path(place)))
+    return write_bytes(target, archive.getvalue())
+
+
+def _builder(plant: Plant, params: ParameterSet, name: str) -> Any:
+    builder = ca.DaeBuilder(name, "", {})
+    x = {state: builder.add(state) for state in plant.states}
+    u = {source: builder.add(source, "input") for source in plant.inputs}
+    p = {parameter: builder.add(parameter, "parameter", "tunable") for parameter in plant.parameters}
+    taken = {*x, *u, *p}
+    y = [builder.add(f"{o}_out" if o in taken else o, "output") for o in plant.outputs]
+    equations = ca.Function("equations", [plant.x, plant.u, plant.p], [plant.dynamics, plant.output])
+    rates, outputs = equations(*(ca.vertcat(*named.values()) for named in (x, u, p)))
+    for state, rate in zip(x.values(), ca.vertsplit(rates), strict=True):
+        builder.eq(builder.der(state), rate)
+    for symbol, output in zip(y, ca.vertsplit(outputs), strict=True):
+        builder.eq(symbol, output)
+    for parameter, value in zip(p, plant.parameter_values(params), strict=True):
+        builder.set_start(parameter, value)
+    for state in x:
+        builder.set_start(state, 0.0)
+        builder.set_initial(state, "exact")
+    return builder

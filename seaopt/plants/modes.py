@@ -1,0 +1,148 @@
+"""Poles, zeros, static gains and resonances of a plant at an operating point, by name."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.parameters import ParameterSet
+from seaopt.plants.linear import state_space
+from seaopt.plants.plant import Plant
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Resonance:
+    """A pair of complex poles.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Undamped natural frequency.
+    damping_ratio : float
+        Negative where the mode grows.
+    states : tuple of str
+        The states that take part, the largest first, each scaled by its participation factor.
+    """
+
+    frequency_hz: float
+    damping_ratio: float
+    states: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Modes:
+    """What a linearised plant is made of.
+
+    Parameters
+    ----------
+    poles : complex array, shape (nx,)
+        rad/s, slowest first.
+    resonances : tuple of Resonance
+        Slowest first.
+    zeros : mapping of (output, input) to complex array
+        Finite zeros of each transfer function, rad/s.
+    dc_gain : mapping of (output, input) to float
+        In the output's unit over the input's; infinite or not a number where the plant integrates.
+    """
+
+    poles: Complex[np.ndarray, " nx"]
+    resonances: tuple[Resonance, ...]
+    zeros: Mapping[tuple[str, str], Complex[np.ndarray, " _"]]
+    dc_gain: Mapping[tuple[str, str], float]
+
+    def __repr__(self) -> str:
+        lines = ["Modes"]
+        lines += [
+            f"  resonance {item.frequency_hz:.5g} Hz, damping ratio {item.damping_ratio:.3g} ({', '.join(item.states)})"
+            for item in self.resonances
+        ]
+        lines += [f"  real pole {pole.real:.5g} rad/s" for pole in self.poles if pole.imag == 0.0]
+        for (output, source), zeros in self.zeros.items():
+            shown = ", ".join(f"{abs(zero) / 2 / np.pi:.4g}" for zero in zeros if zero.imag >= 0.0) or "none"
+            lines.append(f"  {output}/{source}: static gain {self.dc_gain[output, source]:.5g}, zeros at {shown} Hz")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def modes(
+    plant: Plant,
+    params: ParameterSet,
+    x: Mapping[str, float] | None = None,
+    u: Mapping[str, float] | None = None,
+) -> Modes:
+    """Return poles, zeros, static gains and resonances of a plant linearised at an operating point.
+
+    Parameters
+    ----------
+    plant, params
+        The plant and its parameters.
+    x, u : mapping of name to float, optional
+        Operating point; what is left out is zero.
+
+    Examples
+    --------
+    >>> from seaopt.plants import high_impedance, thor
+    >>> found = modes(high_impedance(), thor())
+    >>> round(found.resonances[0].frequency_hz, 2), round(found.dc_gain["F1", "I"], 1)
+    (7.5, 240.3)
+    """
+    a, b, c, d = state_space(plant, params, x, u)
+    poles, right = np.linalg.eig(a)
+    left = np.linalg.pinv(right)
+    order = np.argsort(np.abs(poles), kind="stable")
+    names = list(plant.states)
+    resonances: list[Resonance] = []
+    for k in order:
+        if poles[k].imag > 1e-9 * abs(poles[k]):
+            share = np.abs(right[:, k] * left[k])
+            ranked = [names[i] for i in np.argsort(-share) if share[i] > 0.1 * share.max()]
+            resonances.append(
+                Resonance(
+                    frequency_hz=float(abs(poles[k]) / (2 * np.pi)),
+                    damping_ratio=float(-poles[k].real / abs(poles[k])),
+                    states=tuple(ranked),
+                )
+            )
+    pairs = [(i, j, output, source) for i, output in enumerate(plant.outputs) for j, source in enumerate(plant.inputs)]
+    singular = np.linalg.cond(a) > 1e14
+    return Modes(
+        poles=poles[order].astype(complex),
+        resonances=tuple(resonances),
+        zeros={(output, source): _zeros(a, b[:, j], c[i], float(d[i, j])) for i, j, output, source in pairs},
+        dc_gain={
+            (output, source): np.inf if singular else float(d[i, j] - c[i] @ np.linalg.solve(a, b[:, j]))
+            for i, j, output, source in pairs
+        },
+    )
+
+
+def _zeros(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
+) -> Complex[np.ndarray, " m"]:
+    """Return the finite generalised eigenvalues of the system pencil [[A, b], [c, d]] - z diag(1, 0).
+
+    The pencil is scaled first: forces in newtons and strains in metres stand ten decades apart.
+    """
+    from scipy.linalg import eig
+
+    n = b.size
+    if not np.any(b) or (not np.any(c) and d == 0.0):
+        return np.zeros(0, dtype=complex)
+    scale = max(float(np.max(np.abs(c))), abs(d))
+    drive = float(np.max(np.abs(b))) or 1.0
+    pencil = np.block([[a, b[:, None] / drive], [c[None] / scale, np.array([[d / scale / drive]])]])
+    mass = np.zeros((n + 1, n + 1))
+    mass[:n, :n] = np.eye(n)
+    alpha, beta = eig(pencil, mass, right=False, homogeneous_eigvals=True)
+    size = np.hypot(np.abs(alpha), np.abs(beta))
+    finite = np.abs(beta) > 1e-10 * np.where(size > 0.0, size, 1.0) / max(1.0, float(np.max(np.abs(a))))
+    found = (alpha[finite] / beta[finite]).astype(complex)
+    bound = 1e4 * max(1.0, float(np.max(np.abs(np.linalg.eigvals(a)))))
+    found = found[np.abs(found) < bound]
+    return found[np.argsort(np.abs(found), kind="stable")]
