@@ -123,12 +123,12 @@ def _task(
     robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]],
 ) -> Task:  # fmt: skip
     gain = current_per_force(plant, params)
-    pairs = {"design": (plant, params)} | {
-        name: given if isinstance(given, tuple) else (given, params) for name, given in robust_to.items()
-    }
+    if not isinstance(robust_to, Mapping):
+        raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
+    names = ("design plant", *robust_to)
+    pairs = [(plant, params), *(p if isinstance(p, tuple) else (p, params) for p in robust_to.values())]
     plants = tuple(
-        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.delay_samples)
-        for model, values in pairs.values()
+        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.delay_samples) for model, values in pairs
     )
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
@@ -136,10 +136,10 @@ def _task(
             f"measured = {spec.measured}: the static gain of {plant.name} from motor force is {static:g}, which "
             "feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
-    for name, sampled in zip(pairs, plants, strict=True):
+    for name, sampled in zip(names, plants, strict=True):
         if np.max(np.abs(np.linalg.eigvals(sampled.a))) > 1.0 + 1e-9:
             raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
-    return Task(spec=spec, plants=plants, names=tuple(pairs), k_ff=1.0 / static)
+    return Task(spec=spec, plants=plants, names=names, k_ff=1.0 / static)
 
 
 def _gains(task: Task, x: Float[np.ndarray, " 4"]) -> Gains:
@@ -155,7 +155,10 @@ def _loop(task: Task, x: Float[np.ndarray, " 4"], plant: int = 0) -> Loop:
 
 
 def _frequencies(task: Task) -> Float[np.ndarray, " m"]:
-    """Return a logarithmic grid, finer about lightly damped plant modes (step at most zeta f / 4), with f_b in it."""
+    """Return a logarithmic grid, finer about lightly damped plant modes, with f_b in it.
+
+    Steps there are zeta f / 4, or as small as 80 points allow; what falls between is found and added by `_polish`.
+    """
     nyquist = 0.5 / task.spec.sample_time_s
     points = [np.geomspace(LOWEST_HZ, 0.999 * nyquist, 220), [task.spec.bandwidth_hz]]
     for plant in task.plants:

@@ -5,9 +5,10 @@ residuals is :math:`H^{-1}`. Residuals of a real log are coloured; then
 
 .. math:: \Sigma = H^{-1} (B + P) H^{-1}, \qquad B = \sum_{t,s} J_t^T\, R(t - s)\, J_s
 
-with R the residuals' autocorrelation (Ljung, System Identification, 2nd ed., Sec. 9.5; Newey and West 1987). R is
-estimated from the residuals under a Parzen window, whose spectrum is never negative, so that B is never indefinite,
-and the double sum is done in the frequency domain.
+with R the correlation of the residuals of all outputs, at all lags (Ljung, System Identification, 2nd ed., Sec. 9.5;
+Newey and West 1987). R is estimated from the residuals under a Parzen window, whose spectral matrix is never
+indefinite, and the double sum is done in the frequency domain. With Huber's loss the residuals in B are clipped, and
+J^T J counts only those that are not (Huber, Robust Statistics, 1981, ch. 7).
 """
 
 from __future__ import annotations
@@ -56,30 +57,45 @@ class Identifiability:
     unidentifiable: tuple[dict[str, float], ...]
 
 
-def meat(problem: Residuals, z: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n n"], list[list[float]]]:
-    """Return B of the module docstring, and the whiteness p-value of each experiment's outputs."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sandwich:
+    """B and J^T J (without priors) at the minimum, and the whiteness p-value of each experiment's outputs."""
+
+    meat: Float[np.ndarray, "n n"]
+    bread: Float[np.ndarray, "n n"]
+    whiteness: list[list[float]]
+
+
+def sandwich(problem: Residuals, z: Float[np.ndarray, " n"]) -> Sandwich:
+    """Return the parts of the covariance of the module docstring."""
     n = z.size
-    total = np.zeros((n, n))
+    meat, bread = np.zeros((n, n)), np.zeros((n, n))
     whiteness: list[list[float]] = []
     for e, pieces in enumerate(problem.segments):
-        weights, row = problem.weights(e), [1.0] * len(problem.sigma[e])
+        weights, sigma = problem.weights(e), problem.sigma[e]
+        row = [1.0] * len(sigma)
         for s in range(len(pieces)):
             columns = problem.run(e, s, z, columns=True).columns
             assert columns is not None
             present = counted(problem, e, s, weights.settle)
-            for o, sigma in enumerate(problem.sigma[e]):
-                v = columns[:, o] / sigma * present[:, o][:, None]
-                if np.count_nonzero(present[:, o]) < 8:
-                    continue
-                if np.isfinite(weights.knee[o]):
-                    v[:, 0] = np.clip(v[:, 0], -weights.knee[o] / sigma, weights.knee[o] / sigma)
-                index = problem.columns_of(e, s, o)
-                kept = [i for i, k in enumerate(index) if k is not None]
-                place = [k for k in index if k is not None]
-                total[np.ix_(place, place)] += coloured_gram(v[:, 1:][:, kept], v[:, 0])
-                row[o] = min(row[o], ljung_box(v[present[:, o] > 0.0, 0]))
+            residual = columns[:, :, 0] / sigma * present
+            knee = weights.knee / sigma
+            jacobians: list[Float[np.ndarray, "m n"]] = []
+            for o in range(len(sigma)):
+                j = np.zeros((residual.shape[0], n))
+                for column, k in enumerate(problem.columns_of(e, s, o), start=1):
+                    if k is not None:
+                        j[:, k] = columns[:, o, column] / sigma[o] * present[:, o]
+                jacobians.append(j)
+                inside = j[np.abs(residual[:, o]) <= knee[o]]
+                bread += inside.T @ inside
+                used = present[:, o] > 0.0
+                if np.count_nonzero(used) >= 8:
+                    row[o] = min(row[o], ljung_box(residual[used, o]))
+            if residual.shape[0] >= 8:
+                meat += coloured_gram(jacobians, np.clip(residual, -knee, knee))
         whiteness.append(row)
-    return total, whiteness
+    return Sandwich(meat=meat, bread=bread, whiteness=whiteness)
 
 
 def counted(problem: Residuals, e: int, s: int, settle: int) -> Float[np.ndarray, "n ny"]:
@@ -100,24 +116,36 @@ def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, 
     return np.fft.irfft(spectrum, size)[: lags + 1] / r.size
 
 
-def coloured_gram(j: Float[np.ndarray, "n p"], r: Float[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
-    """Return sum over t, s of J_t R(t - s) J_s', with R estimated from r under a Parzen window."""
-    n = r.size
+def coloured_gram(j: list[Float[np.ndarray, "n p"]], r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "p p"]:
+    """Return the sum over outputs a, b and times t, s of J_a(t) R_ab(t - s) J_b(s)'.
+
+    Parameters
+    ----------
+    j : list of ny arrays, shape (n, p)
+        Derivatives of each output's residuals.
+    r : array, shape (n, ny)
+        Residuals; zero where missing.
+
+    """
+    n, ny = r.shape
     lags = int(min(max(32, 4 * np.sqrt(n)), n // 4))
-    counted = max(np.count_nonzero(r), 1)
-    r_of = autocorrelation(r, lags) * (n / counted)
     x = np.arange(lags + 1) / lags
     parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
     size = 1 << int(np.ceil(np.log2(n + lags + 1)))
-    kernel = np.zeros(size)
-    kernel[: lags + 1] = r_of * parzen
-    kernel[size - lags :] = (r_of * parzen)[1:][::-1]
-    density = np.maximum(np.fft.rfft(kernel).real, 0.0)
-    weight = np.full(density.size, 2.0)
-    weight[0] = weight[-1] = 1.0
-    jf = np.fft.rfft(j, size, axis=0)
-    scaled = jf * np.sqrt(density * weight / size)[:, None]
-    return (scaled.conj().T @ scaled).real
+    window = np.zeros(size)
+    window[: lags + 1], window[size - lags :] = parzen, parzen[1:][::-1]
+    counted_samples = np.maximum(np.count_nonzero(r, axis=0), 1)
+    rf = np.fft.rfft(r, size, axis=0)
+    half = np.full(rf.shape[0], 2.0)
+    half[0] = half[-1] = 1.0
+    jf = [np.fft.rfft(item, size, axis=0) for item in j]
+    total = np.zeros((j[0].shape[1],) * 2)
+    for a in range(ny):
+        for b in range(ny):
+            correlation = np.fft.irfft(rf[:, a] * np.conj(rf[:, b]), size) * window
+            density = np.fft.rfft(correlation) / np.sqrt(counted_samples[a] * counted_samples[b])
+            total += (jf[a].conj().T @ (jf[b] * (density * half / size)[:, None])).real
+    return 0.5 * (total + total.T)
 
 
 def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:
@@ -136,27 +164,22 @@ def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:
 
 
 def posterior(
-    hessian: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n n"], prior: Float[np.ndarray, " n"],
-    held: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, "n n"]:  # fmt: skip
-    """Return H^-1 (B + P) H^-1 over what is seen and not `held` on a bound; the rest has infinite variance.
+    bread: Float[np.ndarray, "n n"], meat: Float[np.ndarray, "n n"], prior: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n n"]:
+    """Return H^-1 (B + P) H^-1 with H = bread + P, over what is seen; the rest has infinite variance.
 
-    An unknown that takes part in an unseen direction has no finite variance; one held on its bound has none to give
-    (NaN).
+    Bounds are not taken into account: the value of a parameter on its bound has the variance that the curvature there
+    gives it, to be truncated at the bound.
     """
-    n = hessian.shape[0]
-    free = np.flatnonzero(held == 0.0)
-    out = np.full((n, n), np.nan)
-    scale = np.sqrt(np.maximum(np.diag(hessian)[free], 1e-300))
-    values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)] / np.outer(scale, scale))
+    hessian = bread + np.diag(prior)
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
     seen = values > RANK * max(values[-1], 1e-300)
     inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / np.outer(scale, scale)
-    inner = b[np.ix_(free, free)] + np.diag(prior[free])
-    covariance = inverse @ inner @ inverse
+    covariance = inverse @ (meat + np.diag(prior)) @ inverse
     lost = np.sum(vectors[:, ~seen] ** 2, axis=1) > 1e-8
     covariance[lost, :] = covariance[:, lost] = np.inf
-    out[np.ix_(free, free)] = covariance
-    return out
+    return covariance
 
 
 def identifiability(

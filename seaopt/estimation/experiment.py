@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -16,6 +17,7 @@ from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import same_dimension
 
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
@@ -68,6 +70,10 @@ class Experiment:
     gaps: Literal["split", "error"] = "split"
 
     def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise EstimationError(
+                f'experiment name "{self.name[:40]}" is not a name; start with a letter, then letters, digits, _ and -'
+            )
         chosen = self.outputs or tuple(name for name in self.plant.outputs if name in self.log.signals)
         if not chosen:
             raise EstimationError(
@@ -81,7 +87,10 @@ class Experiment:
                     f'experiment {self.name}: output "{name}" is not one of {self.plant.name}; '
                     f"{suggestion(name, self.plant.outputs)}"
                 )
-            self.log.signal(name)
+            if not np.any(np.isfinite(self.log[name])):
+                raise EstimationError(
+                    f"experiment {self.name}: output {name} has no finite sample; leave it out of outputs"
+                )
         self._check_units()
         self._check_settings()
 

@@ -12,18 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import (
-    Covariance,
-    Identifiability,
-    counted,
-    identifiability,
-    meat,
-    posterior,
-)
+from seaopt.estimation.covariance import Covariance, Identifiability, counted, identifiability, posterior, sandwich
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.first_guess import first_guess
 from seaopt.estimation.least_squares import Callback, Solution, minimise
-from seaopt.estimation.residuals import Evaluation, Linear, Loss, Residuals
+from seaopt.estimation.residuals import Evaluation, Huber, Linear, Loss, Residuals
 from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit
 from seaopt.estimation.unknowns import Unknowns, collect
 from seaopt.parameters import Parameter, ParameterSet
@@ -121,6 +114,8 @@ def fit(
 
 def _named(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     """Return the experiments under names of their own."""
+    if isinstance(experiments, Experiment):
+        raise EstimationError("fit takes a list of experiments; put the experiment in brackets, [experiment]")
     if not experiments:
         raise EstimationError("no experiment is given; give at least one Experiment(plant=..., log=...)")
     seen: set[str] = set()
@@ -198,7 +193,7 @@ def _solve(
             callback=callback,
         )
         z, iterations = solution.z, iterations + solution.iterations
-        updated = _estimated_sigma(problem, solution.evaluation)
+        updated = _estimated_sigma(problem, solution.evaluation, z)
         settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(updated, problem.sigma, strict=True))
         finer, error = _refined(problem.with_sigma(updated), z, STEP_ERROR_SIGMA)
         if (settled and finer.substeps == problem.substeps) or attempt == MAX_ROUNDS - 1:
@@ -207,17 +202,32 @@ def _solve(
     raise AssertionError  # the last attempt returns
 
 
-def _estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.ndarray, " ny"], ...]:
+def _estimated_sigma(
+    problem: Residuals, found: Evaluation, z: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " ny"], ...]:
     """Return the rms of each residual where sigma is not given; never less than rounding of the signal."""
     out: list[Float[np.ndarray, " ny"]] = []
     for e, experiment in enumerate(problem.experiments):
         row: list[float] = []
         for o, name in enumerate(experiment.outputs):
             rms = float(np.sqrt(found.squares[e][o] / max(found.counts[e][o], 1.0)))
+            if isinstance(problem.loss, Huber):
+                rms = _median_scale(problem, e, o, z)
             floor = 1e-9 * float(np.nanmax(np.abs(experiment.log[name])))
             row.append(experiment.sigma.get(name, max(rms, floor, 1e-300)))
         out.append(np.array(row))
     return tuple(out)
+
+
+def _median_scale(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float:
+    """Return 1.4826 times the median absolute residual: the standard deviation of Gaussian noise under outliers."""
+    sizes: list[Float[np.ndarray, " m"]] = []
+    for s in range(len(problem.segments[e])):
+        columns = problem.run(e, s, z, columns=True).columns
+        assert columns is not None
+        present = counted(problem, e, s, problem.weights(e).settle)[:, o] > 0.0
+        sizes.append(np.abs(columns[present, o, 0]))
+    return 1.4826 * float(np.median(np.concatenate(sizes)))
 
 
 def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> tuple[Residuals, float]:
@@ -229,7 +239,7 @@ def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> 
             continue
         while True:
             error = _step_error(replace(problem, substeps=tuple(substeps)), e, z)
-            if error <= allowed or not np.isfinite(error) or substeps[e] >= MAX_SUBSTEPS:
+            if error <= allowed or substeps[e] >= MAX_SUBSTEPS:
                 break
             substeps[e] *= 2
         worst = max(worst, error)
@@ -244,7 +254,8 @@ def _step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> float
         coarse, fine = problem.run(e, s, z, outputs=True).outputs, halved.run(e, s, z, outputs=True).outputs
         assert coarse is not None and fine is not None
         with np.errstate(invalid="ignore"):
-            worst = max(worst, float(np.max(np.abs(coarse - fine) / problem.sigma[e])) * 16.0 / 15.0)
+            error = float(np.max(np.abs(coarse - fine) / problem.sigma[e])) * 16.0 / 15.0
+            worst = max(worst, error if np.isfinite(error) else np.inf)
     return worst
 
 
@@ -256,22 +267,18 @@ def _result(
     evaluation = problem.evaluate(z)
     if not np.isfinite(evaluation.cost):
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
-    b, whiteness = meat(problem, z)
-    held = ((z <= unknowns.low) | (z >= unknowns.high)).astype(float)
+    parts = sandwich(problem, z)
     prior = unknowns.prior_std**-2.0
-    full = posterior(evaluation.hessian, b, prior, held)
-    white = posterior(evaluation.hessian, evaluation.hessian - np.diag(prior), prior, held)
+    full = posterior(parts.bread, parts.meat, prior)
+    white = posterior(parts.bread, parts.bread, prior)
     names = unknowns.names[:p]
     covariance = Covariance(names=names, matrix=full[:p, :p])
     seen = identifiability(evaluation.hessian, names, z[:p])
     fitted = params.with_parameters(
-        *(
-            replace(params[name], value=float(z[i]), std=float(np.sqrt(full[i, i])) if full[i, i] >= 0 else None)
-            for i, name in enumerate(names)
-        )
+        *(replace(params[name], value=float(z[i]), std=float(np.sqrt(full[i, i]))) for i, name in enumerate(names))
     )
-    nuisance = {e.name: _nuisance(e, unknowns, i, z) for i, e in enumerate(experiments)}
-    status, message = _status(solution, seen)
+    nuisance = {e.name: _nuisance(e, unknowns, i, z, problem.substeps[i]) for i, e in enumerate(experiments)}
+    status, message = _status(solution, seen, evaluation.hessian, names, step_error)
     result = Fit(
         status=status,
         message=message,
@@ -289,23 +296,36 @@ def _result(
         step_error_sigma=step_error,
         experiments=experiments,
     )
-    outputs = {e.name: _explained(result, problem, i, holdout, whiteness[i], z) for i, e in enumerate(experiments)}
+    outputs = {
+        e.name: _explained(result, problem, i, holdout, parts.whiteness[i], z) for i, e in enumerate(experiments)
+    }
     return replace(result, outputs=outputs, wall_s=time.perf_counter() - started)
 
 
-def _status(solution: Solution, seen: Identifiability) -> tuple[str, str]:
+def _told(direction: dict[str, float], hessian: Float[np.ndarray, "n n"], names: tuple[str, ...]) -> str:
+    """Say in words what cannot be told."""
+    if len(direction) > 1:
+        return f"{' and '.join(direction)} enter only together"
+    (name,) = direction
+    if hessian[names.index(name), names.index(name)] > 0.0:
+        return f"{name} cannot be told from an experiment's own unknowns (gain, offset, delay, initial state)"
+    return f"{name} has no effect on any output"
+
+
+def _status(
+    solution: Solution, seen: Identifiability, hessian: Float[np.ndarray, "n n"], names: tuple[str, ...], error: float
+) -> tuple[str, str]:
     if seen.rank == seen.free:
+        if error > STEP_ERROR_SIGMA:
+            return "stalled", f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {error:.2g} sigma"
         return solution.status, solution.message
-    told = "; ".join(
-        f"{next(iter(direction))} has no effect on any output"
-        if len(direction) == 1
-        else f"{' and '.join(direction)} enter only together"
-        for direction in seen.unidentifiable
-    )
+    told = "; ".join(_told(direction, hessian, names) for direction in seen.unidentifiable)
     return "not_identifiable", f"{told}: fix one, give it a prior, or measure another output"
 
 
-def _nuisance(experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.ndarray, " n"]) -> Nuisance:
+def _nuisance(
+    experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.ndarray, " n"], substeps: int
+) -> Nuisance:
     places = unknowns.locals_of[e]
     return Nuisance(
         delay_s=places.delay.at(z),
@@ -315,6 +335,7 @@ def _nuisance(experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.nd
             {name: slot.at(z) for name, slot in zip(experiment.plant.states, row, strict=True)}
             for row in places.initial
         ),
+        substeps=substeps,
     )
 
 
@@ -357,6 +378,11 @@ def _explained(
     own = result.nuisance[experiment.name]
     gain, offset = np.array(list(own.gain.values())), np.array(list(own.offset.values()))
     model = np.vstack([piece for piece in pieces if piece is not None]) * gain + offset
+    # A segment that lies wholly in the part held out has no initial state: it says nothing of the model.
+    started = np.concatenate([
+        np.full(segment.u.shape[0], segment.keep is None or bool(np.any(segment.keep)))
+        for segment in problem.segments[e]
+    ])  # fmt: skip
     kept = np.vstack([
         segment.keep if segment.keep is not None else np.ones((segment.u.shape[0], gain.size), dtype=np.uint8)
         for segment in problem.segments[e]
@@ -364,7 +390,7 @@ def _explained(
     out: dict[str, OutputFit] = {}
     for o, name in enumerate(experiment.outputs):
         used = kept[:, o] & np.isfinite(measured[:, o])
-        rest = ~kept[:, o] & np.isfinite(measured[:, o])
+        rest = ~kept[:, o] & started & np.isfinite(measured[:, o])
         residual = measured[:, o] - model[:, o]
         out[name] = OutputFit(
             fit_percent=_fit_percent(measured[used, o], residual[used]),

@@ -70,10 +70,11 @@ def minimise(
     damping, growth = 1e-4, 2.0
     for iteration in range(1, max_iterations + 1):
         held = _held(z, here.gradient, low, high)
-        if _decrement(here, held) <= DECREMENT + RELATIVE * here.cost:
+        distance = _decrement(here, held)
+        if distance <= DECREMENT + RELATIVE * here.cost:
             return Solution(
                 z=z, evaluation=here, status="converged", iterations=iteration - 1,
-                message="the minimum is nearer than a thousandth of a standard deviation",
+                message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
             )  # fmt: skip
         trial = np.clip(z + _step(here, held, damping), low, high)
         moved = trial - z

@@ -18,6 +18,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.simulation import Clock, Point, make_model, run_pass
 
 SCHEMA = "seaopt/fit/1"
+STATUSES = ("converged", "max_iterations", "stalled", "not_identifiable")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,21 +46,25 @@ class OutputFit:
 
     fit_percent: float
     holdout_fit_percent: float | None
-    band_fit_percent: float | None
     rms_residual: float
     sigma: float
     unit: str
     whiteness_p: float
+    band_fit_percent: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nuisance:
-    """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment."""
+    """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment.
+
+    `substeps` is how many integration steps a sample took (a linear plant needs one).
+    """
 
     delay_s: float
     gain: dict[str, float]
     offset: dict[str, float]
     initial_state: tuple[dict[str, float], ...]
+    substeps: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +157,7 @@ class Fit:
         for segment, piece, state in pieces:
             point = Point(
                 theta=np.zeros(0), x0=np.array(list(state.values())), offset=offset, gain=gain, clock=clock,
-                substeps=16,
+                substeps=own.substeps,
             )  # fmt: skip
             found = run_pass(model, segment, point, outputs=True).outputs
             assert found is not None
@@ -207,7 +212,7 @@ class Fit:
         """
         try:
             return _from_dict(content, experiments)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise FileError(f"fit.json: field {error} is missing or malformed; run the fit again") from error
 
     def __repr__(self) -> str:
@@ -250,12 +255,16 @@ def _number(value: Any, missing: float) -> float:
 def _covariance(item: Mapping[str, Any]) -> Covariance:
     names = tuple(item["names"])
     rows = [[_number(value, math.inf) for value in row] for row in item["matrix"]]
-    return Covariance(names=names, matrix=np.array(rows, dtype=float).reshape(len(names), len(names)))
+    matrix = np.array(rows, dtype=float).reshape(len(names), len(names))
+    seen = np.isfinite(np.diag(matrix))
+    if np.any(np.linalg.eigvalsh(matrix[np.ix_(seen, seen)]) < -1e-9 * np.max(np.diag(matrix)[seen], initial=0.0)):
+        raise ValueError("covariance, which has a negative variance,")
+    return Covariance(names=names, matrix=matrix)
 
 
 def _std(item: Mapping[str, Any]) -> float | None:
-    """Return a parameter's std: null stands for an infinite one, or for none of a value that is held."""
-    return _number(item["std"], math.inf) if item["free"] and not item["at_bound"] else None
+    """Return a parameter's std: null stands for an infinite one, and for none of a parameter that is not free."""
+    return _number(item["std"], math.inf) if item["free"] else None
 
 
 def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) -> Fit:
@@ -268,12 +277,17 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
         for name, item in content["parameters"].items()
     )  # fmt: skip
     found = content["identifiability"]
+    if content["status"] not in STATUSES:
+        raise ValueError(f'status "{content["status"]}"')
+    covariance = _covariance(content["covariance"])
+    if set(covariance.names) != {name for name, item in parameters.items() if item.free}:
+        raise ValueError("covariance.names, other than the free parameters,")
     return Fit(
         status=content["status"],
         message=content["message"],
         parameters=parameters,
-        covariance=_covariance(content["covariance"]),
-        white_covariance=_covariance(content["white_covariance"]),
+        covariance=covariance,
+        white_covariance=_covariance(content.get("white_covariance", content["covariance"])),
         derived={
             name: Derived(value=float(item["value"]), unit=item["unit"], std=_number(item["std"], math.inf))
             for name, item in content["derived"].items()
@@ -285,9 +299,9 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
         nuisance={
             name: Nuisance(
                 delay_s=item["delay_s"], gain=item["gain"], offset=item["offset"],
-                initial_state=tuple(item["initial_state"]),
+                initial_state=tuple(item["initial_state"]), substeps=int(item.get("substeps", 1)),
             )
-            for name, item in content["experiments"].items()
+            for name, item in content.get("experiments", {}).items()
         },
         identifiability=Identifiability(
             rank=found["rank"], free=found["free"], condition=_number(found["condition"], math.inf),
@@ -297,6 +311,6 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
         iterations=content["iterations"],
         samples=content["samples"],
         wall_s=content["wall_s"],
-        step_error_sigma=content["step_error_sigma"],
+        step_error_sigma=float(content.get("step_error_sigma", 0.0)),
         experiments=experiments,
     )  # fmt: skip

@@ -64,6 +64,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     Notes
     -----
     States start at zero. An output with the name of a state is called NAME_out.
+
     """
     if not hasattr(ca.DaeBuilder, "export_fmu"):
         raise PlantError(f"CasADi {ca.__version__} has no FMU exporter; install CasADi 3.8 or newer")

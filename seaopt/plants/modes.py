@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -26,6 +27,7 @@ class Resonance:
         Negative where the mode grows.
     states : tuple of str
         The states that take part, the largest first, each scaled by its participation factor.
+
     """
 
     frequency_hz: float
@@ -47,6 +49,7 @@ class Modes:
         Finite zeros of each transfer function, rad/s.
     dc_gain : mapping of (output, input) to float
         In the output's unit over the input's; infinite or not a number where the plant integrates.
+
     """
 
     poles: Complex[np.ndarray, " nx"]
@@ -91,9 +94,11 @@ def modes(
     >>> found = modes(high_impedance(), thor())
     >>> round(found.resonances[0].frequency_hz, 2), round(found.dc_gain["F1", "I"], 1)
     (7.5, 240.3)
+
     """
     a, b, c, d = state_space(plant, params, x, u)
-    poles, right = np.linalg.eig(a)
+    found: Any = np.linalg.eig(a)
+    poles, right = found.eigenvalues.astype(complex), found.eigenvectors
     left = np.linalg.pinv(right)
     order = np.argsort(np.abs(poles), kind="stable")
     names = list(plant.states)
@@ -112,7 +117,7 @@ def modes(
     pairs = [(i, j, output, source) for i, output in enumerate(plant.outputs) for j, source in enumerate(plant.inputs)]
     singular = np.linalg.cond(a) > 1e14
     return Modes(
-        poles=poles[order].astype(complex),
+        poles=poles[order],
         resonances=tuple(resonances),
         zeros={(output, source): _zeros(a, b[:, j], c[i], float(d[i, j])) for i, j, output, source in pairs},
         dc_gain={
@@ -139,7 +144,8 @@ def _zeros(
     pencil = np.block([[a, b[:, None] / drive], [c[None] / scale, np.array([[d / scale / drive]])]])
     mass = np.zeros((n + 1, n + 1))
     mass[:n, :n] = np.eye(n)
-    alpha, beta = eig(pencil, mass, right=False, homogeneous_eigvals=True)
+    pairs: Any = eig(pencil, mass, right=False, homogeneous_eigvals=True)
+    alpha, beta = pairs
     size = np.hypot(np.abs(alpha), np.abs(beta))
     finite = np.abs(beta) > 1e-10 * np.where(size > 0.0, size, 1.0) / max(1.0, float(np.max(np.abs(a))))
     found = (alpha[finite] / beta[finite]).astype(complex)

@@ -17,9 +17,9 @@ Inside the actuator (of `two_link` and its special cases):
 ``screw_mode``
     The ball screw is axially elastic: it stretches by s, with stiffness k_b and damping c_b, and moves an effective
     mass m_n at the nut: with both links fixed and a heavy rotor, a mode at
-    :math:`\tfrac{1}{2\pi}\sqrt{(k + k_b)/(m_l + m_n)}`. The defaults put it at 80 Hz with a damping ratio of 0.03, where
-    the paper saw one (between 70 and 80 Hz, with the actuator's length). They leave the static stiffness within a tenth,
-    which takes an m_n of 28 kg: an effective mass, much more than the screw's own.
+    :math:`\tfrac{1}{2\pi}\sqrt{(k + k_b)/(m_l + m_n)}`. The defaults put it at 80 Hz with a damping ratio of 0.03,
+    where the paper saw one (between 70 and 80 Hz, with the actuator's length). They leave the static stiffness within
+    a tenth, which takes an m_n of 28 kg: an effective mass, much more than the screw's own.
 
 Around any plant:
 

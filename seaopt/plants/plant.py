@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 
-from seaopt.errors import ParameterError, PlantError, suggestion
+from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.units import DIMENSIONLESS, si_unit
+from seaopt.units import DIMENSIONLESS, factor, si_unit
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
@@ -96,8 +96,8 @@ class Plant:
         put(self, "t", time)
         for key, named in symbols.items():
             put(self, key, ca.vertcat(*named.values()) if named else ca.SX(0, 1))
-        put(self, "dynamics", _stack(self, "f", self.f(time, *spaces), self.states))
-        put(self, "output", _stack(self, "h", self.h(time, *spaces), self.outputs))
+        put(self, "dynamics", _stack(self, "f", _called(self, "f", self.f, time, *spaces), self.states))
+        put(self, "output", _stack(self, "h", _called(self, "h", self.h, time, *spaces), self.outputs))
         _check_structure(self)
 
     @property
@@ -111,32 +111,31 @@ class Plant:
         return item.unit if isinstance(item, Parameter) else item
 
     def parameter_values(self, params: ParameterSet) -> list[float]:
-        """Return the parameter vector p, from `params` and, where it has none, the plant's defaults.
+        """Return the parameter vector p in the plant's units, as `complete` does."""
+        return [item.value for item in self.complete(params).values()]
+
+    def complete(self, params: ParameterSet) -> ParameterSet:
+        """Return the plant's own parameters in its units and order: from `params`, else the defaults.
 
         Raises
         ------
         ParameterError
             A parameter has neither a value in `params` nor a default.
+        UnitError
+            A value's unit has another dimension than the plant's.
 
         """
         defaults = self.defaults
-        values: list[float] = []
+        items: list[Parameter] = []
         for name in self.parameters:
+            unit = self.parameter_unit(name)
             if name in params:
-                values.append(params[name].value)
+                items.append(_in_unit(params[name], unit, self.name))
             elif name in defaults:
-                values.append(defaults[name].value)
+                items.append(defaults[name])
             else:
-                raise ParameterError(
-                    f'parameter "{name}" of plant {self.name} has no value; give one in {self.parameter_unit(name)}'
-                )
-        return values
-
-    def complete(self, params: ParameterSet) -> ParameterSet:
-        """Return the plant's own parameters: from `params`, else the defaults, in the plant's order."""
-        defaults = self.defaults
-        self.parameter_values(params)
-        return ParameterSet(params[name] if name in params else defaults[name] for name in self.parameters)
+                raise ParameterError(f'parameter "{name}" of plant {self.name} has no value; give one in {unit}')
+        return ParameterSet(items)
 
     def derived_values(self) -> dict[str, tuple[Any, str]]:
         """Return the derived figures as {name: (expression of p, unit)}; empty where none are declared."""
@@ -192,6 +191,31 @@ class Plant:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _in_unit(item: Parameter, unit: str, plant: str) -> Parameter:
+    """Return a parameter in another unit of the same dimension."""
+    if item.unit == unit:
+        return item
+    try:
+        scale = factor(item.unit, unit)
+    except UnitError as error:
+        raise UnitError(f"parameter {item.name} of plant {plant}: {error}") from error
+    prior, std = (None if value is None else value * scale for value in (item.prior_std, item.std))
+    low, high = item.min * scale, item.max * scale
+    return replace(item, value=item.value * scale, unit=unit, min=low, max=high, prior_std=prior, std=std)
+
+
+def _called(plant: Plant, what: str, equations: Equations, *arguments: Any) -> Mapping[str, Any]:
+    """Return what f or h gives; a name that it uses and that is not there is a PlantError."""
+    try:
+        return equations(*arguments)
+    except AttributeError as error:
+        if not isinstance(error.obj, SimpleNamespace):
+            raise
+        raise PlantError(
+            f'plant {plant.name}: {what} uses "{error.name}"; {suggestion(str(error.name), vars(error.obj))}'
+        ) from error
 
 
 def _check_names(plant: Plant) -> None:

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from seaopt.errors import SimulationError
 from seaopt.simulation.discretisation import Clock
+
+MAX_SECTIONS = 8  # as in pass.c
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,6 +35,10 @@ class Weights:
     sections: Float[np.ndarray, "m 5"]
     settle: int
     knee: Float[np.ndarray, " ny"]
+
+    def __post_init__(self) -> None:
+        if len(self.sections) > MAX_SECTIONS:
+            raise SimulationError(f"{len(self.sections)} filter sections; pass.c has room for {MAX_SECTIONS}")
 
     @classmethod
     def plain(cls, ny: int) -> Weights:

@@ -245,7 +245,7 @@ def test_the_two_mass_drive_is_rotary_with_n_1():
 
 
 def test_a_clamped_flexible_link_is_rotary_with_a_heavy_motor():
-    """The flexible link's published 2.94 Hz with its base clamped: k_s = J_l (2 pi 2.94)^2, the base held by inertia."""
+    """The flexible link's published 2.94 Hz with its base clamped: k_s = J_l (2 pi 2.94)^2."""
     plant = so.plants.rotary()
     inertia = 0.0038
     params = plant.defaults.update(J_m=1e6, N=70.0, J_l=inertia, k_s=inertia * (2 * np.pi * 2.94) ** 2, b_r=0.0)
