@@ -64,6 +64,10 @@ def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) 
     session = Session(problem, output)
     stages = session.planned()
     for stage in stages:
+        if stage == "tune" and not session.designable():
+            stages = ["fit", "report"]
+            session.run("report")
+            break
         session.run(stage)
     _finish(session, json, stages)
 

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from seaopt.control import Controller, tune
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, fit
 from seaopt.files import read_json, to_json, write_json
 from seaopt.logs import Log, write_log
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.problem import Problem, read_problem
 from seaopt.reporting import verdict, write_report
 from seaopt.robustness import Certificate, certify
+from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
+FILES = {"fit": "fit.json", "tune": "controller.json", "certify": "robustness.json"}
 LABELS = {
     "simulate": "simulating",
     "fit": "fitting the logs",
@@ -39,6 +43,10 @@ class Session:
         if folder.exists() and not folder.is_dir():
             raise ProblemError(f"{folder}: is a file; give a folder for the results with -o")
         self.problem: Problem = read_problem(problem)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ProblemError(f"{folder}: cannot be made ({error.strerror}); give another folder with -o") from error
         self.folder = folder
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
@@ -54,6 +62,16 @@ class Session:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them")
         return [*stages, "report"]
 
+    def designable(self) -> bool:
+        """Tell whether the fit of this run can be designed with: it converged, or there was none."""
+        found = self.results.get("fit")
+        return found is None or (found.status in ("converged", "not_identifiable") and self._covered(found))
+
+    def _covered(self, found: Fit) -> bool:
+        """Tell whether what the fit leaves open has a range in the problem."""
+        names = found.covariance.names
+        return all(np.isfinite(found.covariance.std(name)) or name in self.problem.ranges for name in names)
+
     def run(self, stage: str) -> None:
         """Run one stage and write its result."""
         stages: dict[str, Callable[[Callable[[str], None]], None]] = {
@@ -65,13 +83,23 @@ class Session:
 
     @contextmanager
     def _progress(self, label: str) -> Generator[Callable[[str], None]]:
+        """Show a stage's progress on a terminal; elsewhere write one line when it is done. An error writes nothing."""
+        if not self._console.is_terminal:
+            notes = [""]
+            yield lambda note: notes.__setitem__(0, note)
+            self._console.print(f"{label}: {notes[0] or 'done'}", highlight=False, markup=False, soft_wrap=True)
+            return
         columns = (
-            SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<24}"),
-            BarColumn(bar_width=16), TimeElapsedColumn(), TextColumn("{task.fields[note]}", style="dim"),
+            SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<22}"),
+            BarColumn(bar_width=12), TimeElapsedColumn(), TextColumn("{task.fields[note]}", style="dim"),
         )  # fmt: skip
-        with Progress(*columns, console=self._console, transient=False) as progress:
+        with Progress(*columns, console=self._console) as progress:
             task = progress.add_task(label, total=None, note="")
-            yield lambda note: progress.update(task, note=note)
+            try:
+                yield lambda note: progress.update(task, note=note)
+            except BaseException:
+                progress.remove_task(task)
+                raise
             progress.update(task, total=1, completed=1)
 
     def experiments(self) -> tuple[Experiment, ...]:
@@ -86,7 +114,8 @@ class Session:
             path = self.folder / "fit.json"
             if not path.exists():
                 raise ProblemError(f"{path}: no such file; run seaopt fit {self.problem.source} -o {self.folder} first")
-            self.results["fit"] = Fit.from_dict(read_json(path, "seaopt/fit/1"), ())
+            content = self._read(path, "seaopt/fit/1", "fit")
+            self.results["fit"] = Fit.from_dict(content, ())
         return self.results.get("fit", self.problem.parameters)
 
     def values(self) -> ParameterSet:
@@ -104,12 +133,39 @@ class Session:
                 raise ProblemError(
                     f"{path}: no such file; run seaopt tune {self.problem.source} -o {self.folder} first"
                 )
-            content = read_json(path, "seaopt/controller/1")
+            content = self._read(path, "seaopt/controller/1", "tune")
             self.results["tune"] = Controller.from_dict(content, self.problem.design_plant, self.values())
         return self.results["tune"]
 
-    def _write(self, name: str, content: dict[str, Any]) -> None:
-        self.written.append(write_json(self.folder / name, content))
+    def _write(self, stage: str, content: dict[str, Any]) -> None:
+        """Write a result with the digest of what it was made from."""
+        self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": self._made_from(stage)}))
+
+    def _read(self, path: Path, schema: str, stage: str) -> dict[str, Any]:
+        """Read an earlier stage's result; one made from something else than what is there now is refused.
+
+        A file that does not say what it was made from (written by hand) is taken as it is.
+        """
+        content = read_json(path, schema)
+        if content.get("made_from", self._made_from(stage)) != self._made_from(stage):
+            raise ProblemError(
+                f"{path}: was made from another problem file or earlier result; "
+                f"run seaopt {stage} {self.problem.source} -o {self.folder} again"
+            )
+        return content
+
+    def _made_from(self, stage: str) -> str:
+        """Return a digest of the parts of the problem that a stage reads, and of the result before it."""
+        table = self.problem.table.model_dump(mode="json")
+        parts = ["parameters", "plant", "experiment", "fit"]
+        earlier = {"fit": None, "tune": "fit.json", "certify": "controller.json"}[stage]
+        if stage != "fit":
+            parts += ["controller", "robustness"]
+        if earlier == "fit.json" and not self.problem.table.experiment:
+            earlier = None
+        before = (self.folder / earlier).read_bytes() if earlier and (self.folder / earlier).exists() else b""
+        text = json.dumps({part: table[part] for part in parts}, sort_keys=True)
+        return hashlib.sha256(text.encode() + before).hexdigest()
 
     def _simulate(self, tell: Callable[[str], None]) -> None:
         if not self.problem.table.experiment:
@@ -117,11 +173,27 @@ class Session:
         runs: dict[str, Log] = {}
         for experiment in self.experiments():
             tell(experiment.name)
-            runs[experiment.name] = simulate(
-                experiment.plant, self.problem.parameters, experiment.log, hold=experiment.hold
-            )
+            runs[experiment.name] = self._simulated(experiment)
             self.written.append(write_log(runs[experiment.name], self.folder / f"simulation_{experiment.name}.csv"))
         self.results["simulate"] = runs
+
+    def _simulated(self, experiment: Experiment) -> Log:
+        """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated)."""
+        delay, start = experiment.delay_s, experiment.initial_state
+        options: dict[str, Any] = {
+            "delay_s": delay.value if isinstance(delay, Parameter) else delay,
+            "initial_state": None if isinstance(start, str) else start,
+            "hold": experiment.hold,
+        }
+        log, plant = experiment.log, experiment.plant
+        clock = log.time - log.time[0]
+        stretches = [log.between(float(clock[p.start]), float(clock[p.stop - 1])) for p in log.segments]
+        pieces = [simulate(plant, self.problem.parameters, stretch, **options) for stretch in stretches]
+        signals = {
+            name: Signal(name=name, values=np.concatenate([piece[name] for piece in pieces]), unit=signal.unit)
+            for name, signal in pieces[0].signals.items()
+        }
+        return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
 
     def _fit(self, tell: Callable[[str], None]) -> None:
         if not self.problem.table.experiment:
@@ -136,7 +208,7 @@ class Session:
         )
         tell(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}")
         self.results["fit"] = result
-        self._write("fit.json", result.to_dict())
+        self._write("fit", result.to_dict())
 
     def _tune(self, tell: Callable[[str], None]) -> None:
         design, values = self.problem.design_plant, self.values()
@@ -145,7 +217,7 @@ class Session:
         tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
         result = tune(design, values, spec, self.problem.robust_to(values))
         self.results["tune"] = result
-        self._write("controller.json", result.to_dict())
+        self._write("tune", result.to_dict())
 
     def _certify(self, tell: Callable[[str], None]) -> None:
         controller, source = self.controller(), self.parameters()
@@ -157,7 +229,7 @@ class Session:
             others=self.problem.parameters,
         )  # fmt: skip
         self.results["certify"] = result
-        self._write("robustness.json", result.to_dict())
+        self._write("certify", result.to_dict())
 
     def _report(self, tell: Callable[[str], None]) -> None:
         results: list[Any] = []
@@ -165,14 +237,17 @@ class Session:
             found = self.parameters()
             if isinstance(found, Fit) and not found.experiments:
                 path = self.folder / "fit.json"
-                self.results["fit"] = found = Fit.from_dict(read_json(path, "seaopt/fit/1"), self.experiments())
+                content = self._read(path, "seaopt/fit/1", "fit")
+                self.results["fit"] = found = Fit.from_dict(content, self.experiments())
             results.append(found)
         if self.problem.spec is not None and ("tune" in self.results or (self.folder / "controller.json").exists()):
             results.append(self.controller())
             path = self.folder / "robustness.json"
             if "certify" not in self.results and path.exists():
                 self.results["certify"] = Certificate.from_dict(
-                    read_json(path, "seaopt/robustness/1"), self.controller(), self.problem.certified_plants(),
+                    self._read(path, "seaopt/robustness/1", "certify"),
+                    self.controller(),
+                    self.problem.certified_plants(),
                     self.values(),
                 )  # fmt: skip
             results += [self.results["certify"]] if "certify" in self.results else []
@@ -183,7 +258,8 @@ class Session:
 
     def met(self, stages: list[str]) -> bool:
         """Tell whether everything that these stages require is met."""
-        return all(good for stage in stages for good, _ in self._verdict(stage))
+        shown = ["fit", "tune", "certify"] if "report" in stages else stages
+        return all(good for stage in shown for good, _ in self._verdict(stage))
 
     def _verdict(self, stage: str) -> list[tuple[bool, str]]:
         found = self.results.get(stage)
@@ -204,12 +280,10 @@ class Session:
         for stage in stages:
             if stage in ("fit", "tune", "certify"):
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
-        table = Table(show_header=False, box=None, padding=(0, 1))
-        for stage in stages:
+        for stage in ["fit", "tune", "certify"] if "report" in stages else stages:
             for good, text in self._verdict(stage):
-                table.add_row("[green]met[/]" if good else "[red]not met[/]", text)
-        if table.row_count:
-            console.print(table)
+                console.print("[green]met    [/]" if good else "[red]not met[/]", end="  ")
+                console.print(text, highlight=False, markup=False)
         if self.written:
             console.print("wrote " + ", ".join(str(path) for path in self.written), highlight=False, markup=False)
 
@@ -217,4 +291,6 @@ class Session:
         found = self.results[stage]
         if stage == "simulate":
             return {"schema": "seaopt/simulation/1", "files": [str(path) for path in self.written]}
-        return {"schema": "seaopt/report/1", "file": str(found)} if stage == "report" else found.to_dict()
+        if stage == "report":
+            return {"schema": "seaopt/report/1", "file": str(found)}
+        return json.loads((self.folder / FILES[stage]).read_text(encoding="utf-8"))

@@ -83,6 +83,18 @@ class Controller:
         """Return the loop of this controller around a plant."""
         return Loop(plant=self.plant(plant, params), reference=self.reference, measurement=self.measurement)
 
+    def force_limit(self, frequency_hz: float) -> float | None:
+        """Return the largest amplitude of F_ref (N) at a frequency that `current_limit_A` allows on the design plant.
+
+        The motor force per reference is |T_r/P|, the plant's property whatever the controller; None without a limit.
+        """
+        if self.spec.current_limit_A is None or self.design is None:
+            return None
+        loop = self.close(*self.design)
+        f = np.array([frequency_hz])
+        force = np.abs(loop.reference.response(f, self.sample_time_s) * loop.sensitivity(f))[0]
+        return float(self.spec.current_limit_A / self.current_per_force_A_per_N / force)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/1)."""
         achieved = {field.name: getattr(self.achieved, field.name) for field in fields(LoopFigures)}
@@ -124,9 +136,8 @@ class Controller:
             }
             spec = ControllerSpec(**given)
             gain, ts = float(content["current_per_force_A_per_N"]), float(content["sample_time_s"])
-            delay = int(content["delay_samples"])
-            if ts <= 0.0 or delay < 0 or any(tf.den.size == 0 or tf.den[0] != 1.0 for tf in law.values()):
-                raise ValueError("sample_time_s, delay_samples or den[0]")
+            delay = content["delay_samples"]
+            _check(content, spec, law)
             design = sample(plant, params, spec.measured, gain, ts, delay)
             return cls(
                 structure=content["structure"], gains=content["gains"], sample_time_s=ts, delay_samples=delay,
@@ -134,7 +145,7 @@ class Controller:
                 achieved=Loop(plant=design, **law).figures(), feasible=bool(content["feasible"]),
                 active_constraints=tuple(content["active_constraints"]), robust_to=robust_to, design=(plant, params),
             )  # fmt: skip
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise FileError(f"controller.json: {error} is missing or malformed; tune again") from error
 
     def __repr__(self) -> str:
@@ -147,20 +158,47 @@ class Controller:
         return "\n".join(
             [
                 f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
-                f"{self.delay_samples} samples of delay: {verdict}",
+                f"delay of {self.delay_samples} sample{'' if self.delay_samples == 1 else 's'}: {verdict}",
                 f"  {gains}",
                 f"  bandwidth {_shown(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
                 f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
                 f"  gain margin {_shown(a.gain_margin_db)} dB, phase margin {_shown(a.phase_margin_deg)} deg, "
                 f"delay margin {_shown(None if a.delay_margin_s is None else 1e3 * a.delay_margin_s)} ms",
+                *self._force_lines(),
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
                 else "",
             ]
         ).rstrip()
 
+    def _force_lines(self) -> list[str]:
+        slow, fast = self.force_limit(0.01), self.force_limit(self.spec.bandwidth_hz)
+        if slow is None or fast is None:
+            return []
+        limit, band = self.spec.current_limit_A, self.spec.bandwidth_hz
+        return [f"  {limit:g} A allow a reference of {slow:.4g} N at rest and {fast:.4g} N at {band:g} Hz"]
+
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _check(content: Mapping[str, Any], spec: ControllerSpec, law: Mapping[str, TransferFunction]) -> None:
+    """Refuse a controller.json that contradicts itself or is not of the schema's types."""
+    for name, tf in law.items():
+        if tf.num.ndim != 1 or tf.den.ndim != 1 or not tf.num.size or not tf.den.size or tf.den[0] != 1.0:
+            raise ValueError(f"{name}, num or den, with den[0] = 1,")
+        if not (np.all(np.isfinite(tf.num)) and np.all(np.isfinite(tf.den))):
+            raise ValueError(f"{name}, whose coefficients are not all numbers,")
+    if content["structure"] != spec.structure or not isinstance(content["feasible"], bool):
+        raise ValueError("structure or feasible")
+    if content["delay_samples"] != spec.delay_samples:
+        raise ValueError("delay_samples, which is not spec.delay_samples,")
+    if not np.isclose(content["sample_time_s"] * spec.sample_rate_hz, 1.0, rtol=1e-9):
+        raise ValueError("sample_time_s, which is not 1/spec.sample_rate_hz,")
+    if not all(isinstance(value, (int, float)) for value in content["gains"].values()):
+        raise ValueError("gains")
+    if not float(content["current_per_force_A_per_N"]) > 0.0:
+        raise ValueError("current_per_force_A_per_N")
 
 
 def _shown(value: float | None) -> str:

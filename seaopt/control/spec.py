@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -9,6 +10,8 @@ from seaopt.control.law import Derivative, Structure
 from seaopt.errors import ControlError
 
 LIMITS = ("max_sensitivity", "max_complementary", "max_reference_peak", "max_noise_gain")
+OPTIONAL = ("min_sensitivity_bandwidth_hz", "current_limit_A")
+MAX_DELAY_SAMPLES = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +45,7 @@ class ControllerSpec:
     objective : {"disturbance", "noise"}
         Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
     current_limit_A : float, optional
-        Of the motor.
+        Of the motor; it does not shape the gains. The controller says which force it leaves (`force_limit`).
     reserve : float
         Ms, Mt and the other limits are met with this fraction to spare, so that parameters as uncertain as a fit
         leaves them do not break them.
@@ -71,6 +74,7 @@ class ControllerSpec:
     reserve: float = 0.005
 
     def __post_init__(self) -> None:
+        self._check_types()
         low, high = self.bandwidth_range_hz
         if not 0.0 < low < high:
             raise ControlError(f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high")
@@ -85,14 +89,26 @@ class ControllerSpec:
             raise ControlError(f'derivative = "{self.derivative}" is not known; use "error" or "measurement"')
         if self.objective not in ("disturbance", "noise"):
             raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
-        if self.delay_samples < 0 or self.delay_samples != int(self.delay_samples):
-            raise ControlError(f"delay_samples = {self.delay_samples} is not a whole number of samples; give 0, 1, ...")
-        if not self.sample_rate_hz > 4.0 * self.bandwidth_hz:
+        if not 0 <= self.delay_samples <= MAX_DELAY_SAMPLES:
+            raise ControlError(f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}")
+        if not 4.0 * self.bandwidth_hz < self.sample_rate_hz < math.inf:
             raise ControlError(
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 "sample more than four times as fast"
             )
         self._check_limits()
+
+    def _check_types(self) -> None:
+        if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int):
+            raise ControlError(
+                f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give 0, 1, ..."
+            )
+        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *LIMITS, *OPTIONAL):
+            value = getattr(self, name)
+            if value is None and name in (*LIMITS, *OPTIONAL):
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+                raise ControlError(f"{name} = {value!r} is not a number; give one")
 
     def _check_limits(self) -> None:
         for name in LIMITS:

@@ -21,7 +21,11 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Experiment:
     """One log of one plant.
 
@@ -105,6 +109,9 @@ class Experiment:
                     )
 
     def _check_settings(self) -> None:
+        for what, given in (("sigma", self.sigma), ("gain", self.gain)):
+            if not isinstance(given, Mapping):
+                raise EstimationError(f"experiment {self.name}: {what} = {given!r}; give a mapping of output to value")
         known = {
             "sigma": self.sigma,
             "gain": self.gain,
@@ -136,10 +143,15 @@ class Experiment:
                         f"{self.plant.name}; {suggestion(name, self.plant.states)}"
                     )
         if self.gaps == "error" and len(self.log.segments) > 1:
+            count = _counted(len(self.log.segments) - 1, "gap")
             raise EstimationError(
-                f'experiment {self.name}: the log has {len(self.log.segments) - 1} gaps and gaps = "error"; '
+                f'experiment {self.name}: the log has {count} and gaps = "error"; '
                 'use gaps = "split", or slice_s to choose a stretch'
             )
+
+    def __repr__(self) -> str:
+        count = _counted(len(self.log.segments), "segment")
+        return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
         """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""

@@ -23,6 +23,7 @@ from seaopt.parameters import Parameter, ParameterSet
 
 STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
 MAX_SUBSTEPS = 256
+VAGUE = 3.0  # a std of so many times the value is no estimate
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 
 
@@ -189,6 +190,7 @@ def _solve(
             z,
             unknowns.low,
             unknowns.high,
+            reach=_reach(unknowns, start),
             max_iterations=method.max_iterations,
             callback=callback,
         )
@@ -200,6 +202,14 @@ def _solve(
             return replace(solution, iterations=iterations), problem, error
         problem = finer
     raise AssertionError  # the last attempt returns
+
+
+def _reach(unknowns: Unknowns, start: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return the size of the plants' parameters, and infinity for what starts at zero and the experiments' own."""
+    reach = np.full(start.size, np.inf)
+    shared = np.abs(start[: unknowns.shared])
+    reach[: unknowns.shared] = np.where(shared > 0.0, shared, np.inf)
+    return reach
 
 
 def _estimated_sigma(
@@ -279,6 +289,8 @@ def _result(
     )
     nuisance = {e.name: _nuisance(e, unknowns, i, z, problem.substeps[i]) for i, e in enumerate(experiments)}
     status, message = _status(solution, seen, evaluation.hessian, names, step_error)
+    if status == "converged":
+        status, message = _open(fitted, params, message)
     result = Fit(
         status=status,
         message=message,
@@ -310,6 +322,18 @@ def _told(direction: dict[str, float], hessian: Float[np.ndarray, "n n"], names:
     if hessian[names.index(name), names.index(name)] > 0.0:
         return f"{name} cannot be told from an experiment's own unknowns (gain, offset, delay, initial state)"
     return f"{name} has no effect on any output"
+
+
+def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[str, str]:
+    """Call a fit not identifiable whose parameters are less certain than their size: the log hardly shows them."""
+    vague = [
+        f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
+        for name, item in fitted.items()
+        if item.free and item.std is not None and item.std > VAGUE * max(abs(item.value), abs(given[name].value))
+    ]
+    if not vague:
+        return "converged", message
+    return "not_identifiable", f"the logs hardly show {', '.join(vague)}: excite more, fix it, or give it a prior"
 
 
 def _status(

@@ -45,6 +45,7 @@ def minimise(
     low: Float[np.ndarray, " n"],
     high: Float[np.ndarray, " n"],
     *,
+    reach: Float[np.ndarray, " n"] | None = None,
     max_iterations: int = 50,
     callback: Callback | None = None,
 ) -> Solution:
@@ -56,6 +57,9 @@ def minimise(
         Cost, gradient and Gauss-Newton Hessian at a point.
     start, low, high : array, shape (n,)
         First point and bounds.
+    reach : array, shape (n,), optional
+        No step is longer than twice the larger of this and the present value, unknown by unknown: a far start must not
+        be thrown out of the world. Infinite entries are free.
     max_iterations : int
         Evaluations after the first.
     callback : callable, optional
@@ -76,7 +80,11 @@ def minimise(
                 z=z, evaluation=here, status="converged", iterations=iteration - 1,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
             )  # fmt: skip
-        trial = np.clip(z + _step(here, held, damping), low, high)
+        step = _step(here, held, damping)
+        if reach is not None:
+            size = np.abs(step) / (2.0 * np.maximum(reach, np.abs(z)))
+            step = step / max(1.0, float(np.max(size)))
+        trial = np.clip(z + step, low, high)
         moved = trial - z
         if not np.any(np.abs(moved) > 1e-15 * np.abs(z)):
             return Solution(

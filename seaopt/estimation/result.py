@@ -221,6 +221,9 @@ class Fit:
         shown = ParameterSet(item for item in self.parameters.values() if item.free)
         lines += [f"  {line}" for line in repr(shown).splitlines()]
         lines += [f"  {name} = {item.value:.5g} ± {item.std:.2g} {item.unit}" for name, item in self.derived.items()]
+        for name, own in self.nuisance.items():
+            if len(own.initial_state) > 1:
+                lines.append(f"  {name}: gaps split the log into {len(own.initial_state)} segments")
         for name, row in self.outputs.items():
             for output, item in row.items():
                 held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"

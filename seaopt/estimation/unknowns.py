@@ -116,7 +116,7 @@ def collect(experiments: tuple[Experiment, ...], params: ParameterSet) -> Unknow
                 f"parameter {name} is free, but no plant of the experiments has it; {suggestion(name, used)}"
             )
     if not params.free_names:
-        raise EstimationError("no parameter is free; free one, for example params.free('J')")
+        raise EstimationError("no parameter is free; free one: params.free('J'), or free = true in a problem file")
     builder = _Builder()
     for name in params.free_names:
         builder.add(params[name])

@@ -133,8 +133,14 @@ class Log:
         return float(self.time[-1] - self.time[0])
 
     @property
+    def gaps(self) -> list[tuple[float, float]]:
+        """Times (s) of the samples before and after each gap."""
+        rows = np.flatnonzero(np.diff(self.time) > GAP * self.period)
+        return [(float(self.time[row]), float(self.time[row + 1])) for row in rows]
+
+    @property
     def segments(self) -> list[slice]:
-        """The stretches without a gap, as slices of at least two samples.
+        """The stretches without a gap, as slices of at least two samples; a sample alone between gaps is in none.
 
         Raises
         ------
@@ -180,6 +186,10 @@ class Log:
             span = f"{good.min():.4g} to {good.max():.4g}" if good.size else "no finite sample"
             lost = signal.values.size - good.size
             lines.append(f"  {name} [{signal.unit or 'SI'}]  {span}" + (f", {lost} missing" if lost else ""))
+        count = len(self.gaps)
+        if count:
+            shown = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])
+            lines.append(f"  {count} gap{'s' if count > 1 else ''}: {shown}{', ...' if count > 3 else ''}")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:

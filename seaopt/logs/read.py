@@ -95,7 +95,7 @@ def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str
         raise factor_error
     table = _parse(source, text, headers, delimiter, {column.column for column in wanted.values()})
     if table.height < 2:
-        raise LogError(f"{source}: {table.height} rows below the header; a log needs at least 2")
+        raise LogError(f"{source}: too few rows ({table.height}) below the header; a log needs at least 2")
     arrays = {name: _numbers(source, table, column.column) for name, column in wanted.items()}
     clock = arrays.pop("time") * factor(units.pop("time"), "s")
     signals = {
@@ -204,5 +204,15 @@ def _numbers(source: Path, table: pl.DataFrame, column: str) -> Float[np.ndarray
     bad = (values.is_null() & ~blank).arg_true()
     if len(bad):
         row = int(bad[0])
-        raise LogError(f'{source}: line {row + 2}: "{text[row]}" in column "{column}" is not a number; correct it')
+        comma = re.fullmatch(r"[-+]?\d+,\d+", str(text[row])) is not None
+        hint = ", or save the log with decimal points" if comma else ""
+        raise LogError(
+            f'{source}: line {row + 2}: "{text[row]}" in column "{column}" is not a number; correct it{hint}'
+        )
+    infinite = values.is_infinite().fill_null(value=False).arg_true()
+    if len(infinite):
+        row = int(infinite[0])
+        raise LogError(
+            f'{source}: line {row + 2}: "{text[row]}" in column "{column}" is not finite; leave the cell empty'
+        )
     return values.fill_null(float("nan")).to_numpy().astype(float)

@@ -94,6 +94,7 @@ class Problem:
         if self.table.controller is None:
             raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
         names = [self.table.controller.plant]
+        names += self.table.controller.robust_to
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
@@ -118,7 +119,15 @@ class Problem:
             A log cannot be read, or does not fit its plant.
 
         """
-        return tuple(self._experiment(table) for table in self.table.experiment)
+        found: list[Experiment] = []
+        for table in self.table.experiment:
+            try:
+                found.append(self._experiment(table))
+            except SeaoptError as error:
+                text = str(error)
+                named = text if f"experiment {table.name}" in text else f"experiment {table.name}: {text}"
+                raise type(error)(f"{self.source}: {named}") from error
+        return tuple(found)
 
     def _experiment(self, table: ExperimentTable) -> Experiment:
         plant = self.plants[table.plant]
@@ -181,7 +190,7 @@ def _column(item: str | ColumnTable) -> Column:
 def _unknown(name: str, unit: str, item: float | UnknownTable) -> float | Parameter:
     if not isinstance(item, UnknownTable):
         return item
-    free = item.free or item.prior_std is not None
+    free = item.free if item.free is not None else item.prior_std is not None
     known = Parameter(name=name, value=item.value, unit=unit, free=free, prior_std=item.prior_std)
     low = known.min if item.min is None else item.min
     return replace(known, min=low, max=known.max if item.max is None else item.max)
@@ -331,6 +340,8 @@ def _check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     for place, name in places:
         if name not in plants:
             raise ProblemError(f'{place} = "{name}" is no [plant] of this file; {suggestion(name, plants)}')
+    _check_measured(table, plants)
+    _check_ranges(table, plants)
     seen: set[str] = set()
     for item in table.experiment:
         if item.name in seen:
@@ -339,12 +350,38 @@ def _check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         _check_experiment(item, plants[item.plant])
 
 
+def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+    if table.controller is None:
+        return
+    measured = table.controller.measured
+    for name in (
+        table.controller.plant,
+        *table.controller.robust_to,
+        *(table.robustness.plants if table.robustness else ()),
+    ):
+        if measured not in plants[name].outputs:
+            raise ProblemError(
+                f'controller.measured = "{measured}" is not an output of plant.{name}; '
+                f"{suggestion(measured, plants[name].outputs)}"
+            )
+
+
+def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+    known = {name for plant in plants.values() for name in plant.parameters}
+    for name, (low, high) in (table.robustness.parameters if table.robustness else {}).items():
+        if name not in known:
+            raise ProblemError(f'robustness.parameters names "{name}", which no plant has; {suggestion(name, known)}')
+        if not low <= high:
+            raise ProblemError(f"robustness.parameters.{name} = [{low:g}, {high:g}] is empty; give [low, high]")
+
+
 def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
     place = f"experiment.{item.name}"
     if (item.log is None) == (item.virtual is None):
         raise ProblemError(f"{place}: give either log or virtual, and not both")
     if item.log is not None:
-        if item.time is None or not item.outputs:
+        driven = any(name not in plant.optional_inputs for name in plant.inputs)
+        if item.time is None or not item.outputs or (driven and not item.inputs):
             raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
         if Path(item.log).is_absolute() or ".." in Path(item.log).parts:
             raise ProblemError(f'{place}.log = "{item.log}" leaves the problem file\'s folder; put the log beside it')

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints
 
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
 
 
+Number = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
 
 
 class ParameterTable(_Strict):
     """A value with its unit, and what a fit may do with it."""
 
-    value: float
+    value: Number
     unit: str | None = None
-    free: bool | None = None
-    min: float | None = None
-    max: float | None = None
-    prior_std: float | None = None
+    free: Flag | None = None
+    min: Number | None = None
+    max: Number | None = None
+    prior_std: Number | None = None
 
 
 class PlantTable(BaseModel):
@@ -38,32 +41,32 @@ class ColumnTable(_Strict):
 
     column: str
     unit: str | None = None
-    sigma: float | None = None
+    sigma: Number | None = None
 
 
 class UnknownTable(_Strict):
     """A value of an experiment that may be estimated."""
 
-    value: float
-    free: bool = False
-    min: float | None = None
-    max: float | None = None
-    prior_std: float | None = None
+    value: Number
+    free: Flag | None = None
+    min: Number | None = None
+    max: Number | None = None
+    prior_std: Number | None = None
 
 
 class ChirpTable(_Strict):
     """A logarithmic chirp over the whole duration."""
 
-    amplitude: float
-    f0_hz: float
-    f1_hz: float
+    amplitude: Number
+    f0_hz: Number
+    f1_hz: Number
 
 
 class NoiseTable(_Strict):
     """Band-limited Gaussian noise."""
 
-    std: float
-    band_hz: float
+    std: Number
+    band_hz: Number
 
 
 class ExcitationTable(_Strict):
@@ -76,14 +79,14 @@ class ExcitationTable(_Strict):
 class VirtualTable(_Strict):
     """A virtual experiment in place of a log."""
 
-    seed: int
-    duration_s: Annotated[float, Field(gt=0, le=1e6)]
-    rate_hz: Annotated[float, Field(gt=0, le=1e6)]
-    noise_std: dict[str, float] = {}
-    offset: dict[str, float] = {}
-    quantisation: dict[str, float] = {}
-    saturation: dict[str, float] = {}
-    truth: dict[str, float] = {}
+    seed: Whole
+    duration_s: Annotated[Number, Field(gt=0, le=1e6)]
+    rate_hz: Annotated[Number, Field(gt=0, le=1e6)]
+    noise_std: dict[str, Number] = {}
+    offset: dict[str, Number] = {}
+    quantisation: dict[str, Number] = {}
+    saturation: dict[str, Number] = {}
+    truth: dict[str, Number] = {}
     excitation: ExcitationTable
     outputs: list[str] = []
 
@@ -98,13 +101,13 @@ class ExperimentTable(_Strict):
     time: str | ColumnTable | None = None
     inputs: dict[str, str | ColumnTable] = {}
     outputs: dict[str, str | ColumnTable] = {}
-    sigma: dict[str, float] = {}
-    initial_state: Literal["estimate", "rest"] | dict[str, float] = "estimate"
-    offset: bool | dict[str, float] = True
-    delay_s: float | UnknownTable = 0.0
-    gain: dict[str, float | UnknownTable] = {}
+    sigma: dict[str, Number] = {}
+    initial_state: Literal["estimate", "rest"] | dict[str, Number] = "estimate"
+    offset: Flag | dict[str, Number] = True
+    delay_s: Number | UnknownTable = 0.0
+    gain: dict[str, Number | UnknownTable] = {}
     hold: Literal["zero", "first"] = "zero"
-    slice_s: tuple[float, float] | None = None
+    slice_s: tuple[Number, Number] | None = None
     gaps: Literal["split", "error"] = "split"
 
 
@@ -113,8 +116,8 @@ class FitTable(_Strict):
 
     method: Literal["output_error"] = "output_error"
     loss: Literal["linear", "huber"] = "linear"
-    band_hz: tuple[float, float] | None = None
-    holdout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    band_hz: tuple[Number, Number] | None = None
+    holdout: Annotated[Number, Field(ge=0, lt=1)] = 0.0
 
 
 class ControllerTable(_Strict):
@@ -124,28 +127,28 @@ class ControllerTable(_Strict):
     measured: str = "F1"
     structure: Literal["pd", "pid"] = "pid"
     derivative: Literal["error", "measurement"] = "error"
-    bandwidth_hz: float
-    bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
-    sample_rate_hz: float = 1000.0
-    delay_samples: int = 1
-    max_sensitivity: float | None = None
-    max_complementary: float | None = None
-    max_reference_peak: float | None = None
-    max_noise_gain: float | None = None
-    min_sensitivity_bandwidth_hz: float | None = None
+    bandwidth_hz: Number
+    bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
+    sample_rate_hz: Number = 1000.0
+    delay_samples: Whole = 1
+    max_sensitivity: Number | None = None
+    max_complementary: Number | None = None
+    max_reference_peak: Number | None = None
+    max_noise_gain: Number | None = None
+    min_sensitivity_bandwidth_hz: Number | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     robust_to: list[Name] = []
-    current_limit_A: float | None = None
-    reserve: float = 0.005
+    current_limit_A: Number | None = None
+    reserve: Number = 0.005
 
 
 class RobustnessTable(_Strict):
     """What the controller must survive."""
 
     plants: list[Name] = []
-    parameters: dict[str, tuple[float, float]] = {}
-    samples: Annotated[int, Field(ge=1, le=10_000_000)] = 1375
-    seed: int = 1
+    parameters: dict[str, tuple[Number, Number]] = {}
+    samples: Annotated[Whole, Field(ge=1, le=10_000_000)] = 1375
+    seed: Whole = 1
 
 
 class ProblemTable(_Strict):
@@ -155,7 +158,7 @@ class ProblemTable(_Strict):
 
     version: Annotated[Literal[1], Field(alias="schema")]
     title: str = "untitled"
-    parameters: dict[str, float | ParameterTable] = {}
+    parameters: dict[str, Number | ParameterTable] = {}
     plant: dict[Name, PlantTable]
     experiment: list[ExperimentTable] = []
     fit: FitTable = FitTable()

@@ -151,11 +151,11 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
     if spec.max_sensitivity is not None:
         limit = 20 * np.log10(spec.max_sensitivity)
         axes[0, 1].axhline(
-            limit, color="#444444", linestyle="--", linewidth=0.9, label=f"Ms = {spec.max_sensitivity:g}"
+            limit, color="#444444", linestyle="-.", linewidth=0.9, label=f"Ms = {spec.max_sensitivity:g}"
         )
-    axes[1, 1].axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9)
+    axes[1, 1].axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9, label="-3 dB")
     axes[1, 1].axvline(spec.bandwidth_hz, color="#444444", linestyle="--", linewidth=0.9, label="bandwidth asked")
-    axes[1, 1].set_ylim(-30, 12)
+    axes[1, 1].set_ylim(bottom=-30)
     axes[0, 0].set_ylim(-60, 60)
     titles = (("open loop L: magnitude [dB]", "sensitivity |S| [dB]"),
               ("open loop L: phase [deg]", f"tracking |{spec.measured}/F_ref| [dB]"))  # fmt: skip
@@ -164,8 +164,10 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
             axis.set_title(title, fontsize="medium")
     for axis in axes[1]:
         axis.set_xlabel("frequency [Hz]")
-    for axis in (axes[0, 0], axes[0, 1], axes[1, 1]):
-        axis.legend(loc="lower left", frameon=False, fontsize="small")
+    handles: dict[str, Any] = {}
+    for axis in axes.ravel():
+        handles |= {str(line.get_label()): line for line in axis.lines if not str(line.get_label()).startswith("_")}
+    figure.legend(list(handles.values()), list(handles), loc="outside upper left", frameon=False, ncols=len(handles))
     return figure
 
 

@@ -140,8 +140,30 @@ def number(value: Any, digits: int = 4) -> str:
     return f"{value:.{digits}g}"
 
 
+def _interval(value: tuple[float, float] | None) -> str:
+    return f"{number(value[0], 6)} to {number(value[1], 6)}" if value and np.all(np.isfinite(value)) else "unknown"
+
+
+def _swinging(certificate: Certificate | None) -> bool:
+    """Tell whether some plant's -3 dB bandwidth says nothing: its tracking band does not start at 0 Hz."""
+    plants = certificate.plants.values() if certificate is not None else ()
+    return any(item.tracking_band_hz is not None and item.tracking_band_hz[0] > 1.0 for item in plants)
+
+
+def _forces(controller: Controller | None) -> str:
+    slow = controller.force_limit(0.01) if controller is not None else None
+    if controller is None or slow is None:
+        return ""
+    band = controller.spec.bandwidth_hz
+    fast = number(controller.force_limit(band))
+    return (
+        f"The current limit of {controller.spec.current_limit_A:g} A allows a reference of {number(slow)} N at rest "
+        f"and {fast} N at {band:g} Hz, whatever the gains."
+    )
+
+
 def _band(value: tuple[float, float] | None) -> str:
-    return "–" if value is None else f"{number(value[0], 3)} – {number(value[1])}"
+    return "–" if value is None else f"{number(value[0], 3)} to {number(value[1])}"
 
 
 def _page(
@@ -152,12 +174,13 @@ def _page(
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["number"] = number
     environment.filters["band"] = _band
+    environment.filters["interval"] = _interval
     template = environment.from_string(
         files("seaopt.reporting").joinpath("report.html.jinja").read_text(encoding="utf-8")
     )
     return template.render(
         title=title, fit=fit, controller=controller, certificate=certificate, figures=figures,
-        verdict=verdict(fit, controller, certificate),
+        verdict=verdict(fit, controller, certificate), swinging=_swinging(certificate), forces=_forces(controller),
     )  # fmt: skip
 
 
@@ -174,7 +197,7 @@ def verdict(fit: Fit | None, controller: Controller | None, certificate: Certifi
         broken = [f"{item.name} ({item.where})" for item in certificate.requirements if not item.met]
         what = (
             f"passed – {mc.failures} failures in {mc.samples} draws, failure probability below "
-            f"{mc.failure_probability_bound:.2%}"
+            f"{mc.failure_probability_bound:.3g}"
             if certificate.passed
             else "failed – " + "; ".join(broken)
         )

@@ -153,6 +153,8 @@ class Certificate:
         lines.append(
             f"  {mc.failures} failures in {mc.samples} draws: failure probability below "
             f"{mc.failure_probability_bound:.2%} at a confidence of {_confidence(mc.confidence)}"
+            if mc.samples
+            else "  no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
         )
         for item in self.requirements:
             if not item.met:
@@ -233,6 +235,8 @@ def certify(
     (True, 0)
 
     """
+    if not isinstance(plants, Mapping):
+        raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
     if not plants:
         raise ControlError("certify needs at least one plant; give {name: plant}")
     if samples < 1:
@@ -244,19 +248,20 @@ def certify(
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     draws = unknown.draw(samples, np.random.default_rng(seed))
     batches = {name: batch_figures(controller, plant, nominal, draws) for name, plant in plants.items()}
-    failed = np.zeros(samples if draws else 1, dtype=bool)
+    samples = samples if draws else 0  # nothing is uncertain: there is nothing to draw
+    failed = np.zeros(max(samples, 1), dtype=bool)
     for batch in batches.values():
         failed |= _failures(controller, batch)
     worst = {name: _worst(controller, plants[name], nominal, draws, batch) for name, batch in batches.items()}
-    failures = int(np.count_nonzero(failed)) if draws else samples * int(failed[0])
+    failures = int(np.count_nonzero(failed)) if draws else 0
     monte_carlo = MonteCarlo(
         samples=samples, failures=failures, seed=seed, confidence=confidence,
         failure_probability_bound=failure_bound(samples, failures, confidence),
     )  # fmt: skip
     requirements = (
-        *_design_requirements(controller),
+        *_design_requirements(controller, _design_figures(controller, nominal)),
         *(item for name in plants for item in _plant_requirements(controller, name, figures[name])),
-        _monte_carlo_requirement(monte_carlo, worst),
+        *_monte_carlo_requirement(monte_carlo, worst),
     )
     return Certificate(
         passed=all(item.met for item in requirements), requirements=requirements, plants=figures, worst=worst,
@@ -298,7 +303,8 @@ def _worst(
 ) -> Worst:  # fmt: skip
     """Return the worst draw, measured again one by one."""
     ms, mt = _limits(controller)
-    used = np.maximum(batch.ms / ms, batch.mt / mt) if np.isfinite(min(ms, mt)) else batch.ms
+    with np.errstate(invalid="ignore"):  # infinite over infinite, of unstable draws, which are ranked below
+        used = np.maximum(batch.ms / ms, batch.mt / mt) if np.isfinite(min(ms, mt)) else batch.ms
     severity = np.where(batch.spectral_radius >= 1.0, 1e6 + batch.spectral_radius, used)
     k = int(np.argmax(severity))
     values = {name: float(drawn[k]) for name, drawn in draws.items() if name in plant.parameters}
@@ -308,8 +314,19 @@ def _worst(
     return Worst(parameters=values, ms=found.ms, mt=found.mt, severity=float(severity[k]))
 
 
-def _design_requirements(controller: Controller) -> list[Requirement]:
-    spec, achieved = controller.spec, controller.achieved
+def _design_figures(controller: Controller, nominal: ParameterSet) -> LoopFigures:
+    """Return the figures of the design plant at the nominal parameters, computed from the law again."""
+    if controller.design is None:
+        raise ControlError(
+            "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
+        )
+    plant, values = controller.design
+    named = values.with_parameters(*(nominal[name] for name in nominal if name in plant.parameters))
+    return controller.close(plant, named).figures()
+
+
+def _design_requirements(controller: Controller, achieved: LoopFigures) -> list[Requirement]:
+    spec = controller.spec
     reached = achieved.bandwidth_hz if achieved.bandwidth_hz is not None else np.inf
     rows = [
         Requirement(
@@ -330,7 +347,7 @@ def _design_requirements(controller: Controller) -> list[Requirement]:
 def _plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
     spec = controller.spec
     return [
-        Requirement(name="stable", limit=1.0, value=figures.spectral_radius, met=figures.stable, where=name),
+        Requirement(name="spectral_radius", limit=1.0, value=figures.spectral_radius, met=figures.stable, where=name),
         *_upper("max_sensitivity", spec.max_sensitivity, figures.ms, name),
         *_upper("max_complementary", spec.max_complementary, figures.mt, name),
     ]
@@ -342,11 +359,20 @@ def _upper(name: str, limit: float | None, value: float, where: str) -> list[Req
     return [Requirement(name=name, limit=limit, value=value, met=bool(value <= limit * (1 + ROUNDING)), where=where)]
 
 
-def _monte_carlo_requirement(result: MonteCarlo, worst: Mapping[str, Worst]) -> Requirement:
+def _monte_carlo_requirement(result: MonteCarlo, worst: Mapping[str, Worst]) -> list[Requirement]:
+    if not result.samples:
+        return []
     name = max(worst, key=lambda key: worst[key].severity)
     where = ", ".join(f"{key} = {value:.4g}" for key, value in worst[name].parameters.items())
-    return Requirement(
-        name="monte_carlo_failures", limit=0.0, value=float(result.failures), met=result.failures == 0,
-        where=f"{name}: worst draw has Ms {worst[name].ms:.4g}, Mt {worst[name].mt:.4g}"
-        + (f" at {where}" if where else ""),
-    )  # fmt: skip
+    witness = f"{name}: worst draw has Ms {worst[name].ms:.4g}, Mt {worst[name].mt:.4g}" + (
+        f" at {where}" if where else ""
+    )
+    remedy = (
+        "" if result.failures == 0 else "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
+    )
+    return [
+        Requirement(
+            name="monte_carlo_failures", limit=0.0, value=float(result.failures), met=result.failures == 0,
+            where=witness + remedy,
+        )
+    ]  # fmt: skip

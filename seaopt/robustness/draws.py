@@ -99,14 +99,21 @@ def uncertainty(
             )
     if isinstance(source, Fit):
         nominal, names, matrix = source.parameters, source.covariance.names, source.covariance.matrix
+        if source.status not in ("converged", "not_identifiable"):
+            raise ControlError(f"the fit has not converged ({source.message}); nothing can be certified from it")
         for name in names:
-            if not np.isfinite(source.covariance.std(name)) and not nominal[name].at_bound and name not in ranges:
+            if not np.isfinite(source.covariance.std(name)) and name not in ranges:
                 raise ControlError(
                     f"parameter {name} is not identifiable in the fit, so nothing can be certified; "
                     "fix it, give it a prior_std, or give its range"
                 )
-        others = others.subset(name for name in others if name not in nominal)
+        known_within = [item for item in nominal.values() if item.prior_std is not None and item.name not in names]
+        others = others.subset(name for name in others if name not in nominal).with_parameters(*known_within)
     else:
+        if any(item.std is not None for item in source.values()):
+            raise ControlError(
+                "the parameters come from a fit, whose covariance they do not carry; give the Fit itself"
+            )
         nominal, names, matrix = ParameterSet(), (), np.zeros((0, 0))
         others = others.with_parameters(*source.values())
     stds = {name: item.prior_std for name, item in others.items() if item.prior_std is not None}

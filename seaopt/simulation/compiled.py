@@ -38,6 +38,7 @@ def kernel_source(model: Model, delay_free: bool) -> str:
     """Return the C source of the pass of a model."""
     constants = {
         "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": model.np + delay_free, "NQ": model.np,
+        "NA": model.p.numel(),
         "LINEAR": int(model.linear),
     }  # fmt: skip
     generated = ""
@@ -79,7 +80,9 @@ def _settings(model: Model, point: Point, segment: Segment) -> Float[np.ndarray,
     if model.linear:
         return transition(model, point.theta, clock).ravel()
     foh = float(clock.hold == "first")
-    return np.array([*point.theta, point.substeps, clock.period, clock.fraction_s, foh, segment.start_s])
+    return np.array(
+        [*model.parameters(point.theta), point.substeps, clock.period, clock.fraction_s, foh, segment.start_s]
+    )
 
 
 def compiled_pass(

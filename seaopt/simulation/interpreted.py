@@ -134,43 +134,43 @@ def _toeplitz(impulse: list[Float[np.ndarray, "a w"]]) -> Float[np.ndarray, "la 
     return out
 
 
-def _sample_step(model: Model, point: Point) -> Any:
-    """Return the CasADi function (z, [t, u_a, u_b], theta) -> z+ over one sample, z = [x, vec(sensitivities)]."""
+def _fold(model: Model, point: Point) -> Any:
+    """Return the CasADi function (z, w, [p; older; newer]) -> z+ over CHUNK samples, z = [x, vec(sensitivities)].
+
+    Each column of w is [t, u_a, u_b]; older and newer are the two parts of the period that a fractional delay makes.
+    """
     clock, steps = point.clock, point.substeps
-    key = f"sample{clock}{steps}"
+    split = clock.delay_free or clock.fraction_s > 0.0
+    key = f"fold {clock.hold} {clock.delay_free} {split} {steps}"
     if key in model.functions:
         return model.functions[key]
-    nx, nt = model.nx, model.np + clock.delay_free + model.nx
-    z, theta = ca.MX.sym("z", nx * (1 + nt)), ca.MX.sym("theta", model.np)
+    nx, nt, na = model.nx, model.np + clock.delay_free + model.nx, model.p.numel()
+    z, data = ca.MX.sym("z", nx * (1 + nt)), ca.MX.sym("data", na + 2)
     w = ca.MX.sym("w", 1 + 2 * model.nu)
-    x, s = z[:nx], ca.reshape(z[nx:], nx, nt)
+    x, s, p = z[:nx], ca.reshape(z[nx:], nx, nt), data[:na]
     t, ua, ub = w[0], w[1 : 1 + model.nu], w[1 + model.nu :]
     step = step_function(model)
-    for part, length in enumerate((clock.fraction_s, clock.period - clock.fraction_s)):
-        if length <= 0.0 and not clock.delay_free:
-            continue
-        h, dh = length / steps, (-1.0 if part else 1.0) / steps
+    for part in (0, 1) if split else (1,):
+        h, dh = data[na + part] / steps, (-1.0 if part else 1.0) / steps
         for i in range(steps):
             u0 = u1 = ua if part else ub
             if clock.hold == "first":
                 u0, u1 = ua + (ub - ua) * (i / steps), ua + (ub - ua) * ((i + 1) / steps)
-            x, a, b = step(t, x, u0, u1, theta, h)
+            x, a, b = step(t, x, u0, u1, p, h)
             forced = [b[:, : model.np], b[:, model.np] * dh] if clock.delay_free else [b[:, : model.np]]
             s = ca.mtimes(a, s) + ca.horzcat(*forced, ca.MX.zeros(nx, nx))
             t = t + h
-    model.functions[key] = ca.Function("sample", [z, w, theta], [ca.vertcat(x, ca.vec(s))])
+    sample = ca.Function("sample", [z, w, data], [ca.vertcat(x, ca.vec(s))])
+    model.functions[key] = sample.mapaccum(CHUNK)
     return model.functions[key]
 
 
 def _nonlinear_trace(model: Model, segment: Segment, point: Point, held: Float[np.ndarray, "n w"]) -> Trace:
-    n, nx, ny, nq = held.shape[0], model.nx, model.ny, model.np
-    nt = nq + point.clock.delay_free + nx
-    times = segment.start_s + point.clock.period * np.arange(n)
-    sample = _sample_step(model, point)
-    key = f"fold{point.clock}{point.substeps}"
-    if key not in model.functions:
-        model.functions[key] = sample.mapaccum(CHUNK)
-    fold = model.functions[key]
+    n, nx, ny, nq, clock = held.shape[0], model.nx, model.ny, model.np, point.clock
+    nt = nq + clock.delay_free + nx
+    times = segment.start_s + clock.period * np.arange(n)
+    fold, p = _fold(model, point), model.parameters(point.theta)
+    data = np.concatenate([p, [clock.fraction_s, clock.period - clock.fraction_s]])
     z = np.concatenate([point.x0, np.hstack([np.zeros((nx, nt - nx)), np.eye(nx)]).ravel(order="F")])
     w = np.column_stack([times, held[:, :-1]])
     path = [z[:, None]]
@@ -178,19 +178,17 @@ def _nonlinear_trace(model: Model, segment: Segment, point: Point, held: Float[n
         part = w[start : start + CHUNK]
         if len(part) < CHUNK:
             part = np.vstack([part, np.repeat(part[-1:], CHUNK - len(part), axis=0)])
-        block = np.array(fold(path[-1][:, -1], part.T, point.theta))
+        block = np.array(fold(path[-1][:, -1], part.T, data))
         path.append(block[:, : min(CHUNK, n - start)])
     z_all = np.hstack(path).T
     x = z_all[:, :nx]
     s = z_all[:-1, nx:].reshape(n, nt, nx)  # vec() stacks columns
-    now = held[:, model.nu : 2 * model.nu] if point.clock.fraction_s > 0 else held[:, : model.nu]
-    output = output_function(model)
+    now = held[:, model.nu : 2 * model.nu] if clock.fraction_s > 0 else held[:, : model.nu]
     key = f"outputs{n}"
     if key not in model.functions:
-        model.functions[key] = output.map(n)
-    y, c, d = (
-        np.array(item) for item in model.functions[key](times, x[:-1].T, now.T, np.repeat(point.theta[:, None], n, 1))
-    )
+        model.functions[key] = output_function(model).map(n)
+    found = model.functions[key](times, x[:-1].T, now.T, np.repeat(p[:, None], n, 1))
+    y, c, d = (np.array(item) for item in found)
     c = c.reshape(ny, n, nx).transpose(1, 0, 2)
     dy = np.einsum("noi,nti->not", c, s)
     if nq:

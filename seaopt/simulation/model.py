@@ -24,6 +24,9 @@ class Model:
         The plant.
     free : tuple of str
         Names of theta, in order; parameters of other plants are not among them.
+    p : SX
+        theta, then the other parameters that are not zero, whose values are `constants`: data to compiled code, so that
+        other values need no other code. Zeros are put in, and take their terms out.
     outputs : tuple of str
         The outputs that are computed, in order.
     linear : bool
@@ -38,6 +41,8 @@ class Model:
     x: Any
     u: Any
     theta: Any
+    p: Any
+    constants: Float[np.ndarray, " nc"]
     f: Any
     h: Any
     linear: bool
@@ -63,6 +68,10 @@ class Model:
         """Number of free parameters."""
         return len(self.free)
 
+    def parameters(self, theta: Float[np.ndarray, " np"]) -> Float[np.ndarray, " m"]:
+        """Return the values of `p`."""
+        return np.concatenate([theta, self.constants])
+
     def matrices(self, theta: Float[np.ndarray, " np"]) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
         """Return the affine model [f; h] = G [x; u; 1] and its derivatives, for a linear model.
 
@@ -75,13 +84,13 @@ class Model:
         if "matrices" not in self.functions:
             self.functions["matrices"] = _matrices(self)
         rows, cols = self.nx + self.ny, self.nx + self.nu + 1
-        g, dg = self.functions["matrices"](theta)
+        g, dg = self.functions["matrices"](self.parameters(theta))
         derivative = np.array(dg).reshape(cols, rows, self.np).transpose(2, 1, 0)
         return np.array(g), derivative
 
 
 def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> Model:
-    """Specialise a plant: the parameters outside `free` are replaced by their values.
+    """Specialise a plant: the parameters outside `free` are held at their values.
 
     A parameter held at zero, such as f_c, takes its term out, so that a plant is linear exactly when its
     numbers make it so.
@@ -102,19 +111,17 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
     symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if values else {}
     names = tuple(name for name in free if name in values)
     theta = ca.vertcat(*(symbols[name] for name in names)) if names else ca.SX(0, 1)
-    fixed = [name for name in values if name not in names]
+    zero = [name for name in values if name not in names and values[name] == 0.0]
+    known = [name for name in values if name not in names and values[name] != 0.0]
     rows = [list(plant.outputs).index(name) for name in chosen]
     f, h = plant.dynamics, plant.output[rows]
-    if fixed:
-        f, h = ca.substitute(
-            [f, h],
-            [ca.vertcat(*(symbols[name] for name in fixed))],
-            [ca.DM([values[name] for name in fixed])],
-        )
+    if zero:
+        f, h = ca.substitute([f, h], [ca.vertcat(*(symbols[name] for name in zero))], [ca.DM.zeros(len(zero))])
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
     return Model(
-        plant=plant, free=names, outputs=chosen, t=plant.t, x=plant.x, u=u, theta=theta, f=f, h=h,
-        linear=_is_linear(f, h, plant.t, plant.x, u),
+        plant=plant, free=names, outputs=chosen, t=plant.t, x=plant.x, u=u, theta=theta,
+        p=ca.vertcat(theta, *(symbols[name] for name in known)), constants=np.array([values[name] for name in known]),
+        f=f, h=h, linear=_is_linear(f, h, plant.t, plant.x, u),
     )  # fmt: skip
 
 
@@ -142,4 +149,4 @@ def _matrices(model: Model) -> Any:
     slope, constant = ca.substitute([ca.jacobian(both, point), both], [point], [origin])
     g = ca.densify(ca.horzcat(slope, constant))
     dg = ca.densify(ca.jacobian(ca.vec(g), model.theta))
-    return ca.Function("matrices", [model.theta], [g, dg])
+    return ca.Function("matrices", [model.p], [g, dg])

@@ -102,8 +102,8 @@ static void advance(state *q, const seaopt_pass_args *a, const double *ua, const
 #else
 /* CasADi's functions stand in front of this file:
      seaopt_step(t, x, u0, u1, p, h) -> x1, dx1/dx, dx1/d[p, h]     seaopt_output(t, x, u, p) -> y, dy/dx, dy/dp
-   model: p (NQ), substeps, period, older part of the period (fractional delay), first-order hold flag, t0.
-   NQ parameters of the plant; NP = NQ + 1 where the delay is free too. */
+   model: p (NA, of which the first NQ are differentiated), substeps, period, older part of the period (fractional delay), first-order hold flag, t0.
+   NP = NQ + 1 where the delay is free too. */
 static void one_step(state *q, const double *t, const double *u0, const double *u1, const double *p, const double *h, double dh) {
     double x1[NX], a[NX * NX], b[NX * (NQ + 1)], next[NX];
     const double *arg[SZ_ARG] = {t, q->X, u0, u1, p, h};
@@ -123,7 +123,7 @@ static void one_step(state *q, const double *t, const double *u0, const double *
 }
 
 static void observe(state *q, const seaopt_pass_args *a, const double *ua, const double *ub, long k) {
-    const double *p = a->model, *m = p + NQ;
+    const double *p = a->model, *m = p + NA;
     double y[NY], c[NY * NX], d[NY * NQ + 1], t = m[4] + k * m[1];
     const double *now = (m[2] > 0.0) ? ub : ua;
     const double *arg[SZ_ARG] = {&t, q->X, now, p};
@@ -141,7 +141,7 @@ static void observe(state *q, const seaopt_pass_args *a, const double *ua, const
 
 /* With a fractional delay the older input u_b acts first, for m[2] seconds, then u_a. */
 static void advance(state *q, const seaopt_pass_args *a, const double *ua, const double *ub, long k) {
-    const double *p = a->model, *m = p + NQ;
+    const double *p = a->model, *m = p + NA;
     const long steps = (long)m[0];
     const int foh = m[3] > 0.5;
     double t = m[4] + k * m[1];

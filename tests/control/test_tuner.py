@@ -136,6 +136,8 @@ def test_json_round_trip(stand, swing, thor, tmp_path):
         ({"current_limit_A": 0}, "current_limit_A"),
         ({"bandwidth_range_hz": (60, 15)}, "bandwidth_range_hz"),
         ({"objective": "speed"}, "objective"),
+        ({"delay_samples": 100_000}, "delay_samples"),
+        ({"sample_rate_hz": float("inf")}, "sample_rate_hz"),
     ],
 )
 def test_bad_specifications(changes, words):
@@ -154,3 +156,39 @@ def test_unknown_output_and_free_mass_are_refused(stand, thor):
     free = so.plants.two_link(link2="mass")
     with pytest.raises(ControlError, match="static gain"):
         so.tune(free, so.plants.thor(), so.ControllerSpec())
+
+
+def test_a_plant_named_design_does_not_replace_the_design_plant(stand, thor):
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30), {"design": (stand, thor.update(J=1e-5))})
+    assert controller.robust_to == ("design",)
+    assert controller.close(stand, thor).figures().bandwidth_hz == pytest.approx(30, rel=0.005)
+
+
+def test_the_force_limit_is_the_plants(stand, thor):
+    """u/r = T/P whatever the controller: the current of a sine of that force, simulated, peaks at the limit."""
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0))
+    loop = controller.close(stand, thor)
+    p = loop.plant.response(np.array([30.0]))[0]
+    t = loop.tracking(np.array([30.0]))[0]
+    saturation = 9.0 / controller.current_per_force_A_per_N
+    assert controller.force_limit(30.0) == pytest.approx(saturation * abs(p) / abs(t), rel=1e-9)
+    assert controller.force_limit(0.01) == pytest.approx(saturation, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"structure": 5},
+        {"feasible": "false"},
+        {"delay_samples": 1.7},
+        {"sample_time_s": 0.5},
+        {"gains": {"k_p": "<b>"}},
+        {"gains": 5},
+        {"measurement": {"num": [], "den": [1.0]}},
+        {"measurement": {"num": [[1.0]], "den": [1.0]}},
+    ],
+)
+def test_a_damaged_controller_json_is_refused(stand, thor, changes):
+    content = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).to_dict()
+    with pytest.raises(FileError, match=r"controller\.json"):
+        Controller.from_dict({**content, **changes}, stand, thor)

@@ -107,7 +107,7 @@ def test_misra1a_values_and_standard_errors_are_nists():
 
 
 def test_intervals_cover_the_truth(stand, thor):
-    """95 % intervals of J, b_r, eta over 60 seeds (180 intervals; the benchmarks do 400 seeds)."""
+    """95 % intervals of J, b_r, eta over 60 seeds (180 intervals)."""
     inside = 0
     for seed in range(60):
         noise = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
@@ -137,6 +137,39 @@ def test_coloured_residuals_widen_the_intervals(stand, thor):
         found.append(fit.parameters["b_r"].value)
         stated.append(fit.parameters["b_r"].std)
     assert np.mean(stated) == pytest.approx(np.std(found), rel=0.35)
+
+
+def scatter(stand, thor, spoil, seeds, **options):
+    """Return the scatter of J and b_r over seeds, over their mean stated std."""
+    found, stated = [], []
+    for seed in range(seeds):
+        log = so.virtual_log(stand, thor, (Noise(std=1.0, band_hz=20),), duration_s=4, rate_hz=400, seed=seed)
+        f1, f2 = spoil(np.random.default_rng(1000 + seed), log["F1"], log["F2"])
+        noisy = so.Log.from_arrays(time=log.time, I=log["I"], F1=f1, F2=f2)
+        fit = so.fit([experiment(stand, noisy)], thor.free("J", "b_r"), method=so.OutputError(search=False), **options)
+        found.append([fit.parameters[name].value for name in ("J", "b_r")])
+        stated.append([fit.parameters[name].std for name in ("J", "b_r")])
+    return np.std(found, axis=0) / np.mean(stated, axis=0)
+
+
+def test_noise_common_to_both_load_cells_widens_the_intervals(stand, thor):
+    """Output by output, the stated std would be 1/sqrt(2) of the scatter."""
+
+    def common(rng, f1, f2):
+        noise = 2 * rng.normal(size=f1.size)
+        return f1 + noise, f2 + noise
+
+    np.testing.assert_allclose(scatter(stand, thor, common, 60), 1.0, atol=0.25)
+
+
+def test_hubers_intervals_mean_what_they_say(stand, thor):
+    def outliers(rng, f1, f2):
+        hit = rng.random(f1.size) < 0.05
+        return f1 + 2 * rng.normal(size=f1.size) + 60 * hit * rng.normal(size=f1.size), f2 + 2 * rng.normal(
+            size=f1.size
+        )
+
+    np.testing.assert_allclose(scatter(stand, thor, outliers, 60, loss=so.Huber()), 1.0, atol=0.25)
 
 
 def test_what_cannot_be_told_is_named(stand, short_log, thor):
@@ -245,6 +278,7 @@ def test_fit_json_round_trip(stand, short_log, thor, tmp_path):
         (lambda s, log, p: experiment(s, log, sigma={"F1": -1}), "sigma of F1"),
         (lambda s, log, p: experiment(s, log, initial_state={"z": 1}), '"z"'),
         (lambda s, log, p: experiment(s, log, gain={"F3": 1}), "F3"),
+        (lambda s, log, p: experiment(s, log, name='"><b>'), "not a name"),
     ],
 )
 def test_bad_input(stand, short_log, thor, make, words):

@@ -69,3 +69,17 @@ def test_unknown_kind_and_option_are_refused():
         plant_of_kind("high_impedanse")
     with pytest.raises(PlantError, match="drife"):
         plant_of_kind("high_impedance", drife="lumped")
+
+
+def test_units_of_values_are_converted_or_refused(stand, thor):
+    from seaopt.errors import UnitError
+
+    millimetres = so.ParameterSet.of(k=(655.0, "N/mm"))
+    np.testing.assert_allclose(stand.linearize(millimetres).A, stand.linearize(thor).A)
+    with pytest.raises(UnitError, match="parameter k of plant"):
+        stand.linearize(so.ParameterSet.of(k=(655e3, "kg")))
+
+
+def test_a_misspelt_symbol_is_named():
+    with pytest.raises(PlantError, match='f uses "mass"; known: m, c'):
+        build(f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.mass})

@@ -68,6 +68,12 @@ kind = "high_impedance"
         ("seed = 1,", "seed = 'x',", "seed"),
         ("f0_hz = 0.01", "f0_hz = 0.01, f2_hz = 3", "f2_hz"),
         ("samples = 1375", "samples = 0", "samples"),
+        ("bandwidth_hz = 30", 'bandwidth_hz = "30"', "bandwidth_hz"),
+        ("delay_samples = 1", "delay_samples = true", "delay_samples"),
+        ("delay_samples = 1", "delay_samples = 5000", "from 0 to 1000"),
+        ('measured = "F1"', 'measured = "F9"', 'did you mean "F1"|F9'),
+        ("I_p = [0.2, 0.6]", "I_q = [0.2, 0.6]", "I_q"),
+        ("I_p = [0.2, 0.6]", "I_p = [0.6, 0.2]", "empty"),
     ],
 )
 def test_mistakes_are_one_clear_line(write, old, new, words):
@@ -80,9 +86,14 @@ def test_mistakes_are_one_clear_line(write, old, new, words):
 
 @pytest.mark.parametrize("log", ["/etc/passwd", "../secret.csv"])
 def test_logs_stay_in_the_folder(write, log):
-    experiment = (
-        f'[[experiment]]\nname = "a"\nplant = "stand"\nlog = "{log}"\ntime = "t [s]"\noutputs = {{ F1 = "F1 [N]" }}\n'
-    )
+    experiment = f"""[[experiment]]
+name = "a"
+plant = "stand"
+log = "{log}"
+time = "t [s]"
+inputs = {{ I = "I [A]" }}
+outputs = {{ F1 = "F1 [N]" }}
+"""
     with pytest.raises(so.SeaoptError, match="leaves the problem file's folder"):
         so.read_problem(write('schema = 1\n[plant.stand]\nkind = "high_impedance"\n' + experiment))
 

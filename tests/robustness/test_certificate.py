@@ -38,7 +38,7 @@ def test_it_passes_with_the_stated_bound(certificate):
 def test_every_requirement_carries_its_numbers(certificate):
     names = {(item.name, item.where) for item in certificate.requirements}
     assert ("max_sensitivity", "swing") in names
-    assert ("stable", "stand") in names
+    assert ("spectral_radius", "stand") in names
     assert all(item.met for item in certificate.requirements)
     content = certificate.to_dict()
     assert content["schema"] == "seaopt/robustness/1"
@@ -127,3 +127,52 @@ def test_an_unidentifiable_fit_is_not_certified(controller, stand, short_log, th
     fit = so.fit([so.Experiment(plant=stand, log=short_log)], thor.free("J", "eta", "K_tau"))
     with pytest.raises(ControlError, match="not identifiable"):
         so.certify(controller, {"stand": stand}, fit)
+
+
+def test_the_law_alone_is_certified(controller, stand, thor):
+    """Halve both transfer functions: the design figures are of the halved law, not of what was tuned."""
+    from dataclasses import replace
+
+    from seaopt.control import TransferFunction
+
+    halved = {n: TransferFunction(num=0.5 * getattr(controller, n).num, den=getattr(controller, n).den)
+              for n in ("reference", "measurement")}  # fmt: skip
+    certificate = so.certify(replace(controller, **halved), {"stand": stand}, thor)
+    (row,) = [item for item in certificate.requirements if item.name == "bandwidth_hz"]
+    assert not row.met
+    assert row.value < 20
+
+
+def test_nothing_uncertain_is_no_statement(controller, stand, thor):
+    certificate = so.certify(controller, {"stand": stand}, thor)
+    assert certificate.monte_carlo.samples == 0
+    assert certificate.monte_carlo.failure_probability_bound == 1.0
+    assert "nothing is uncertain" in repr(certificate)
+
+
+def test_fits_that_cannot_be_trusted(controller, stand, short_log, thor):
+    bench = so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))
+    method = so.OutputError(search=False, max_iterations=2)
+    stopped = so.fit([bench], thor.update(J=1e-6, b_r=1e-3).free("J", "b_r"), method=method)
+    assert stopped.status != "converged"
+    with pytest.raises(ControlError, match="has not converged"):
+        so.certify(controller, {"stand": stand}, stopped)
+    good = so.fit([bench], thor.free("J"))
+    with pytest.raises(ControlError, match="give the Fit itself"):
+        so.certify(controller, {"stand": stand}, good.parameters)
+
+
+def test_a_parameter_on_its_bound_is_drawn_from_one_side(controller, stand, short_log, thor):
+    start = thor.update(J=5e-6).free("J", "b_r").bound(J=(3.3101e-6, 1e-5))
+    fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], start)
+    certificate = so.certify(controller, {"stand": stand}, fit, samples=200)
+    assert certificate.worst["stand"].parameters["J"] >= 3.3101e-6
+
+
+def test_a_known_parameters_prior_is_drawn_too(controller, stand, short_log, thor):
+    from dataclasses import replace
+
+    known = thor.free("J").with_parameters(replace(thor["k"], prior_std=5e3))
+    fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], known)
+    certificate = so.certify(controller, {"stand": stand}, fit, samples=50)
+    assert set(certificate.worst["stand"].parameters) == {"J", "k"}
