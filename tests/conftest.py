@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
-os.environ.setdefault("SEAOPT_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"seaopt-tests-{os.getuid()}"))
+os.environ.setdefault("SEAOPT_CACHE_DIR", tempfile.mkdtemp(prefix="seaopt-tests-"))
 
 import pytest
 from beartype import BeartypeConf, FrozenDict, beartype

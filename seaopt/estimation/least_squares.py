@@ -73,7 +73,7 @@ def minimise(
         return Solution(z=z, evaluation=here, status="stalled", message=message, iterations=0)
     damping, growth = 1e-4, 2.0
     for iteration in range(1, max_iterations + 1):
-        held = _held(z, here.gradient, low, high)
+        held = _held(z, here, low, high)
         distance = _decrement(here, held)
         if distance <= DECREMENT + RELATIVE * here.cost:
             return Solution(
@@ -109,11 +109,11 @@ def minimise(
 
 
 def _held(
-    z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"], low: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
-) -> Bool[np.ndarray, " n"]:  # fmt: skip
-    """Tell which unknowns lie on a bound that descent would cross."""
-    return ((z <= low) & (gradient > 0.0)) | ((z >= high) & (gradient < 0.0))
+    z: Float[np.ndarray, " n"], here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Tell which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
+    near = 1e-4 / np.sqrt(np.maximum(np.diag(here.hessian), 1e-300))
+    return ((z - low <= near) & (here.gradient > 0.0)) | ((high - z <= near) & (here.gradient < 0.0))
 
 
 def _scaled(here: Evaluation, held: Bool[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"]]:

@@ -128,16 +128,9 @@ def _lag(p: Any, name: str) -> _Filter:
 
 def _pade(p: Any, name: str) -> _Filter:
     """exp(-s T) by Padé's (3, 3): (120 - 60 sT + 12 (sT)^2 - (sT)^3) / (120 + 60 sT + 12 (sT)^2 + (sT)^3)."""
-    t = getattr(p, name)
-    den = [120 / t**3, 60 / t**2, 12 / t]  # ascending powers of s, monic
-    num = [120 / t**3, -60 / t**2, 12 / t]  # leading coefficient -1
-    a = ca.vertcat(
-        ca.horzcat(0, 1, 0),
-        ca.horzcat(0, 0, 1),
-        ca.horzcat(*(-item for item in den)),
-    )  # fmt: skip
-    c = ca.horzcat(*(n + d for n, d in zip(num, den, strict=True)))
-    return _Filter(a=a, b=ca.vertcat(0, 0, 1), c=c, d=ca.SX(-1))
+    rate = 1 / getattr(p, name)  # in units of T the entries are numbers, and the states have the signal's size
+    a = rate * ca.vertcat(ca.horzcat(0, 1, 0), ca.horzcat(0, 0, 1), ca.horzcat(-120, -60, -12))
+    return _Filter(a=a, b=rate * ca.vertcat(0, 0, 1), c=ca.horzcat(ca.SX(240), 0, 24), d=ca.SX(-1))
 
 
 _FILTERS = {

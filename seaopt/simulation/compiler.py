@@ -46,11 +46,19 @@ def cache_folder() -> Path | None:
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
-        status = folder.stat()
     except OSError:
         return None
-    private = status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return folder if private else None
+    return folder if _private(folder) else None
+
+
+def _private(path: Path) -> bool:
+    """Tell whether a file or folder, not a link, is the user's own and nobody else can write to it."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return False
+    own = status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return own and not stat.S_ISLNK(status.st_mode)
 
 
 @lru_cache(maxsize=64)
@@ -63,10 +71,16 @@ def load_library(source: str) -> ctypes.CDLL | None:
     library = folder / f"{key}.so"
     if not library.exists() and not _compile(compiler, source, library):
         return None
+    if not _private(library):
+        return None
     try:
         return ctypes.CDLL(str(library))
     except OSError:  # built for another machine that shares this folder
+        pass
+    try:
         return ctypes.CDLL(str(library)) if _compile(compiler, source, library) else None
+    except OSError:
+        return None
 
 
 def _compile(compiler: list[str], source: str, library: Path) -> bool:

@@ -24,6 +24,8 @@ RATE = 400.0
 
 def reference(plant, params, u, x0, hold):
     """Integrate sample by sample with DOP853, so that the hold's corners fall on step ends."""
+    columns = [u] + [np.zeros_like(u)] * (len(plant.inputs) - 1)
+    u = np.hstack(columns)
     p = plant.parameter_values(params)
     f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
     h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
@@ -48,6 +50,14 @@ CASES = {
     "swing": (so.plants.moving_output(), {}),
     "swing lumped": (so.plants.moving_output(drive="lumped"), {}),
     "swing friction": (so.plants.moving_output(), {"f_c": 40.0, "v_s": 5e-3, "d": 0.2}),
+    "two masses": (so.plants.two_link("mass", "mass"), {}),
+    "mass and pendulum, lumped": (so.plants.two_link("mass", "pendulum", drive="lumped"), {}),
+    "two pendulums, spring at link 2": (so.plants.two_link("pendulum", "pendulum", spring="link2"), {}),
+    "rotary": (so.plants.rotary(), {}),
+    "every part": (
+        so.plants.moving_output(parts=tuple(so.plants.PARTS)),
+        {"f_c": 20.0, "f_s": 30.0, "v_s": 0.02, "v_st": 0.05, "g_b": 2e-5, "eps_b": 1e-5, "k_3": 1e11, "c_k": 50.0},
+    ),
 }
 
 
@@ -55,10 +65,12 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_simulation_is_dop853s(name, hold, thor):
     plant, changes = CASES[name]
-    params = thor.update(**changes)
+    params = plant.complete(thor).update(**changes)
     rng = np.random.default_rng(5)
     u = rng.normal(size=(80, 1)) * 3
     x0 = {state: 1e-3 * rng.normal() for state in plant.states}
+    if name == "every part":
+        x0 |= {"q": 1e-4, "s": 1e-6}  # a millimetre in its hardening spring would be 10^8 N
     log = so.Log.from_arrays(time=np.arange(80) / RATE, I=u[:, 0])
     run = so.simulate(plant, params, log, initial_state=x0, hold=hold)
     expected = reference(plant, params, u, list(x0.values()), hold)
@@ -67,17 +79,20 @@ def test_simulation_is_dop853s(name, hold, thor):
         np.testing.assert_allclose(run[output], expected[:, column], atol=1e-6 * scale, rtol=0)
 
 
-@given(st.integers(0, 10_000))
-@settings(max_examples=8)
-def test_random_pendulums_are_dop853s(seed):
+@given(st.integers(0, 10_000), st.sampled_from(["stand", "swing", "two masses", "mass and pendulum, lumped", "rotary"]))
+@settings(max_examples=15)
+def test_random_plants_are_dop853s(seed, name):
     rng = np.random.default_rng(seed)
-    plant = so.plants.moving_output()
-    around = {n: v.value * 10 ** rng.uniform(-0.4, 0.4) for n, v in so.plants.thor().items() if v.value and n != "g"}
-    params = so.plants.thor().update(**{**around, "f_c": rng.uniform(0, 30), "v_s": 0.01})
+    plant = CASES[name][0]
+    defaults = plant.defaults
+    around = {n: v.value * 10 ** rng.uniform(-0.4, 0.4) for n, v in defaults.items() if v.value and n != "g"}
+    if "f_c" in defaults:
+        around |= {"f_c": rng.uniform(0, 30), "v_s": 0.01}
+    params = defaults.update(**around)
     u = rng.normal(size=(40, 1)) * 3
     log = so.Log.from_arrays(time=np.arange(40) / RATE, I=u[:, 0])
     run = so.simulate(plant, params, log)
-    expected = reference(plant, params, u, [0.0] * 4, "zero")
+    expected = reference(plant, params, u, [0.0] * len(plant.states), "zero")
     for column, output in enumerate(plant.outputs):
         scale = np.max(np.abs(expected[:, column]))
         np.testing.assert_allclose(run[output], expected[:, column], atol=1e-6 * scale, rtol=0)
@@ -233,3 +248,9 @@ def test_the_kernel_folder_is_private(tmp_path, monkeypatch):
     folder = cache_folder()
     assert folder is not None
     assert folder.stat().st_mode & 0o777 == 0o700
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "kernels").symlink_to(elsewhere)
+    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "linked"))
+    assert cache_folder() is None

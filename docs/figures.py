@@ -1,0 +1,96 @@
+"""Draw the figures of docs/plants.md: python docs/figures.py"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+import seaopt as so
+
+FOLDER = Path(__file__).resolve().parent / "figures"
+COLOURS = {"unlumped": "#0072b2", "lumped": "#d55e00"}
+F = np.geomspace(0.1, 300, 1500)
+
+
+def new(titles: list[str], ylabel: str, xlabel: str = "frequency [Hz]"):
+    figure = Figure(figsize=(8.5, 3.0), layout="constrained")
+    axes = figure.subplots(1, len(titles), squeeze=False)[0]
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set_title(title, fontsize="medium")
+        axis.set_xlabel(xlabel)
+        axis.grid(visible=True, which="both", color="#e4e4e4", linewidth=0.5)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel(ylabel)
+    return figure, axes
+
+
+def save(figure: Figure, name: str) -> None:
+    FOLDER.mkdir(exist_ok=True)
+    with rc_context({"svg.hashsalt": "seaopt", "svg.fonttype": "none"}):
+        figure.savefig(FOLDER / f"{name}.svg", metadata={"Date": None})
+
+
+def decibel(model, row: int, column: int = 0):
+    value = model(2j * np.pi * F)
+    return 20 * np.log10(np.maximum(np.abs(value[row, column] if value.ndim == 3 else value), 1e-9))
+
+
+def force_responses(make, name: str) -> None:
+    figure, axes = new(["F1/I", "F2/I"], "magnitude [dB re N/A]")
+    for drive, colour in COLOURS.items():
+        for spring, style in (("link1", "-"), ("link2", "--")):
+            model = make(drive=drive, spring=spring).linearize(so.plants.thor())
+            for row, axis in enumerate(axes):
+                label = f"{drive}, spring at {spring}"
+                axis.semilogx(F, decibel(model, row), color=colour, linestyle=style, linewidth=1.3, label=label)
+                axis.set_ylim(-40, 80)
+    axes[0].legend(frameon=False, fontsize="x-small", loc="lower left")
+    save(figure, name)
+
+
+def impulse() -> None:
+    figure, axes = new(["link 2 and sprung mass", "screw"], "speed [m/s]", "time [ms]")
+    time = np.arange(400) / 20e3
+    force = np.where(time < 1e-3, 1000.0, 0.0)
+    log = so.Log.from_arrays(time=time, I=np.zeros(400), Fe2=force)
+    for drive, colour in COLOURS.items():
+        plant = so.plants.two_link(link1="fixed", link2="mass", drive=drive)
+        run = so.simulate(plant, plant.defaults, log)
+        axes[0].plot(1e3 * time, run["v_2"], color=colour, label=f"{drive}: link 2")
+        axes[0].plot(1e3 * time, run["v_2"] + run["qd"], color=colour, linestyle="--", label=f"{drive}: sprung mass")
+        axes[1].plot(1e3 * time, run["qd"], color=colour, label=f"{drive}: nut along the screw")
+    for axis in axes:
+        axis.legend(frameon=False, fontsize="x-small")
+    save(figure, "two_link")
+
+
+def rotary() -> None:
+    plant = so.plants.rotary()
+    model = plant.linearize(plant.defaults)
+    figure, axes = new(["torques", "angles"], "magnitude [dB]")
+    for row, (output, axis) in enumerate(zip(plant.outputs, (axes[0], axes[1], axes[1], axes[0]), strict=True)):
+        axis.semilogx(F, decibel(model, row), linewidth=1.3, label=f"{output}/I")
+    for axis in axes:
+        axis.legend(frameon=False, fontsize="x-small")
+    save(figure, "rotary")
+
+
+def parts() -> None:
+    figure, axes = new(["F1/I on the stand with parts"], "magnitude [dB re N/A]")
+    for names in ((), ("screw_mode",), ("current_loop", "load_cell"), ("screw_mode", "current_loop", "load_cell")):
+        plant = so.plants.high_impedance(parts=names)
+        model = plant.linearize(plant.defaults)
+        axes[0].semilogx(F, decibel(model, 0), linewidth=1.3, label=", ".join(names) or "none")
+    axes[0].legend(frameon=False, fontsize="x-small")
+    save(figure, "parts")
+
+
+if __name__ == "__main__":
+    force_responses(so.plants.high_impedance, "high_impedance")
+    force_responses(so.plants.moving_output, "moving_output")
+    impulse()
+    rotary()
+    parts()

@@ -1,0 +1,45 @@
+"""What the documentation shows is what works."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+import seaopt as so
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+def blocks(name, language):
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / name).read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log):
+    (text,) = blocks("problem_file.md", "toml")
+    path = tmp_path / "problem.toml"
+    path.write_text(text, encoding="utf-8")
+    late = so.simulate(stand, thor, short_log, delay_s=1.2e-3)
+    noise = 2 * np.random.default_rng(0).normal(size=(2, len(late)))
+    rows = zip(late.time, late["I"], late["F1"] + noise[0], late["F2"] + noise[1], strict=True)
+    lines = ["time [s],cur,F1 [N],F2 [N]", *(f"{t:.6f},{1e3 * i:.9g},{a:.9g},{b:.9g}" for t, i, a, b in rows)]
+    (tmp_path / "chirp.csv").write_text("\n".join(lines), encoding="utf-8")
+    problem = so.read_problem(path)
+    fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
+    assert fit.status == "converged"
+    assert abs(fit.nuisance["chirp"].delay_s - 1.2e-3) < 1e-4
+    assert abs(fit.parameters["J"].value / thor["J"].value - 1) < 0.02
+
+
+def test_the_plant_of_the_how_to_works():
+    code = blocks("howto_own_plant.md", "python")[0]
+    space: dict = {}
+    exec(code, space)
+    assert list(space["pendulum"].states) == ["theta", "omega"]
+
+
+def test_every_figure_of_the_docs_is_there():
+    for page in DOCS.glob("*.md"):
+        for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):
+            assert (DOCS / name).exists(), name
