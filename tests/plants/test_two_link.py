@@ -87,6 +87,17 @@ def test_spring_at_link_2_sees_the_rotary_inertia_alone():
         np.testing.assert_allclose(response(plant, params, output, s), expected, rtol=1e-9)
 
 
+def test_the_lumped_mirror(thor):
+    """Lumped, spring at link 2: link 1 feels the motor force as link 2 does with the spring at link 1 (docs/plants.md)."""
+    s = 1j * FREQUENCIES
+    mirror, paper = so.plants.high_impedance("lumped", "link2"), so.plants.high_impedance("lumped", "link1")
+    f1, f2 = (response(mirror, thor, output, s) for output in ("F1", "F2"))
+    expected = printed({name: item.value for name, item in thor.items()}, s)
+    np.testing.assert_allclose(f2, expected["lumped", "F1"], rtol=1e-9)
+    np.testing.assert_allclose(f1, response(paper, thor, "F2", s), rtol=1e-9)
+    np.testing.assert_allclose(f1 / f2, 1 / expected["lumped", "F1/F2"], rtol=1e-7)
+
+
 def pendulum_model(p, drive):
     """moving_output written by hand, linear: the design's equations, not the Lagrangian of the code."""
     r = p["l"] / (2 * math.pi * p["N_p"])
