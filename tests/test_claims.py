@@ -1,8 +1,8 @@
 """Every figure that the tuner and the certificate claim, from scratch: NumPy and python-control, own hold, own delay.
 
-Only the continuous plant (as control.StateSpace), the two transfer functions' coefficients and the current per force
-are taken from seaopt. The hold is a Taylor series with squaring, the delay is z^-d, stability comes from python-control's
-feedback connection, peaks and crossings from a dense grid.
+Only the continuous plant (as control.StateSpace), the coefficients of the two transfer functions and the current per
+force are taken from seaopt. The hold is a Taylor series with squaring, the delay is z^-d, stability comes from
+python-control's feedback connection, peaks and crossings from a dense grid.
 """
 
 from __future__ import annotations
