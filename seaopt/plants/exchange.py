@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import tempfile
 import zipfile
 from pathlib import Path
@@ -71,7 +72,9 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     if ca.depends_on(ca.vertcat(plant.dynamics, plant.output), plant.t):
         raise PlantError(f"plant {plant.name} depends on time explicitly, which the export leaves out")
     target = Path(path)
-    builder = _builder(plant, params, "".join(c if c.isalnum() else "_" for c in target.stem))
+    if include is not None and not Path(include).is_dir():
+        raise PlantError(f"include = {include} is no folder; give the one with the FMI 3.0 headers")
+    builder = _builder(plant, params, "plant_" + re.sub("[^A-Za-z0-9]+", "_", plant.name).strip("_"))
     archive = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         try:
@@ -104,6 +107,10 @@ def _builder(plant: Plant, params: ParameterSet, name: str) -> Any:
         builder.eq(symbol, output)
     for parameter, value in zip(p, plant.parameter_values(params), strict=True):
         builder.set_start(parameter, value)
+    # CasADi writes no unit definitions, without which FMI allows no units: they go into the descriptions.
+    units = {**plant.states, **plant.inputs, **{name: plant.parameter_unit(name) for name in p}}
+    for signal, unit in units.items():
+        builder.set_description(signal, f"[{unit}]")
     for state in x:
         builder.set_start(state, 0.0)
         builder.set_initial(state, "exact")

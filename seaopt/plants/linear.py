@@ -44,6 +44,8 @@ def point(kind: str, names: Mapping[str, str], values: Mapping[str, float] | Non
         A name is not one of `names`.
 
     """
+    if values is not None and not isinstance(values, Mapping):
+        raise PlantError(f"{kind}s are given as a {type(values).__name__}; give a mapping of {kind} name to value")
     given = dict(values or {})
     for name in given:
         if name not in names:

@@ -48,7 +48,7 @@ class Modes:
     zeros : mapping of (output, input) to complex array
         Finite zeros of each transfer function, rad/s.
     dc_gain : mapping of (output, input) to float
-        In the output's unit over the input's; infinite or not a number where the plant integrates.
+        In the output's unit over the input's; infinite where it integrates.
 
     """
 
@@ -115,16 +115,28 @@ def modes(
                 )
             )
     pairs = [(i, j, output, source) for i, output in enumerate(plant.outputs) for j, source in enumerate(plant.inputs)]
-    singular = np.linalg.cond(a) > 1e14
     return Modes(
         poles=poles[order],
         resonances=tuple(resonances),
         zeros={(output, source): _zeros(a, b[:, j], c[i], float(d[i, j])) for i, j, output, source in pairs},
-        dc_gain={
-            (output, source): np.inf if singular else float(d[i, j] - c[i] @ np.linalg.solve(a, b[:, j]))
-            for i, j, output, source in pairs
-        },
+        dc_gain={(output, source): _static(a, b[:, j], c[i], float(d[i, j]), poles) for i, j, output, source in pairs},
     )
+
+
+def _static(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float,
+    poles: Complex[np.ndarray, " n"],
+) -> float:  # fmt: skip
+    """Return the limit of c (s - a)^-1 b + d at s = 0; a pole there may cancel in one transfer function only."""
+    if np.linalg.cond(a) < 1e14:
+        return float(d - c @ np.linalg.solve(a, b))
+    moving = np.abs(poles)[np.abs(poles) > 1e-6 * np.max(np.abs(poles), initial=0.0)]
+    slowest = float(moving.min()) if moving.size else 1.0
+    near, nearer = (float(c @ np.linalg.solve(s * np.eye(b.size) - a, b) + d) for s in (1e-3 * slowest, 1e-4 * slowest))
+    largest = max(abs(near), abs(nearer))
+    if abs(nearer) > 3.0 * abs(near):
+        return float(np.sign(nearer)) * np.inf
+    return 0.0 if abs(nearer) < 0.3 * abs(near) or largest == 0.0 else nearer
 
 
 def _zeros(

@@ -19,7 +19,10 @@ Inside the actuator (of `two_link` and its special cases):
     mass m_n at the nut: with both links fixed and a heavy rotor, a mode at
     :math:`\tfrac{1}{2\pi}\sqrt{(k + k_b)/(m_l + m_n)}`. The defaults put it at 80 Hz with a damping ratio of 0.03,
     where the paper saw one (between 70 and 80 Hz, with the actuator's length). They leave the static stiffness within
-    a tenth, which takes an m_n of 28 kg: an effective mass, much more than the screw's own.
+    a tenth, which takes an m_n of 28 kg: an effective mass, much more than the screw's own, which a load cell at link
+    2 feels too (F1/F2 falls to 0.46 at 60 Hz) and which swings along with a moving output. These figures are for the
+    unlumped drive with the spring at link 1; with the spring at link 2 the mode is at 84 Hz, and the lumped drive
+    damps it away.
 
 Around any plant:
 
@@ -66,7 +69,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "screw_mode": (
         Parameter(name="k_b", value=6.55e6, unit="N/m", min=0.0, description="axial stiffness of the screw"),
         Parameter(name="c_b", value=860.0, unit="N s/m", min=0.0, description="damping of the screw"),
-        Parameter(name="m_n", value=27.9, unit="kg", min=0.0, description="effective mass at the nut"),
+        Parameter(name="m_n", value=27.9, unit="kg", min=1e-9, description="effective mass at the nut"),
     ),
     "current_loop": (
         Parameter(name="current_loop_hz", value=500.0, unit="Hz", min=1e-6, description="current loop bandwidth"),
@@ -86,6 +89,24 @@ FORCES = ("F1", "F2")
 def parameters(parts: Sequence[str]) -> list[Parameter]:
     """Return the parameters of the parts that sit inside the actuator."""
     return [item for part in parts if part in INSIDE for item in PARTS[part]]
+
+
+def check_parts(parts: Sequence[str]) -> None:
+    """Refuse what is no part, and a part given twice.
+
+    Raises
+    ------
+    PlantError
+        As said.
+
+    """
+    if isinstance(parts, str) or not isinstance(parts, Sequence):
+        raise PlantError(f"parts = {parts!r} is not a list of names; give a list such as ['load_cell']")
+    for part in parts:
+        if part not in PARTS:
+            raise PlantError(f'part "{part}" is not known; {suggestion(str(part), PARTS)}')
+        if list(parts).count(part) > 1:
+            raise PlantError(f'part "{part}" is given twice; each part goes on once')
 
 
 def play(compression: Any, p: Any) -> Any:
@@ -149,7 +170,7 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
     plant : Plant
         The plant inside.
     parts : sequence of str
-        Of these, current_loop, load_cell, command_delay and measurement_delay are put around it; the rest is left.
+        Of current_loop, load_cell, command_delay and measurement_delay, each once.
     source : str, optional
         The input that passes current loop and command delay; the first if left out.
     outputs : sequence of str
@@ -167,9 +188,12 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
     ['q', 'qd', 'I_current_loop_1', 'F1_load_cell_1', 'F2_load_cell_1']
 
     """
+    check_parts(parts)
     for part in parts:
-        if part not in PARTS:
-            raise PlantError(f'part "{part}" is not known; {suggestion(part, PARTS)}')
+        if part in INSIDE:
+            raise PlantError(
+                f'part "{part}" sits inside a linear actuator; use two_link, high_impedance or moving_output'
+            )
     for part in ("current_loop", "command_delay", "load_cell", "measurement_delay"):
         if part not in parts:
             continue
@@ -192,11 +216,13 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
 def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
     """Return a plant with one filter on each of the named inputs or outputs."""
     law, parameter, where, order = _FILTERS[part]
+    if parameter in plant.parameters:
+        raise PlantError(f"plant {plant.name} has {part} already; each part goes on once")
     own = {signal: [f"{signal}_{part}_{i}" for i in range(1, order + 1)] for signal in signals}
     units = plant.inputs if where == "input" else plant.outputs
     added = {state: units[signal] for signal in signals for state in own[signal]}
 
-    def split(x: Any, u: Any, p: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    def split(t: Any, x: Any, u: Any, p: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Return inner inputs, inner outputs' replacement, and derivatives of the filters' states."""
         filters = law(p, parameter)
         states = {signal: ca.vertcat(*(getattr(x, name) for name in own[signal])) for signal in signals}
@@ -204,9 +230,9 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         if where == "input":
             passed = {s: ca.mtimes(filters.c, states[s]) + filters.d * inner_u[s] for s in signals}
             sources, inner_u = dict(inner_u), inner_u | passed
-            out = plant.h(0, x, SimpleNamespace(**inner_u), p)
+            out = plant.h(t, x, SimpleNamespace(**inner_u), p)
         else:
-            out = dict(plant.h(0, x, SimpleNamespace(**inner_u), p))
+            out = dict(plant.h(t, x, SimpleNamespace(**inner_u), p))
             sources = dict(out)
             out |= {s: ca.mtimes(filters.c, states[s]) + filters.d * sources[s] for s in signals}
         rates: dict[str, Any] = {}
@@ -216,11 +242,11 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         return inner_u, dict(out), rates
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        inner_u, _, rates = split(x, u, p)
+        inner_u, _, rates = split(t, x, u, p)
         return {**plant.f(t, x, SimpleNamespace(**inner_u), p), **rates}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return split(x, u, p)[1]
+        return split(t, x, u, p)[1]
 
     return Plant(
         name=f"{plant.name} with {part}",

@@ -216,9 +216,23 @@ def _called(plant: Plant, what: str, equations: Equations, *arguments: Any) -> M
         raise PlantError(
             f'plant {plant.name}: {what} uses "{error.name}"; {suggestion(str(error.name), vars(error.obj))}'
         ) from error
+    except (TypeError, RuntimeError, NotImplementedError) as error:
+        reason = str(error).strip().splitlines()[-1][:160]
+        raise PlantError(
+            f"plant {plant.name}: {what} cannot be made symbolic ({reason}); "
+            "use CasADi's functions, and ca.if_else for a branch"
+        ) from error
 
 
 def _check_names(plant: Plant) -> None:
+    for group in ("states", "inputs", "outputs", "parameters"):
+        if not isinstance(getattr(plant, group), Mapping):
+            raise PlantError(f"plant {plant.name}: {group} is no mapping; give {{name: unit}}")
+        for name, item in getattr(plant, group).items():
+            if not isinstance(item, str | Parameter):
+                raise PlantError(
+                    f'plant {plant.name}: "{name}" in {group} has no unit; give one, "-" for a pure number'
+                )
     seen: dict[str, str] = {}
     for group in ("states", "inputs", "parameters"):
         for name in getattr(plant, group):
@@ -266,13 +280,24 @@ _COMMON_UNITS = frozenset(
 
 def _stack(plant: Plant, what: str, equations: Mapping[str, Any], names: Mapping[str, str]) -> Any:
     """Return the expressions in the order of `names`, refusing missing and unknown ones."""
+    if not isinstance(equations, Mapping):
+        raise PlantError(f"plant {plant.name}: {what} returns a {type(equations).__name__}; give {{name: expression}}")
     for name in equations:
         if name not in names:
             raise PlantError(f'plant {plant.name}: {what} returns "{name}"; {suggestion(name, names)}')
     for name in names:
         if name not in equations:
             raise PlantError(f'plant {plant.name}: {what} returns nothing for "{name}"; add its equation')
-    return ca.vertcat(*(ca.SX(equations[name]) for name in names)) if names else ca.SX(0, 1)
+    rows: list[Any] = []
+    for name in names:
+        try:
+            row = ca.SX(equations[name])
+        except (TypeError, NotImplementedError) as error:
+            raise PlantError(f'plant {plant.name}: {what} gives no expression for "{name}"') from error
+        if not row.is_scalar():
+            raise PlantError(f'plant {plant.name}: {what} gives "{name}" the shape {row.shape}; give one expression')
+        rows.append(row)
+    return ca.vertcat(*rows) if rows else ca.SX(0, 1)
 
 
 def _check_structure(plant: Plant) -> None:
@@ -282,7 +307,10 @@ def _check_structure(plant: Plant) -> None:
         if not ca.depends_on(plant.output[index], moved_by):
             raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
     for index, name in enumerate(plant.states):
-        if not ca.depends_on(plant.dynamics[index], moved_by):
+        others = ca.vertcat(plant.t, *(x for k, x in enumerate(ca.vertsplit(plant.x)) if k != index), plant.u)
+        free = not plant.inputs  # a plant without inputs may decay by itself
+        if not ca.depends_on(plant.dynamics[index], moved_by if free else others):
             raise PlantError(
-                f'plant {plant.name}: state "{name}" is driven by nothing; check f, or make it a parameter'
+                f'plant {plant.name}: state "{name}" is driven by nothing, no input, no other state; '
+                "check f, or make it a parameter"
             )

@@ -13,13 +13,13 @@ from seaopt.plants.parts import Part, wrapped
 from seaopt.plants.plant import Plant
 
 _PARAMETERS = (
-    Parameter(name="J_m", value=1e-4, unit="kg m^2", min=0.0, description="motor inertia"),
+    Parameter(name="J_m", value=1e-4, unit="kg m^2", min=1e-15, description="motor inertia"),
     Parameter(name="b_r", value=1e-4, unit="N m s", min=0.0, description="motor damping"),
     Parameter(name="K_tau", value=0.05, unit="N m/A", min=0.0, description="motor torque constant"),
-    Parameter(name="N", value=50.0, unit="-", min=0.0, description="gear ratio"),
+    Parameter(name="N", value=50.0, unit="-", min=1e-9, description="gear ratio"),
     Parameter(name="k_s", value=300.0, unit="N m/rad", min=0.0, description="spring stiffness"),
     Parameter(name="c_s", value=0.0, unit="N m s/rad", min=0.0, description="spring damping"),
-    Parameter(name="J_l", value=0.1, unit="kg m^2", min=0.0, description="link inertia"),
+    Parameter(name="J_l", value=0.1, unit="kg m^2", min=1e-15, description="link inertia"),
     Parameter(name="d_l", value=0.0, unit="N m s/rad", min=0.0, description="link damping"),
 )
 

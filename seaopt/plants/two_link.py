@@ -44,10 +44,10 @@ from typing import Any, Literal
 
 import casadi as ca
 
-from seaopt.errors import PlantError, suggestion
+from seaopt.errors import PlantError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import parts as part_laws
-from seaopt.plants.parts import PARTS, Part
+from seaopt.plants.parts import Part
 from seaopt.plants.plant import Plant
 
 Drive = Literal["unlumped", "lumped"]
@@ -57,8 +57,8 @@ Link = Literal["fixed", "mass", "pendulum"]
 _ACTUATOR = (
     Parameter(name="m_l", value=0.646, unit="kg", min=0.0, description="translational sprung mass"),
     Parameter(name="k", value=655e3, unit="N/m", min=0.0, description="spring stiffness"),
-    Parameter(name="l", value=0.002, unit="m", min=0.0, description="ball-screw lead"),
-    Parameter(name="N_p", value=3.0, unit="-", min=0.0, description="pulley reduction"),
+    Parameter(name="l", value=0.002, unit="m", min=1e-9, description="ball-screw lead"),
+    Parameter(name="N_p", value=3.0, unit="-", min=1e-9, description="pulley reduction"),
     Parameter(name="K_tau", value=0.0255, unit="N m/A", min=0.0, description="motor torque constant"),
     Parameter(name="J", value=3.31e-6, unit="kg m^2", min=0.0, description="motor and transmission inertia"),
     Parameter(name="b_r", value=1.31e-4, unit="N m s", min=0.0, description="rotary viscous damping"),
@@ -67,7 +67,7 @@ _ACTUATOR = (
     Parameter(name="v_s", value=1e-3, unit="m/s", min=1e-9, description="smoothing speed of f_c"),
 )
 _PENDULUM = (
-    Parameter(name="I_p", value=0.36, unit="kg m^2", min=0.0, description="inertia about the pivot"),
+    Parameter(name="I_p", value=0.36, unit="kg m^2", min=1e-9, description="inertia about the pivot"),
     Parameter(name="m", value=4.0, unit="kg", min=0.0, description="pendulum mass"),
     Parameter(name="L", value=0.3, unit="m", min=0.0, description="centre of mass to pivot"),
     Parameter(name="L_a", value=0.0725, unit="m", min=0.0, description="lever arm"),
@@ -84,7 +84,7 @@ def all_parameters() -> list[Parameter]:
 
 
 def _link_mass(number: int) -> Parameter:
-    return Parameter(name=f"m_{number}", value=10.0, unit="kg", min=0.0, description=f"mass of link {number}")
+    return Parameter(name=f"m_{number}", value=10.0, unit="kg", min=1e-9, description=f"mass of link {number}")
 
 
 def thor() -> ParameterSet:
@@ -109,16 +109,20 @@ def _drive_figures(p: Any) -> tuple[Any, Any, Any]:
     return r, p.J / r**2, p.b_r / r**2
 
 
-def derived_figures(p: Any) -> dict[str, tuple[Any, str]]:
-    """Return r (2), m_k (1), b_m (4) and the natural frequency and damping ratio of (13), with units."""
+def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[Any, str]]:
+    """Return r (2), m_k (1), b_m (4), and the natural frequency and damping ratio with both links fixed (13).
+
+    Where the housing rides on link 1 (unlumped, spring at link 2), only M = J/r^2 swings then, not m_k.
+    """
     r, rotary, b_m = _drive_figures(p)
     m_k = p.m_l + rotary
+    swinging = rotary if housing_rides else m_k
     return {
         "r": (r, "m"),
         "m_k": (m_k, "kg"),
         "b_m": (b_m, "N s/m"),
-        "natural_frequency_hz": (ca.sqrt(p.k / m_k) / (2 * math.pi), "Hz"),
-        "damping_ratio": (b_m / (2 * ca.sqrt(p.k * m_k)), "-"),
+        "natural_frequency_hz": (ca.sqrt(p.k / swinging) / (2 * math.pi), "Hz"),
+        "damping_ratio": (b_m / (2 * ca.sqrt(p.k * swinging)), "-"),
     }
 
 
@@ -233,6 +237,11 @@ def _pendulum_parameters(suffix: str) -> list[Parameter]:
     return [replace(item, name=f"{item.name}{suffix}") for item in _PENDULUM]
 
 
+def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
+    part_laws.check_parts(parts)
+    return tuple(parts)
+
+
 def _checked(build: _Build) -> _Build:
     for what, given, known in (
         ("drive", build.drive, ("unlumped", "lumped")),
@@ -242,9 +251,7 @@ def _checked(build: _Build) -> _Build:
     ):
         if given not in known:
             raise PlantError(f'{what} = "{given}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
-    for part in build.parts:
-        if part not in PARTS:
-            raise PlantError(f'part "{part}" is not known; {suggestion(str(part), PARTS)}')
+    part_laws.check_parts(build.parts)
     return build
 
 
@@ -286,10 +293,10 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         parameters={item.name: item for item in parameters},
         f=f,
         h=h,
-        derived=derived_figures,
-        optional_inputs=frozenset({"Fe1", "Fe2"}) if external else frozenset(),
+        derived=lambda p: derived_figures(p, housing_rides=build.drive == "unlumped" and build.spring == "link2"),
+        optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
     )
-    return part_laws.wrapped(plant, build.parts)
+    return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])
 
 
 def two_link(
@@ -317,7 +324,8 @@ def two_link(
     -------
     Plant
         Inputs I (A) and the external forces Fe1, Fe2 (N, positive along x; on a fixed link the ground takes them;
-        zero where a log leaves them out). Outputs F1, F2 (N), q (m), and of each moving link x_i (m) and phi (rad).
+        any of the three is zero where a log leaves it out). Outputs F1, F2 (N), q (m), and of each moving link
+        x_i (m) and phi (rad).
 
     Raises
     ------
@@ -341,7 +349,7 @@ def two_link(
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
 
     """
-    build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=tuple(parts))
+    build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=_listed(parts))
     return _actuator(f"two_link({link1}, {link2}, {drive})", build, external=True)
 
 
@@ -375,7 +383,7 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
     True
 
     """
-    build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=tuple(parts))
+    build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=_listed(parts))
     return _actuator(f"high_impedance({drive})", build, external=False)
 
 
@@ -403,5 +411,5 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Se
     ['F1', 'F2', 'q', 'phi', 'x_2']
 
     """
-    build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=tuple(parts))
+    build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=_listed(parts))
     return _actuator(f"moving_output({drive})", build, external=False)

@@ -31,6 +31,11 @@ def input_samples(plant: Plant, log: Log) -> Float[np.ndarray, "n nu"]:
 
     """
     columns: list[Float[np.ndarray, " n"]] = []
+    if plant.inputs and not any(name in log.signals for name in plant.inputs):
+        raise LogError(
+            f'{log.source}: has no channel for any input of {plant.name}, no channel "{next(iter(plant.inputs))}"; '
+            f"{suggestion(next(iter(plant.inputs)), log.signals)}"
+        )
     for name in plant.inputs:
         if name not in log.signals and name in plant.optional_inputs:
             columns.append(np.zeros(len(log)))

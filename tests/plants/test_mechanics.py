@@ -337,6 +337,25 @@ def test_unknown_parts_are_refused(stand):
         wrapped(stand, ["current_loop"], source="V")
 
 
+def test_wrapping_keeps_time():
+    plant = so.Plant(
+        name="clock", states={"v": "m/s"}, inputs={"u": "N"}, outputs={"w": "m/s"}, parameters={"a": "1/s"},
+        f=lambda t, x, u, p: {"v": u.u - p.a * x.v + t}, h=lambda t, x, u, p: {"w": x.v + 5 * t},
+    )  # fmt: skip
+    dressed = wrapped(plant, ["load_cell"], outputs=("w",))
+    assert ca.depends_on(dressed.dynamics[1], dressed.t)
+
+
+def test_parts_that_do_not_belong_are_refused(stand):
+    for words, attempt in (
+        ("sits inside", lambda: so.plants.rotary(parts=("stribeck",))),
+        ("given twice", lambda: so.plants.high_impedance(parts=("load_cell", "load_cell"))),
+        ("already", lambda: wrapped(wrapped(stand, ["load_cell"]), ["load_cell"])),
+    ):
+        with pytest.raises(PlantError, match=words):
+            attempt()
+
+
 def test_installed_packages_add_kinds(monkeypatch):
     import seaopt.plants.kinds as kinds
 
