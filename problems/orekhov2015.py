@@ -226,9 +226,7 @@ def main() -> None:
     given = ("m_l", "k", "l", "N_p", "K_tau", "L_a", "L", "m")
     thor = so.plants.thor()
     print("taken as printed: " + ", ".join(f"{name} = {thor[name].value:g} {thor[name].unit}" for name in given))
-    print(
-        "and the experiments: 164 s at 400 Hz, chirp 0.01 to 150 Hz, noise up to 150 Hz; THOR's motor of 100 W, 3:1 belt"
-    )
+    print("and the experiments: 164 s at 400 Hz, chirp 0.01 to 150 Hz, noise up to 150 Hz; a 100 W motor, 3:1 belt")
     per_ampere = so.plants.high_impedance().linearize(thor).dcgain()[0, 0]
     print(
         f"data, not modelled: 685 N continuous ({685 / per_ampere:.2f} A), 2225 N peak ({2225 / per_ampere:.2f} A), "
