@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from seaopt.robustness import Certificate, certify
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
+SCHEMAS = {"fit": "seaopt/fit/1", "tune": "seaopt/controller/1", "certify": "seaopt/robustness/1"}
 FILES = {"fit": "fit.json", "tune": "controller.json", "certify": "robustness.json"}
 LABELS = {
     "simulate": "simulating",
@@ -111,11 +113,7 @@ class Session:
     def parameters(self) -> Fit | ParameterSet:
         """Return the fit of this run or of the folder; the file's own values if it has no experiments."""
         if "fit" not in self.results and self.problem.table.experiment:
-            path = self.folder / "fit.json"
-            if not path.exists():
-                raise ProblemError(f"{path}: no such file; run seaopt fit {self.problem.source} -o {self.folder} first")
-            content = self._read(path, "seaopt/fit/1", "fit")
-            self.results["fit"] = Fit.from_dict(content, ())
+            self.results["fit"] = Fit.from_dict(self._read("fit"))
         return self.results.get("fit", self.problem.parameters)
 
     def values(self) -> ParameterSet:
@@ -128,30 +126,25 @@ class Session:
     def controller(self) -> Controller:
         """Return the controller of this run or of the folder."""
         if "tune" not in self.results:
-            path = self.folder / "controller.json"
-            if not path.exists():
-                raise ProblemError(
-                    f"{path}: no such file; run seaopt tune {self.problem.source} -o {self.folder} first"
-                )
-            content = self._read(path, "seaopt/controller/1", "tune")
-            self.results["tune"] = Controller.from_dict(content, self.problem.design_plant, self.values())
+            self.results["tune"] = Controller.from_dict(self._read("tune"), self.problem.design_plant, self.values())
         return self.results["tune"]
 
     def _write(self, stage: str, content: dict[str, Any]) -> None:
         """Write a result with the digest of what it was made from."""
         self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": self._made_from(stage)}))
 
-    def _read(self, path: Path, schema: str, stage: str) -> dict[str, Any]:
+    def _read(self, stage: str) -> dict[str, Any]:
         """Read an earlier stage's result; one made from something else than what is there now is refused.
 
         A file that does not say what it was made from (written by hand) is taken as it is.
         """
-        content = read_json(path, schema)
-        if content.get("made_from", self._made_from(stage)) != self._made_from(stage):
-            raise ProblemError(
-                f"{path}: was made from another problem file or earlier result; "
-                f"run seaopt {stage} {self.problem.source} -o {self.folder} again"
-            )
+        path, again = self.folder / FILES[stage], f"run seaopt {stage} {self.problem.source} -o {self.folder}"
+        if not path.exists():
+            raise ProblemError(f"{path}: no such file; {again} first")
+        content = read_json(path, SCHEMAS[stage])
+        made_from = self._made_from(stage)
+        if content.get("made_from", made_from) != made_from:
+            raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         return content
 
     def _made_from(self, stage: str) -> str:
@@ -236,20 +229,15 @@ class Session:
         if self.problem.table.experiment:
             found = self.parameters()
             if isinstance(found, Fit) and not found.experiments:
-                path = self.folder / "fit.json"
-                content = self._read(path, "seaopt/fit/1", "fit")
-                self.results["fit"] = found = Fit.from_dict(content, self.experiments())
+                self.results["fit"] = found = replace(found, experiments=self.experiments())
             results.append(found)
-        if self.problem.spec is not None and ("tune" in self.results or (self.folder / "controller.json").exists()):
+        if self.problem.spec is not None and ("tune" in self.results or (self.folder / FILES["tune"]).exists()):
             results.append(self.controller())
-            path = self.folder / "robustness.json"
-            if "certify" not in self.results and path.exists():
+            if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
+                plants = self.problem.certified_plants()
                 self.results["certify"] = Certificate.from_dict(
-                    self._read(path, "seaopt/robustness/1", "certify"),
-                    self.controller(),
-                    self.problem.certified_plants(),
-                    self.values(),
-                )  # fmt: skip
+                    self._read("certify"), self.controller(), plants, self.values()
+                )
             results += [self.results["certify"]] if "certify" in self.results else []
         tell("figures")
         page = write_report(results, self.folder / "report.html", title=self.problem.title)

@@ -113,9 +113,9 @@ def tune(
     task = _task(plant, params, spec, robust_to or {})
     frequencies = _frequencies(task)
     candidates = [_polish(task, frequencies, start) for start in _scan(task, frequencies)[:STARTS]]
-    best = min(candidates, key=lambda x: _rank(task, x))
-    gains = _gains(task, best)
-    return _controller(task, gains, plant, params)
+    measured = [(x, _measured(task, x)) for x in candidates]
+    x, figures = min(measured, key=lambda found: _rank(task, *found))
+    return _controller(task, x, figures, plant, params)
 
 
 def _task(
@@ -354,24 +354,30 @@ def _measured(task: Task, x: Float[np.ndarray, " 4"]) -> list[LoopFigures]:
     return [_loop(task, x, i).figures() for i in range(len(task.plants))]
 
 
+def _used(task: Task, figures: list[LoopFigures]) -> list[tuple[str, float]]:
+    """Return each peak limit that is imposed, with the plant where it holds for all, and how much of it is used."""
+    spec, design = task.spec, figures[0]
+    peaks = [
+        (limit, f"{limit} ({name})", value)
+        for name, item in zip(task.names, figures, strict=True)
+        for limit, value in (("max_sensitivity", item.ms), ("max_complementary", item.mt))
+    ]
+    peaks += [
+        (limit, limit, value)
+        for limit, value in (
+            ("max_reference_peak", design.reference_peak),
+            ("max_noise_gain", design.noise_gain),
+        )
+    ]
+    imposed = [(label, value, getattr(spec, limit)) for limit, label, value in peaks]
+    return [(label, value / allowed) for label, value, allowed in imposed if allowed is not None]
+
+
 def _broken(task: Task, figures: list[LoopFigures], slack: float = 1e-6) -> list[str]:
     """Return the limits that the measured figures break, with the plant that breaks them."""
     spec, design = task.spec, figures[0]
-    out: list[str] = []
-    for name, item in zip(task.names, figures, strict=True):
-        if not item.stable:
-            out.append(f"stability ({name})")
-        for limit, value in (("max_sensitivity", item.ms), ("max_complementary", item.mt)):
-            allowed = getattr(spec, limit)
-            if allowed is not None and value > allowed * (1 + slack):
-                out.append(f"{limit} ({name})")
-    for limit, value in (
-        ("max_reference_peak", design.reference_peak),
-        ("max_noise_gain", design.noise_gain),
-    ):
-        allowed = getattr(spec, limit)
-        if allowed is not None and value > allowed * (1 + slack):
-            out.append(limit)
+    out = [f"stability ({name})" for name, item in zip(task.names, figures, strict=True) if not item.stable]
+    out += [label for label, used in _used(task, figures) if used > 1 + slack]
     reached = design.bandwidth_hz
     if reached is None or abs(reached / spec.bandwidth_hz - 1) > BANDWIDTH_TOLERANCE:
         out.append("bandwidth_hz")
@@ -382,22 +388,9 @@ def _broken(task: Task, figures: list[LoopFigures], slack: float = 1e-6) -> list
 
 def _active(task: Task, figures: list[LoopFigures]) -> list[str]:
     """Return the limits that are met with no more than the reserve and a hundredth to spare."""
-    spec, near = task.spec, 1.0 - task.spec.reserve - 0.01
-    out: list[str] = []
-    for name, item in zip(task.names, figures, strict=True):
-        for limit, value in (("max_sensitivity", item.ms), ("max_complementary", item.mt)):
-            allowed = getattr(spec, limit)
-            if allowed is not None and value > near * allowed:
-                out.append(f"{limit} ({name})")
-    design = figures[0]
-    for limit, value in (
-        ("max_reference_peak", design.reference_peak),
-        ("max_noise_gain", design.noise_gain),
-    ):
-        allowed = getattr(spec, limit)
-        if allowed is not None and value > near * allowed:
-            out.append(limit)
-    if design.sensitivity_bandwidth_hz < 1.01 * spec.sensitivity_bandwidth_limit_hz:
+    near = 1.0 - task.spec.reserve - 0.01
+    out = [label for label, used in _used(task, figures) if used > near]
+    if figures[0].sensitivity_bandwidth_hz < 1.01 * task.spec.sensitivity_bandwidth_limit_hz:
         out.append("min_sensitivity_bandwidth_hz")
     return out
 
@@ -409,9 +402,8 @@ def disturbance(loop: Loop, bandwidth_hz: float) -> float:
     return float(np.trapezoid(np.abs(s), np.log(f)))
 
 
-def _rank(task: Task, x: Float[np.ndarray, " 4"]) -> tuple[float, float]:
+def _rank(task: Task, x: Float[np.ndarray, " 4"], figures: list[LoopFigures]) -> tuple[float, float]:
     """Return what to sort candidates by: limits broken first, then the objective."""
-    figures = _measured(task, x)
     if task.spec.objective == "noise":
         value = figures[0].noise_gain
     else:
@@ -419,10 +411,10 @@ def _rank(task: Task, x: Float[np.ndarray, " 4"]) -> tuple[float, float]:
     return float(len(_broken(task, figures))), value
 
 
-def _controller(task: Task, gains: Gains, plant: Plant, params: ParameterSet) -> Controller:
-    spec = task.spec
-    x = np.array([gains.k_p, gains.k_i, gains.k_d, gains.T_f])
-    figures = _measured(task, x)
+def _controller(
+    task: Task, x: Float[np.ndarray, " 4"], figures: list[LoopFigures], plant: Plant, params: ParameterSet
+) -> Controller:
+    spec, gains = task.spec, _gains(task, x)
     broken = _broken(task, figures)
     reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
     return Controller(

@@ -157,7 +157,7 @@ def _problem(
         substeps=(1,) * len(experiments),
     )  # fmt: skip
     for e, experiment in enumerate(experiments):
-        _, settle = problem.weights(e).sections, problem.weights(e).settle
+        settle = problem.weights(e).settle
         longest = max(segment.u.shape[0] for segment in segments[e])
         if longest <= settle + 8:
             raise EstimationError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,7 @@ class Residuals:
         return replace(self, sigma=sigma)
 
 
+@lru_cache(maxsize=32)
 def band_filter(band_hz: tuple[float, float] | None, period: float) -> tuple[Float[np.ndarray, "m 5"], int]:
     """Return the sections of a Butterworth filter of order 4 for a band, and the samples it takes to settle.
 
@@ -188,5 +190,6 @@ def band_filter(band_hz: tuple[float, float] | None, period: float) -> tuple[Flo
     else:
         return none
     sections = np.ascontiguousarray(np.asarray(sos)[:, [0, 1, 2, 4, 5]])
+    sections.setflags(write=False)
     slowest = max(float(np.max(np.abs(np.roots([1.0, a1, a2])))) for a1, a2 in sections[:, 3:])
     return sections, int(np.ceil(np.log(1e-4) / np.log(slowest)))
