@@ -2,11 +2,11 @@
 
 from seaopt.simulation.discretisation import Clock, Hold, transition
 from seaopt.simulation.model import Model, linearised, make_model
-from seaopt.simulation.passes import Pass, Point, Segment, Weights
-from seaopt.simulation.run import run_pass
+from seaopt.simulation.passes import Layout, Pass, Point, RobustLoss, Segment, Weights, layout_of
+from seaopt.simulation.run import run_passes, stream
 from seaopt.simulation.simulate import simulate
 
 __all__ = [
-    "Clock", "Hold", "Model", "Pass", "Point", "Segment", "Weights", "linearised", "make_model", "run_pass",
-    "simulate", "transition",
+    "Clock", "Hold", "Layout", "Model", "Pass", "Point", "RobustLoss", "Segment", "Weights", "layout_of", "linearised",
+    "make_model", "run_passes", "simulate", "stream", "transition",
 ]  # fmt: skip

@@ -1,134 +1,268 @@
-"""The compiled pass: pass.c around CasADi's generated step, or around the exact matrices of a linear plant."""
+"""The compiled passes: pass.c around CasADi's generated step, or around the exact matrices of a linear plant."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from seaopt.simulation.compiler import load_library
 from seaopt.simulation.discretisation import transition
-from seaopt.simulation.integrator import output_function, step_function
+from seaopt.simulation.integrator import Rates, rate_functions
 from seaopt.simulation.model import Model
-from seaopt.simulation.passes import Pass, Point, Segment, Weights
+from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
-_DOUBLES = ctypes.POINTER(ctypes.c_double)
-_BYTES = ctypes.POINTER(ctypes.c_ubyte)
-
-
-class _Arguments(ctypes.Structure):
-    """seaopt_pass_args of pass.c, field by field."""
-
-    _fields_ = (
-        ("n", ctypes.c_long), ("u", _DOUBLES), ("y", _DOUBLES), ("keep", _BYTES),
-        ("lag_a", ctypes.c_long), ("lag_b", ctypes.c_long), ("model", _DOUBLES),
-        ("x0", _DOUBLES), ("offset", _DOUBLES), ("gain", _DOUBLES),
-        ("sos", _DOUBLES), ("sections", ctypes.c_long), ("settle", ctypes.c_long), ("knee", _DOUBLES),
-        ("gram", _DOUBLES), ("rho", _DOUBLES), ("count", _DOUBLES),
-        ("outputs", _DOUBLES), ("columns", _DOUBLES), ("states", _DOUBLES), ("last", _DOUBLES),
-    )  # fmt: skip
+PARALLEL = 20_000  # samples below which a second thread does not pay
+LOSSES = ("square", "huber", "soft_l1")
+THREADS = "seaopt-pass"
 
 
-def kernel_source(model: Model, delay_free: bool) -> str:
-    """Return the C source of the pass of a model."""
+def _arguments(nu: int, ny: int) -> np.dtype[Any]:
+    """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
+    pointer, whole, real = np.uint64, np.int64, np.float64
+    return np.dtype([
+        ("from", whole), ("to", whole), ("length", whole), ("u", pointer, (nu,)), ("y", pointer, (ny,)),
+        ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole), ("start", whole), ("t0", real),
+        ("tau0", real), ("dtau", real), ("model", pointer), ("correction", pointer), ("x0", pointer),
+        ("offset", pointer), ("gain", pointer), ("drift", pointer), ("sos", pointer), ("sections", whole),
+        ("loss", whole), ("knee", pointer), ("gram", pointer), ("rho", pointer), ("count", pointer),
+        ("outputs", pointer), ("columns", pointer), ("states", pointer), ("last", pointer), ("carry", pointer),
+    ])  # fmt: skip
+
+
+def _has_constant(model: Model) -> bool:
+    """Tell whether a linear model has a constant term, for some parameters."""
+    if "constant" not in model.functions:
+        both, where = ca.vertcat(model.f, model.h), ca.vertcat(model.x, model.u)
+        rest = ca.substitute(both, where, ca.DM.zeros(where.numel()))
+        model.functions["constant"] = not ca.simplify(rest).is_zero()
+    return bool(model.functions["constant"])
+
+
+def _delayed(model: Model, point: Point) -> bool:
+    """Tell whether the code must know of a delay: the older input of a linear plant matters, or the delay is free."""
+    older = point.clock.fraction_s > 0.0 or point.clock.hold == "first"
+    return point.clock.delay_free or (model.linear and older)
+
+
+def kernel_source(model: Model, layout: Layout, delayed: bool) -> str:
+    """Return the C source of the passes of a model."""
     constants = {
-        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": model.np + delay_free, "NQ": model.np,
-        "NA": model.p.numel(),
-        "LINEAR": int(model.linear),
+        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": layout.shared, "NQ": model.np, "ND": layout.drift_terms,
+        "LINEAR": int(model.linear), "CORRECT": int(layout.corrected), "DELAYED": int(delayed),
     }  # fmt: skip
     generated = ""
-    if not model.linear:
-        step, output = step_function(model), output_function(model)
+    if model.linear:
+        constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
+    else:
+        rates = rate_functions(model)
+        both = (rates.rate, rates.output)
         constants |= {
-            "SZ_W": max(step.sz_w(), output.sz_w()),
-            "SZ_ARG": max(step.sz_arg(), output.sz_arg()),
-            "SZ_RES": max(step.sz_res(), output.sz_res()),
-        }
-        generator = ca.CodeGenerator("kernel")
-        generator.add(step)
-        generator.add(output)
-        generated = _inlined(generator.dump())
+            "SZ_W": max(f.sz_w() for f in both), "SZ_ARG": max(f.sz_arg() for f in both),
+            "SZ_RES": max(f.sz_res() for f in both),
+        }  # fmt: skip
+        patterns = (*rates.rate_pattern, *rates.output_pattern)
+        constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
+        chains = (_chain("rate", rates.rate_pattern, model.nx), _chain("output", rates.output_pattern, model.ny))
+        generated = "\n".join((_generated(rates), *chains))
     defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
-    body = files("seaopt.simulation").joinpath("pass.c").read_text(encoding="utf-8")
-    return f"{defines}{generated}\n{body}"
+    return "\n".join((defines, _text("layout.h"), generated, _text("pass.c")))
 
 
-def _inlined(source: str) -> str:
-    """Return CasADi's generated code with its two functions made static, for the compiler to inline."""
-    return re.sub(r"CASADI_SYMBOL_EXPORT int (seaopt_(?:step|output))\(", r"static inline int \1(", source)
+@lru_cache(maxsize=2)
+def _text(name: str) -> str:
+    return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
 
 
-def kernel(model: Model, delay_free: bool) -> Any:
-    """Return the compiled function of a model's pass, or None where there is no compiler."""
-    key = f"kernel{int(delay_free)}"
+def _generated(rates: Rates) -> str:
+    """Return CasADi's code of rate and output, made static for the compiler to inline."""
+    generator = ca.CodeGenerator("kernel")
+    generator.add(rates.rate)
+    generator.add(rates.output)
+    return re.sub(r"CASADI_SYMBOL_EXPORT int (seaopt_(?:rate|output))\(", r"static inline int \1(", generator.dump())
+
+
+def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
+    """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives a row."""
+    a, b = pattern
+    lines = [f"static inline void seaopt_{name}_chain(const double *a, const double *b, const double (*restrict z)[NJP],",
+             "        double (*restrict out)[NJP]) {"]  # fmt: skip
+    for row in range(rows):
+        terms = " + ".join(f"a[{k}] * z[{j}][j]" for k, (i, j) in enumerate(a) if i == row) or "0.0"
+        lines.append(f"    for (int j = 0; j < NJP; j++) out[{row}][j] = {terms};")
+        lines += [f"    out[{row}][{1 + j}] += b[{k}];" for k, (i, j) in enumerate(b) if i == row]
+    return "\n".join([*lines, "}"])
+
+
+def kernel(model: Model, layout: Layout, delayed: bool) -> Any:
+    """Return the compiled library of a model's passes, or None where there is no compiler."""
+    key = f"kernel {layout} {delayed}"
     if key not in model.functions:
-        library = load_library(kernel_source(model, delay_free))
-        function = library.seaopt_pass if library else None
-        if function is not None:
-            function.argtypes, function.restype = [ctypes.POINTER(_Arguments)], ctypes.c_int
-        model.functions[key] = function
+        library = load_library(kernel_source(model, layout, delayed))
+        if library is not None:
+            library.seaopt_passes.argtypes, library.seaopt_passes.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
+            library.carry_size.restype = ctypes.c_long
+        model.functions[key] = library
     return model.functions[key]
 
 
-def _settings(model: Model, point: Point, segment: Segment) -> Float[np.ndarray, " m"]:
+def _padded(count: int) -> int:
+    return (count + 3) // 4 * 4
+
+
+def _linear_data(model: Model, point: Point, layout: Layout, delayed: bool) -> Float[np.ndarray, " m"]:
+    """Return A and D of pass.c: rows of [x+; y], then their derivatives as forcing, derivatives last."""
+    blocks = transition(model, point.theta, point.clock)
+    nx, nu, rows = model.nx, model.nu, model.nx + model.ny
+    used = [*range(nx + nu * (1 + delayed))] + ([nx + 2 * nu] if _has_constant(model) else [])
+    d = np.zeros((rows, len(used), _padded(layout.states)))
+    d[:, :, : blocks.shape[0]] = blocks[:, :, used].transpose(1, 2, 0)
+    d[:, :nx, 0] = 0.0  # the state itself goes through A
+    return np.concatenate([blocks[0, :, :nx].ravel(), d.ravel()])
+
+
+def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     clock = point.clock
-    if model.linear:
-        return transition(model, point.theta, clock).ravel()
     foh = float(clock.hold == "first")
-    return np.array(
-        [*model.parameters(point.theta), point.substeps, clock.period, clock.fraction_s, foh, segment.start_s]
-    )
+    constants = np.array(rate_functions(model).prepare(model.parameters(point.theta))).ravel()
+    return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
 
 
-def compiled_pass(
-    model: Model,
-    segment: Segment,
-    point: Point,
-    weights: Weights,
-    *,
-    outputs: bool,
-    columns: bool,
-    states: bool,
-) -> Pass | None:
-    """Run the compiled pass; None where there is no compiler."""
-    clock = point.clock
-    function = kernel(model, clock.delay_free)
-    if function is None:
-        return None
-    n, ny, nx = segment.u.shape[0], model.ny, model.nx
-    nc = model.np + clock.delay_free + nx + 3
-    keep_alive: list[Any] = []
+class _Memory:
+    """Keeps arrays alive while their addresses are in use."""
 
-    def doubles(array: Any) -> Any:
+    def __init__(self) -> None:
+        self.arrays: list[Any] = []
+
+    def address(self, array: Any) -> int:
         if array is None:
-            return None
-        flat = np.ascontiguousarray(array, dtype=float)
-        keep_alive.append(flat)
-        return flat.ctypes.data_as(_DOUBLES)
+            return 0
+        self.arrays.append(array)
+        return int(array.ctypes.data)
 
-    result = Pass(
-        gram=np.zeros((ny, nc, nc)),
-        loss=np.zeros(ny),
-        count=np.zeros(ny),
-        outputs=np.empty((n, ny)) if outputs else None,
-        columns=np.empty((n, ny, nc)) if columns else None,
-        states=np.empty((n, nx)) if states else None,
-        last=np.empty(nx),
-    )
-    keep = None if segment.keep is None else np.ascontiguousarray(segment.keep)
-    arguments = _Arguments(
-        n=n, u=doubles(segment.u), y=doubles(segment.y), keep=None if keep is None else keep.ctypes.data_as(_BYTES),
-        lag_a=clock.lags[0], lag_b=clock.lags[1], model=doubles(_settings(model, point, segment)),
-        x0=doubles(point.x0), offset=doubles(point.offset), gain=doubles(point.gain),
-        sos=doubles(weights.sections), sections=len(weights.sections), settle=weights.settle,
-        knee=doubles(weights.knee), gram=doubles(result.gram), rho=doubles(result.loss), count=doubles(result.count),
-        outputs=doubles(result.outputs), columns=doubles(result.columns), states=doubles(result.states),
-        last=doubles(result.last),
-    )  # fmt: skip
-    function(ctypes.byref(arguments))
-    return result
+    def constant(self, array: Any) -> int:
+        return self.address(np.ascontiguousarray(array, dtype=float))
+
+
+class Program:
+    """The passes of one segment at one point, ready to run.
+
+    Raises nothing: `make` returns None where there is no compiler.
+    """
+
+    def __init__(self, model: Model, segment: Segment, point: Point, weights: Weights, library: Any) -> None:
+        self.model, self.segment, self.library = model, segment, library
+        self.layout = layout_of(model.nx, model.ny, model.np, point)
+        self.memory = memory = _Memory()
+        data = _linear_data(model, point, self.layout, _delayed(model, point)) if model.linear else _settings(model, point)
+        ny = model.ny
+        base = np.zeros(1, dtype=_arguments(model.nu, ny))
+        base["length"] = segment.n
+        base["u"] = [memory.constant(channel) for channel in segment.u]
+        base["y"] = [memory.constant(channel) for channel in segment.y] if segment.y else 0
+        base["keep"] = [memory.address(np.ascontiguousarray(mask)) for mask in segment.keep] if segment.keep else 0
+        base["lag_a"], base["lag_b"] = point.clock.lags
+        base["settle"], base["t0"] = weights.settle, segment.start_s
+        base["tau0"], base["dtau"] = segment.drift_span
+        base["model"] = memory.constant(data)
+        base["correction"] = self._correction(point)
+        base["offset"], base["gain"] = memory.constant(point.offset), memory.constant(point.gain)
+        base["drift"] = memory.constant(point.drift)
+        base["sos"], base["sections"] = memory.constant(weights.sections), len(weights.sections)
+        base["loss"], base["knee"] = LOSSES.index(weights.loss), memory.constant(weights.knee)
+        self.base = base
+
+    @classmethod
+    def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
+        """Return the program, or None where there is no compiler."""
+        library = kernel(model, layout_of(model.nx, model.ny, model.np, point), _delayed(model, point))
+        return None if library is None else cls(model, segment, point, weights, library)
+
+    def _correction(self, point: Point) -> int:
+        if point.correction is None:
+            return 0
+        padded = np.zeros((self.model.nx, self.model.ny, _padded(self.layout.states)))
+        padded[:, :, : point.correction.shape[0]] = point.correction.transpose(1, 2, 0)
+        return self.memory.constant(padded)
+
+    def run(
+        self,
+        edges: Int[np.ndarray, " shots1"],
+        x0: Float[np.ndarray, "shots nx"],
+        *,
+        outputs: bool = False,
+        columns: bool = False,
+        states: bool = False,
+        resume: Float[np.ndarray, " m"] | None = None,
+    ) -> Pass:
+        """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped."""
+        shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
+        n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
+        result = Pass(
+            gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
+            last=np.zeros((shots, nx, layout.states)),
+            outputs=np.empty((n, ny)) if outputs else None,
+            columns=np.empty((n, ny, nc)) if columns else None,
+            states=np.empty((n, nx)) if states else None,
+        )  # fmt: skip
+        start = np.ascontiguousarray(x0, dtype=float)
+        arguments = np.repeat(self.base, shots)
+        arguments["from"], arguments["to"] = edges[:-1], edges[1:]
+        arguments["start"] = edges[:-1] if resume is None else 0
+        arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
+        for name, array in (("gram", result.gram), ("rho", result.loss), ("count", result.count), ("last", result.last)):
+            arguments[name] = array.ctypes.data + array.strides[0] * np.arange(shots)
+        for name, array in (("outputs", outputs), ("columns", columns), ("states", states)):
+            if array:
+                kept = getattr(result, name)
+                arguments[name] = kept.ctypes.data + kept.strides[0] * (edges[:-1] - first)
+        if resume is not None:
+            arguments["carry"] = resume.ctypes.data
+        self._call(arguments, n)
+        return result
+
+    def carry(self) -> Float[np.ndarray, " m"]:
+        """Return room for what a stretch hands from one call to the next."""
+        return np.zeros(int(self.library.carry_size()))
+
+    def _call(self, arguments: Any, n: int) -> None:
+        """Run the shots, in threads where there are enough samples: ctypes lets go of the interpreter's lock."""
+        count, call = len(arguments), self.library.seaopt_passes
+        if count < 2 or n < PARALLEL or threading.current_thread().name.startswith(THREADS):
+            call(arguments.ctypes.data, count)
+            return
+        pool = threads()
+        bounds = np.linspace(0, count, workers() + 1).astype(int)
+        size = arguments.dtype.itemsize
+        jobs = [
+            pool.submit(call, arguments.ctypes.data + int(a) * size, int(b - a))
+            for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+            if b > a
+        ]
+        for job in jobs:
+            job.result()
+
+
+def workers() -> int:
+    """Return how many threads passes may use: the cores of this process, at most 8."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, 8)
+
+
+@lru_cache(maxsize=1)
+def _threads_of(process: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers(), thread_name_prefix=f"{THREADS}-{process}")
+
+
+def threads() -> ThreadPoolExecutor:
+    """Return the pool of this process, made anew after a fork."""
+    return _threads_of(os.getpid())

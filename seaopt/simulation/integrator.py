@@ -1,12 +1,18 @@
 r"""The step of a nonlinear plant: classical Runge-Kutta of order four, as a CasADi function with its derivatives.
 
 One step of length :math:`h` from :math:`x` at :math:`t`, with the input a straight line from :math:`u_0` to
-:math:`u_1` over the step; CasADi differentiates the step itself, so that the sensitivities are those of the
+:math:`u_1` over the step. `step_function` lets CasADi differentiate the step itself. `rate_functions` gives what compiled
+code needs to do the same faster: differentiating the four stages gives the same method applied to
+
+.. math:: \dot S = f_x S + f_p,
+
+so that one evaluation of :math:`f, f_x, f_p` a stage serves every derivative, and the sensitivities are again those of the
 numbers that the step computes.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -43,3 +49,53 @@ def output_function(model: Model) -> Any:
         arguments = [model.t, model.x, model.u, model.p]
         model.functions["output"] = ca.Function("seaopt_output", arguments, results)
     return model.functions["output"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rates:
+    """Right-hand side and outputs for compiled code, with what depends on parameters alone taken out.
+
+    Parameters
+    ----------
+    prepare : Function
+        p -> c, once a pass.
+    rate, output : Function
+        (t, x, u, c) -> f or h, and the nonzeros of its derivatives by x and by theta.
+    rate_pattern, output_pattern : tuple of lists of (row, column)
+        Where those nonzeros stand.
+
+    """
+
+    prepare: Any
+    rate: Any
+    output: Any
+    rate_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
+    output_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
+
+
+def rate_functions(model: Model) -> Rates:
+    """Return the functions of compiled passes."""
+    if "rates" not in model.functions:
+        parts = [part for e in (model.f, model.h) for part in (e, ca.jacobian(e, model.x), ca.jacobian(e, model.theta))]
+        dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)]
+        sizes = [part.nnz() for part in dense]
+        flat = ca.cse(ca.vertcat(*(part.nz[:] for part in dense)))
+        flat, symbols, values = ca.extract_parametric(flat, model.p, {"extract_trivial": True})
+        c, columns = ca.vertcat(*symbols), []
+        for size in sizes:
+            columns.append(flat[:size])
+            flat = flat[size:]
+        arguments, names = [model.t, model.x, model.u, c], ["seaopt_rate", "seaopt_output"]
+        rate, output = (ca.Function(names[i], arguments, columns[3 * i : 3 * i + 3]) for i in range(2))
+        prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
+        pattern = [_places(part) for part in dense]
+        model.functions["rates"] = Rates(
+            prepare=prepare, rate=rate, output=output, rate_pattern=(pattern[1], pattern[2]),
+            output_pattern=(pattern[4], pattern[5]),
+        )  # fmt: skip
+    return model.functions["rates"]
+
+
+def _places(part: Any) -> list[tuple[int, int]]:
+    rows, columns = part.sparsity().get_triplet()
+    return list(zip(rows, columns, strict=True))

@@ -11,63 +11,92 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from seaopt.simulation.discretisation import transition
 from seaopt.simulation.integrator import output_function, step_function
 from seaopt.simulation.model import Model
-from seaopt.simulation.passes import Pass, Point, Segment, Weights
+from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
 BLOCK = 32
 CHUNK = 4096
 
-Trace = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n1 nx"]]
+Trace = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n1 nx"], Float[np.ndarray, "nx nj"]]
 
 
-def interpreted_pass(
+def interpreted_passes(
     model: Model,
     segment: Segment,
     point: Point,
     weights: Weights,
+    edges: Int[np.ndarray, " shots1"],
+    x0: Float[np.ndarray, "shots nx"],
     *,
-    outputs: bool,
-    columns: bool,
-    states: bool,
+    outputs: bool = False,
+    columns: bool = False,
+    states: bool = False,
 ) -> Pass:
-    """Run the pass in NumPy and CasADi's virtual machine."""
+    """Run the shots between neighbouring `edges` in NumPy and CasADi's virtual machine."""
     held = _held_inputs(segment, point)
-    y, dy, x = _linear_trace(model, point, held) if model.linear else _nonlinear_trace(model, segment, point, held)
-    ny, nc = model.ny, dy.shape[2] + 3
-    gram, loss, count = np.zeros((ny, nc, nc)), np.zeros(ny), np.zeros(ny)
-    v = None
-    if segment.y is not None:
-        v, present = _columns(segment, point, weights, y, dy)
-        for o in range(ny):
-            size = np.abs(v[present[:, o], o, 0])
-            weight = np.minimum(1.0, weights.knee[o] / np.maximum(size, 1e-300))
-            inside = size <= weights.knee[o]
-            with np.errstate(invalid="ignore"):
-                tail = weights.knee[o] * (size - 0.5 * weights.knee[o])
-            rows = v[present[:, o], o]
-            gram[o] = (rows * weight[:, None]).T @ rows
-            loss[o] = float(np.sum(np.where(inside, 0.5 * size**2, tail)))
-            count[o] = float(size.size)
+    shots = [
+        _shot(model, segment, point, weights, held, (int(a), int(b)), start)
+        for a, b, start in zip(edges[:-1], edges[1:], x0, strict=True)
+    ]
+
+    def joined(name: str, wanted: bool) -> Any:
+        return np.concatenate([shot[name] for shot in shots]) if wanted else None
+
     return Pass(
-        gram=gram,
-        loss=loss,
-        count=count,
-        outputs=y if outputs else None,
-        columns=v if columns else None,
-        states=x[:-1] if states else None,
-        last=x[-1],
+        gram=np.stack([shot["gram"] for shot in shots]),
+        loss=np.stack([shot["loss"] for shot in shots]),
+        count=np.stack([shot["count"] for shot in shots]),
+        last=np.stack([shot["last"] for shot in shots]),
+        outputs=joined("outputs", outputs),
+        columns=joined("columns", columns and bool(segment.y)),
+        states=joined("states", states),
     )
+
+
+def _shot(
+    model: Model, segment: Segment, point: Point, weights: Weights, held: Float[np.ndarray, "all w"],
+    rows: tuple[int, int], x0: Float[np.ndarray, " nx"],
+) -> dict[str, Any]:  # fmt: skip
+    layout = layout_of(model.nx, model.ny, model.np, point)
+    if model.linear and point.correction is None:
+        y, dy, x, last = _linear_trace(model, point, held[rows[0] : rows[1]], x0)
+    else:
+        y, dy, x, last = _folded_trace(model, segment, point, held, rows, x0)
+    ny, nc = model.ny, layout.columns
+    found: dict[str, Any] = {"outputs": y, "states": x[:-1], "last": last}
+    found |= {"gram": np.zeros((ny, nc, nc)), "loss": np.zeros(ny), "count": np.zeros(ny)}
+    if segment.y:
+        v, present = _columns(segment, point, weights, layout, rows, y, dy)
+        found["columns"] = v
+        for o in range(ny):
+            kept = v[present[:, o], o]
+            loss, weight = _robust(kept[:, 0], weights.loss, float(weights.knee[o]))
+            found["gram"][o] = (kept * weight[:, None]).T @ kept
+            found["loss"][o], found["count"][o] = float(np.sum(loss)), float(len(kept))
+    return found
+
+
+def _robust(r: Float[np.ndarray, " n"], loss: str, knee: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the loss of each residual and the weight that makes its square's gradient the loss's."""
+    size = np.abs(r)
+    if loss == "soft_l1":
+        root = np.sqrt(1.0 + (r / knee) ** 2)
+        return knee**2 * (root - 1.0), 1.0 / root
+    if loss == "square" or not np.isfinite(knee):
+        return 0.5 * r**2, np.ones_like(r)
+    inside = size <= knee
+    return np.where(inside, 0.5 * r**2, knee * (size - 0.5 * knee)), np.where(inside, 1.0, knee / np.maximum(size, 1e-300))
 
 
 def _held_inputs(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
     """Return [u_a, u_b, 1] of every sample."""
-    n = segment.u.shape[0]
+    n, u = segment.n, np.column_stack(segment.u)
     rows = np.arange(n)
-    ua, ub = (segment.u[np.clip(rows - lag, 0, n - 1)] for lag in point.clock.lags)
+    ua, ub = (u[np.clip(rows - lag, 0, n - 1)] for lag in point.clock.lags)
     return np.hstack([ua, ub, np.ones((n, 1))])
 
 
@@ -89,13 +118,15 @@ def _augmented(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any
     return f, b, h, d
 
 
-def _linear_trace(model: Model, point: Point, held: Float[np.ndarray, "n w"]) -> Trace:
+def _linear_trace(
+    model: Model, point: Point, held: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
+) -> Trace:
     nx, ny = model.nx, model.ny
     f, b, h, d = _augmented(model, transition(model, point.theta, point.clock))
     n, width = held.shape
     nt = f.shape[0] // nx - 1
     z = np.zeros(f.shape[0])
-    z[:nx] = point.x0
+    z[:nx] = x0
     for i in range(nx):
         z[(1 + nt - nx + i) * nx + i] = 1.0
 
@@ -121,8 +152,17 @@ def _linear_trace(model: Model, point: Point, held: Float[np.ndarray, "n w"]) ->
     stacked = starts @ observe.T + inputs @ _toeplitz(impulse).T
     x = (starts @ state_rows.T + inputs @ _toeplitz(state_impulse).T).reshape(count * BLOCK, nx)
     all_outputs = stacked.reshape(count * BLOCK, nt + 1, ny)[:n]
-    last = f[:nx, :nx] @ x[n - 1] + b[:nx] @ held[-1]
-    return all_outputs[:, 0], all_outputs[:, 1:].transpose(0, 2, 1), np.vstack([x[:n], last])
+    last = _last(starts[-1], held[(count - 1) * BLOCK :], f, b).reshape(nt + 1, nx).T
+    return all_outputs[:, 0], all_outputs[:, 1:].transpose(0, 2, 1), np.vstack([x[:n], last[:, 0]]), last
+
+
+def _last(
+    z: Float[np.ndarray, " m"], held: Float[np.ndarray, "k w"], f: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m w"]
+) -> Float[np.ndarray, " m"]:
+    """Return the recursion's state after the rest of the last block."""
+    for w in held:
+        z = f @ z + b @ w
+    return z
 
 
 def _toeplitz(impulse: list[Float[np.ndarray, "a w"]]) -> Float[np.ndarray, "la lw"]:
@@ -134,81 +174,182 @@ def _toeplitz(impulse: list[Float[np.ndarray, "a w"]]) -> Float[np.ndarray, "la 
     return out
 
 
-def _fold(model: Model, point: Point) -> Any:
-    """Return the CasADi function (z, w, [p; older; newer]) -> z+ over CHUNK samples, z = [x, vec(sensitivities)].
+def _split(model: Model, w: Any) -> tuple[Any, Any, Any]:
+    """Return t, u_a, u_b of a sample's data."""
+    return w[0], w[1 : 1 + model.nu], w[1 + model.nu : 1 + 2 * model.nu]
 
-    Each column of w is [t, u_a, u_b]; older and newer are the two parts of the period that a fractional delay makes.
-    """
-    clock, steps = point.clock, point.substeps
-    split = clock.delay_free or clock.fraction_s > 0.0
-    key = f"fold {clock.hold} {clock.delay_free} {split} {steps}"
-    if key in model.functions:
-        return model.functions[key]
-    nx, nt, na = model.nx, model.np + clock.delay_free + model.nx, model.p.numel()
-    z, data = ca.MX.sym("z", nx * (1 + nt)), ca.MX.sym("data", na + 2)
-    w = ca.MX.sym("w", 1 + 2 * model.nu)
-    x, s, p = z[:nx], ca.reshape(z[nx:], nx, nt), data[:na]
-    t, ua, ub = w[0], w[1 : 1 + model.nu], w[1 + model.nu :]
-    step = step_function(model)
-    for part in (0, 1) if split else (1,):
-        h, dh = data[na + part] / steps, (-1.0 if part else 1.0) / steps
+
+def _blocks(model: Model, data: Any) -> list[Any]:
+    """Return the blocks of `transition` from its numbers."""
+    rows, width = model.nx + model.ny, model.nx + 2 * model.nu + 1
+    return [ca.reshape(part, width, rows).T for part in ca.vertsplit(data, rows * width)]
+
+
+def _advanced(model: Model, point: Point, layout: Layout, z: Any, w: Any, data: Any) -> Any:
+    """Return the state and its derivatives one sample on."""
+    clock, steps, nx = point.clock, point.substeps, model.nx
+    t, ua, ub = _split(model, w)
+    x, s = z[:, 0], z[:, 1:]
+    rest = ca.MX.zeros(nx, layout.states - 1 - model.np - clock.delay_free)
+    if model.linear:
+        blocks, v = [block[:nx, :] for block in _blocks(model, data)], ca.vertcat(x, ua, ub, 1.0)
+        forced = ca.horzcat(*(ca.mtimes(block, v) for block in blocks[1:]), rest)
+        return ca.horzcat(ca.mtimes(blocks[0], v), ca.mtimes(blocks[0][:, :nx], s) + forced)
+    step, p = step_function(model), data[:-2]
+    for part in (0, 1) if clock.delay_free or clock.fraction_s > 0.0 else (1,):
+        h, dh = data[data.numel() - 2 + part] / steps, (-1.0 if part else 1.0) / steps
         for i in range(steps):
             u0 = u1 = ua if part else ub
             if clock.hold == "first":
                 u0, u1 = ua + (ub - ua) * (i / steps), ua + (ub - ua) * ((i + 1) / steps)
             x, a, b = step(t, x, u0, u1, p, h)
             forced = [b[:, : model.np], b[:, model.np] * dh] if clock.delay_free else [b[:, : model.np]]
-            s = ca.mtimes(a, s) + ca.horzcat(*forced, ca.MX.zeros(nx, nx))
+            s = ca.mtimes(a, s) + ca.horzcat(*forced, rest)
             t = t + h
-    sample = ca.Function("sample", [z, w, data], [ca.vertcat(x, ca.vec(s))])
-    model.functions[key] = sample.mapaccum(CHUNK)
+    return ca.horzcat(x, s)
+
+
+def _observed(model: Model, point: Point, layout: Layout, z: Any, w: Any, data: Any) -> Any:
+    """Return the outputs and their derivatives."""
+    t, ua, ub = _split(model, w)
+    x, s = z[:, 0], z[:, 1:]
+    if model.linear:
+        blocks, v = [block[model.nx :, :] for block in _blocks(model, data)], ca.vertcat(x, ua, ub, 1.0)
+        y, c = ca.mtimes(blocks[0], v), blocks[0][:, : model.nx]
+        direct = [ca.mtimes(block, v) for block in blocks[1:]]
+    else:
+        y, c, d = output_function(model)(t, x, ub if point.clock.fraction_s > 0.0 else ua, data[:-2])
+        direct = [d]
+    count = sum(item.shape[1] for item in direct)
+    return ca.horzcat(y, ca.mtimes(c, s) + ca.horzcat(*direct, ca.MX.zeros(model.ny, layout.states - 1 - count)))
+
+
+def _corrected(layout: Layout, z: Any, y: Any, w: Any, known: Any) -> Any:
+    """Return what the prediction errors take off the next state and its derivatives.
+
+    w ends in [measured, present, drift basis]; known is [offset, gain, drift, correction and its derivatives].
+    """
+    nx, ny, nd = layout.nx, layout.ny, layout.drift_terms
+    measured, present, basis = ca.vertsplit(w, [0, ny, 2 * ny, 2 * ny + nd])
+    offset, gain, drift, correction = ca.vertsplit(known, [0, ny, 2 * ny, (2 + nd) * ny, known.numel()])
+    coefficients = ca.reshape(drift, nd, ny).T
+    gains = [ca.reshape(part, ny, nx).T for part in ca.vertsplit(correction, nx * ny)]
+    rows = []
+    for o in range(ny):
+        value = gain[o] * y[o, 0] + offset[o] + ca.mtimes(coefficients[o, :], basis) - measured[o]
+        own = ca.vertcat(1.0, basis, y[o, 0])
+        before = ca.MX.zeros(layout.shared + nx + o * layout.own)
+        after = ca.MX.zeros((ny - 1 - o) * layout.own)
+        derivative = gain[o] * y[o, 1:] + ca.vertcat(before, own, after).T
+        rows.append(present[o] * ca.horzcat(value, derivative))
+    v = ca.vertcat(*rows)
+    moved = ca.horzcat(*(ca.mtimes(g, v[:, 0]) for g in gains[1:]), ca.MX.zeros(nx, layout.states - len(gains)))
+    return ca.mtimes(gains[0], v) + ca.horzcat(ca.MX.zeros(nx, 1), moved)
+
+
+def _program(model: Model, point: Point, layout: Layout, sizes: tuple[int, int]) -> Any:
+    """Return the CasADi functions of CHUNK samples (Z, w, data) -> Z+ and of one (Z, w, data) -> [y, derivatives]."""
+    clock = point.clock
+    key = f"program {layout} {clock.hold} {clock.delay_free} {clock.fraction_s > 0.0} {point.substeps} {sizes}"
+    if key not in model.functions:
+        z, w = ca.MX.sym("z", model.nx, layout.states), ca.MX.sym("w", sizes[0])
+        data = ca.MX.sym("data", sizes[1])
+        plant = data[: _data(model, point).size]
+        y = _observed(model, point, layout, z, w, plant)
+        after = _advanced(model, point, layout, z, w, plant)
+        if layout.corrected:
+            after = after - _corrected(layout, z, y, w[1 + 2 * model.nu :], data[plant.numel() :])
+        sample, output = ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
+        model.functions[key] = sample.mapaccum(CHUNK), output
     return model.functions[key]
 
 
-def _nonlinear_trace(model: Model, segment: Segment, point: Point, held: Float[np.ndarray, "n w"]) -> Trace:
-    n, nx, ny, nq, clock = held.shape[0], model.nx, model.ny, model.np, point.clock
-    nt = nq + clock.delay_free + nx
-    times = segment.start_s + clock.period * np.arange(n)
-    fold, p = _fold(model, point), model.parameters(point.theta)
-    data = np.concatenate([p, [clock.fraction_s, clock.period - clock.fraction_s]])
-    z = np.concatenate([point.x0, np.hstack([np.zeros((nx, nt - nx)), np.eye(nx)]).ravel(order="F")])
-    w = np.column_stack([times, held[:, :-1]])
-    path = [z[:, None]]
+def _data(model: Model, point: Point) -> Float[np.ndarray, " m"]:
+    clock = point.clock
+    if model.linear:
+        return transition(model, point.theta, clock).ravel()
+    return np.concatenate([model.parameters(point.theta), [clock.fraction_s, clock.period - clock.fraction_s]])
+
+
+def _first(x0: Float[np.ndarray, " nx"], layout: Layout) -> Float[np.ndarray, "nx nj"]:
+    """Return the state and its derivatives at a shot's first sample."""
+    z = np.zeros((x0.size, layout.states))
+    z[:, 0] = x0
+    z[:, 1 + layout.shared : 1 + layout.shared + x0.size] = np.eye(x0.size)
+    return z
+
+
+def _fold(
+    function: Any, z: Float[np.ndarray, "nx nj"], w: Float[np.ndarray, "n w"], data: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "n1 nx nj"]:
+    """Fold a function of CHUNK samples over all; the last chunk is filled up with repeats, which are dropped."""
+    n, (nx, nj) = len(w), z.shape
+    path = np.empty((n + 1, nx, nj))
+    path[0] = z
     for start in range(0, n, CHUNK):
-        part = w[start : start + CHUNK]
-        if len(part) < CHUNK:
-            part = np.vstack([part, np.repeat(part[-1:], CHUNK - len(part), axis=0)])
-        block = np.array(fold(path[-1][:, -1], part.T, data))
-        path.append(block[:, : min(CHUNK, n - start)])
-    z_all = np.hstack(path).T
-    x = z_all[:, :nx]
-    s = z_all[:-1, nx:].reshape(n, nt, nx)  # vec() stacks columns
-    now = held[:, model.nu : 2 * model.nu] if clock.fraction_s > 0 else held[:, : model.nu]
-    key = f"outputs{n}"
+        part, count = w[start : start + CHUNK], min(CHUNK, n - start)
+        if count < CHUNK:
+            part = np.vstack([part, np.repeat(part[-1:], CHUNK - count, axis=0)])
+        block = np.array(function(path[start], part.T, data)).reshape(nx, CHUNK, nj)
+        path[start + 1 : start + 1 + count] = block.transpose(1, 0, 2)[:count]
+    return path
+
+
+def _times(segment: Segment, point: Point, rows: tuple[int, int]) -> Float[np.ndarray, " n"]:
+    return segment.start_s + point.clock.period * np.arange(rows[0], rows[1])
+
+
+def _folded_trace(
+    model: Model, segment: Segment, point: Point, held: Float[np.ndarray, "all w"], rows: tuple[int, int],
+    x0: Float[np.ndarray, " nx"],
+) -> Trace:  # fmt: skip
+    """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
+    layout = layout_of(model.nx, model.ny, model.np, point)
+    piece = slice(*rows)
+    w, data = np.column_stack([_times(segment, point, rows), held[piece, :-1]]), _data(model, point)
+    if point.correction is not None:
+        measured, present = _measured(segment, rows)
+        w = np.hstack([w, measured, present, _legendre(segment, rows, layout.drift_terms)])
+        known = (point.offset, point.gain, point.drift, point.correction)
+        data = np.concatenate([data, *(np.asarray(item).ravel() for item in known)])
+    fold, output = _program(model, point, layout, (w.shape[1], data.size))
+    path = _fold(fold, _first(x0, layout), w, data)
+    n = len(w)
+    key = f"{output} {n} {layout} {point.clock}"
     if key not in model.functions:
-        model.functions[key] = output_function(model).map(n)
-    found = model.functions[key](times, x[:-1].T, now.T, np.repeat(p[:, None], n, 1))
-    y, c, d = (np.array(item) for item in found)
-    c = c.reshape(ny, n, nx).transpose(1, 0, 2)
-    dy = np.einsum("noi,nti->not", c, s)
-    if nq:
-        dy[:, :, :nq] += d.reshape(ny, n, nq).transpose(1, 0, 2)
-    return y.T, dy, x
+        model.functions[key] = output.map(n)
+    flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)
+    seen = np.array(model.functions[key](flat, w.T, np.repeat(data[:, None], n, 1)))
+    seen = seen.reshape(model.ny, n, layout.states).transpose(1, 0, 2)
+    return seen[:, :, 0], seen[:, :, 1:], path[:, :, 0], path[-1]
+
+
+def _measured(segment: Segment, rows: tuple[int, int]) -> tuple[Float[np.ndarray, "n ny"], Any]:
+    """Return the measured outputs, zero where missing, and which are present."""
+    piece = slice(*rows)
+    measured = np.column_stack([channel[piece] for channel in segment.y])
+    present = np.isfinite(measured)
+    if segment.keep:
+        present &= np.column_stack([mask[piece] for mask in segment.keep]).astype(bool)
+    return np.where(present, measured, 0.0), present
 
 
 def _columns(
-    segment: Segment,
-    point: Point,
-    weights: Weights,
-    y: Float[np.ndarray, "n ny"],
-    dy: Float[np.ndarray, "n ny nt"],
-) -> tuple[Float[np.ndarray, "n ny nc"], Any]:
-    assert segment.y is not None
-    present = np.isfinite(segment.y)
-    if segment.keep is not None:
-        present &= segment.keep.astype(bool)
-    residual = point.gain * y + point.offset - np.where(present, segment.y, 0.0)
-    v = np.concatenate([residual[:, :, None], point.gain[:, None] * dy, np.ones((*y.shape, 1)), y[:, :, None]], axis=2)
+    segment: Segment, point: Point, weights: Weights, layout: Layout, rows: tuple[int, int],
+    y: Float[np.ndarray, "n ny"], dy: Float[np.ndarray, "n ny nt"],
+) -> tuple[Float[np.ndarray, "n ny nc"], Any]:  # fmt: skip
+    """Return v of every sample, and which samples count."""
+    measured, present = _measured(segment, rows)
+    basis = _legendre(segment, rows, point.drift_terms)
+    drift = basis @ point.drift.T if point.drift_terms else 0.0
+    v = np.zeros((len(y), layout.ny, layout.columns))
+    v[:, :, 0] = point.gain * y + point.offset + drift - measured
+    v[:, :, 1 : 1 + dy.shape[2]] = point.gain[:, None] * dy
+    for o in range(layout.ny):
+        own = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
+        v[:, o, own] += 1.0
+        v[:, o, own + 1 : own + 1 + point.drift_terms] += basis
+        v[:, o, own + layout.own - 1] += y[:, o]
     v[~present] = 0.0
     if len(weights.sections):
         from scipy.signal import sosfilt
@@ -217,3 +358,10 @@ def _columns(
         v = np.asarray(sosfilt(sos, v, axis=0))
     present[: weights.settle] = False
     return v, present
+
+
+def _legendre(segment: Segment, rows: tuple[int, int], terms: int) -> Float[np.ndarray, "n nd"]:
+    """Return Legendre's polynomials 1 to `terms` at each sample's drift coordinate."""
+    first, step = segment.drift_span
+    tau = first + step * np.arange(rows[0], rows[1])
+    return np.polynomial.legendre.legvander(tau, terms)[:, 1:]

@@ -1,155 +1,170 @@
-/* One pass over a log: state, sensitivities, outputs, weighted residuals and their Gram matrices.
+/* Passes over stretches of a log: state, sensitivities, outputs, weighted residuals and their Gram matrices.
 
-   Built with these constants in front (see seaopt/simulation/compiled.py):
-     NX states, NU inputs, NY outputs, NP parameters (a free delay is the last), LINEAR 0 or 1.
-   Columns of v, for each output: residual, d/dparameter (NP), d/dx0 (NX), d/doffset, d/dgain. */
-#include <math.h>
+   Built with constants and layout.h in front (see seaopt/simulation/compiled.py).
+
+   Every array that is summed over derivatives has them last and padded to whole vectors: Z[i][0] is the state x_i and
+   Z[i][j] its derivative to unknown j, so that one loop over j advances all.
+
+   Columns of v, for each output: residual, shared (NP), initial state (NX), then the output's own: offset, drift
+   (ND), gain. With a correction the own columns of every output act on the state: then v holds those of all. */
 #include <string.h>
 #if defined(__SSE2__)
 #include <xmmintrin.h>
 #endif
 
-#define NT (NP + NX)
-#define NC (NT + 3)
-#define MAX_SECTIONS 8
-
 typedef struct {
-    long n;                    /* samples */
-    const double *u;           /* n x NU */
-    const double *y;           /* n x NY, or NULL: simulate only */
-    const unsigned char *keep; /* n x NY, or NULL: all kept */
-    long lag_a, lag_b;         /* rows of u in force: u[k - lag_a], u[k - lag_b]; clamped to the log */
-    const double *model;       /* LINEAR: F, H and derivatives; else p, then the step's settings */
-    const double *x0, *offset, *gain;
-    const double *sos;         /* sections x 5: b0 b1 b2 a1 a2 */
-    long sections, settle;     /* samples left out while the filter settles */
-    const double *knee;        /* NY: Huber's threshold on the filtered residual; infinite for squares */
-    double *gram;              /* NY x NC x NC, upper triangle */
-    double *rho;               /* NY: sum of losses */
-    double *count;             /* NY: samples counted */
-    double *outputs;           /* n x NY or NULL */
-    double *columns;           /* n x NY x NC or NULL */
-    double *states;            /* n x NX or NULL */
-    double *last;              /* NX: state after the last sample's step, or NULL */
+    long from, to;                 /* rows of the log: first, and one past the last */
+    long length;                   /* rows of the whole log: inputs are clamped to it */
+    const double *u[NU];
+    const double *y[NY];           /* y[0] NULL: simulate only */
+    const unsigned char *keep[NY]; /* NULL: all kept */
+    long lag_a, lag_b;             /* rows of u in force: u[k - lag_a], u[k - lag_b]; clamped to the log */
+    long settle;                   /* rows from `start` that are left out while the filter settles */
+    long start;                    /* first row of the stretch; later than `from` is not allowed */
+    double t0;                     /* time of row 0 */
+    double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
+    const double *model;           /* LINEAR: A (NX + NY)(NX), D (NX + NY)(NX + NI)(NJP); else the step's settings, then c */
+    const double *correction;      /* CORRECT: NX x NY x NJP, gain and its derivatives */
+    const double *x0;
+    const double *offset, *gain;   /* NY */
+    const double *drift;           /* NY x ND */
+    const double *sos;             /* sections x 5: b0 b1 b2 a1 a2 */
+    long sections;
+    long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
+    const double *knee;            /* NY: where a robust loss leaves the square */
+    double *gram;                  /* NY x NC x NC, added to */
+    double *rho;                   /* NY: sum of losses, added to */
+    double *count;                 /* NY: samples counted, added to */
+    double *outputs;               /* (to - from) x NY or NULL */
+    double *columns;               /* (to - from) x NY x NC or NULL */
+    double *states;                /* (to - from) x NX or NULL */
+    double *last;                  /* NX x NJ: Z one step after the last row, or NULL */
+    double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
 } seaopt_pass_args;
 
 typedef struct {
-    double X[NX], S[NT + 1][NX];       /* S[j] = dX/dtheta_j */
-    double Y[NY], DY[NY][NT + 1];
+    double z[NX][NJP];
+    double filter[NY][MAX_SECTIONS][2][NCP];
 #if !LINEAR
     double work[SZ_W + 1];
 #endif
 } state;
 
-#if LINEAR
-/* model: (1 + NP) blocks of [F (NX x NW), H (NY x NW)] with NW = NX + 2 NU + 1 and w = [x, u_a, u_b, 1]:
-   x+ = F w, y = H w; the blocks after the first are the derivatives. */
-#define NW (NX + 2 * NU + 1)
-#define BLOCK ((NX + NY) * NW)
+static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {
+    long row = k - lag;
+    if (row < 0) row = 0;
+    if (row >= a->length) row = a->length - 1;
+    for (int i = 0; i < NU; i++) u[i] = a->u[i][row];
+}
 
-static void observe(state *q, const seaopt_pass_args *a, const double *ua, const double *ub, long k) {
-    const double *H = a->model + NX * NW;
-    double w[NW];
-    for (int i = 0; i < NX; i++) w[i] = q->X[i];
-    for (int i = 0; i < NU; i++) { w[NX + i] = ua[i]; w[NX + NU + i] = ub[i]; }
-    w[NW - 1] = 1.0;
-    (void)k;
-    for (int o = 0; o < NY; o++) {
-        double value = 0.0;
-        for (int i = 0; i < NW; i++) value += H[o * NW + i] * w[i];
-        q->Y[o] = value;
-        for (int j = 0; j < NP; j++) {
-            const double *dH = H + (j + 1) * BLOCK + o * NW;
-            double d = 0.0;
-            for (int i = 0; i < NW; i++) d += dH[i] * w[i];
-            for (int i = 0; i < NX; i++) d += H[o * NW + i] * q->S[j][i];
-            q->DY[o][j] = d;
-        }
-        for (int j = NP; j < NT; j++) {
-            double d = 0.0;
-            for (int i = 0; i < NX; i++) d += H[o * NW + i] * q->S[j][i];
-            q->DY[o][j] = d;
-        }
+#if LINEAR
+#define NF (NX + NI)
+
+/* Rows of [x+; y] with all derivatives: A Z + D [x; forcing]. */
+static inline void rows(const double *restrict model, const double (*restrict z)[NJP], const double *restrict w, int first, int count,
+                        double (*restrict out)[NJP]) {
+    const double *A = model + first * NX, *D = model + (NX + NY) * NX + first * NF * NJP;
+    for (int r = 0; r < count; r++) {
+        double sum[NJP];
+        for (int j = 0; j < NJP; j++) sum[j] = 0.0;
+        for (int i = 0; i < NX; i++)
+            for (int j = 0; j < NJP; j++) sum[j] += A[r * NX + i] * z[i][j];
+        for (int i = 0; i < NF; i++)
+            for (int j = 0; j < NJP; j++) sum[j] += D[(r * NF + i) * NJP + j] * w[i];
+        memcpy(out[r], sum, sizeof sum);
     }
 }
 
-static void advance(state *q, const seaopt_pass_args *a, const double *ua, const double *ub, long k) {
-    const double *F = a->model;
-    double w[NW], next[NX];
-    (void)k;
-    for (int i = 0; i < NX; i++) w[i] = q->X[i];
-    for (int i = 0; i < NU; i++) { w[NX + i] = ua[i]; w[NX + NU + i] = ub[i]; }
-    w[NW - 1] = 1.0;
-    for (int j = 0; j < NT; j++) {
-        for (int r = 0; r < NX; r++) {
-            double value = 0.0;
-            for (int i = 0; i < NX; i++) value += F[r * NW + i] * q->S[j][i];
-            if (j < NP) {
-                const double *dF = F + (j + 1) * BLOCK + r * NW;
-                for (int i = 0; i < NW; i++) value += dF[i] * w[i];
-            }
-            next[r] = value;
-        }
-        for (int r = 0; r < NX; r++) q->S[j][r] = next[r];
-    }
-    for (int r = 0; r < NX; r++) {
-        double value = 0.0;
-        for (int i = 0; i < NW; i++) value += F[r * NW + i] * w[i];
-        next[r] = value;
-    }
-    for (int r = 0; r < NX; r++) q->X[r] = next[r];
+static inline void forcing(const state *q, const seaopt_pass_args *a, long k, double *w) {
+    double u[NU];
+    for (int i = 0; i < NX; i++) w[i] = q->z[i][0];
+    at(a, k, a->lag_a, u);
+    for (int i = 0; i < NU && i < NI; i++) w[NX + i] = u[i];
+#if DELAYED
+    at(a, k, a->lag_b, u);
+    for (int i = 0; i < NU; i++) w[NX + NU + i] = u[i];
+#endif
+    if (NI > NU * (1 + DELAYED)) w[NF - 1] = 1.0;
+}
+
+static inline void observe(state *q, const seaopt_pass_args *a, long k, double (*restrict y)[NJP]) {
+    double w[NF + 1];
+    forcing(q, a, k, w);
+    rows(a->model, (const double (*)[NJP])q->z, w, NX, NY, y);
+}
+
+static inline void advance(state *q, const seaopt_pass_args *a, long k) {
+    double w[NF + 1], next[NX][NJP];
+    forcing(q, a, k, w);
+    rows(a->model, (const double (*)[NJP])q->z, w, 0, NX, next);
+    memcpy(q->z, next, sizeof next);
 }
 #else
-/* CasADi's functions stand in front of this file:
-     seaopt_step(t, x, u0, u1, p, h) -> x1, dx1/dx, dx1/d[p, h]     seaopt_output(t, x, u, p) -> y, dy/dx, dy/dp
-   model: p (NA, of which the first NQ are differentiated), substeps, period, older part of the period (fractional delay), first-order hold flag, t0.
-   NP = NQ + 1 where the delay is free too. */
-static void one_step(state *q, const double *t, const double *u0, const double *u1, const double *p, const double *h, double dh) {
-    double x1[NX], a[NX * NX], b[NX * (NQ + 1)], next[NX];
-    const double *arg[SZ_ARG] = {t, q->X, u0, u1, p, h};
-    double *res[SZ_RES] = {x1, a, b};
-    seaopt_step(arg, res, 0, q->work, 0);
-    for (int j = 0; j < NT; j++) { /* a and b are stored by columns */
-        for (int r = 0; r < NX; r++) {
-            double value = 0.0;
-            for (int i = 0; i < NX; i++) value += a[i * NX + r] * q->S[j][i];
-            if (j < NQ) value += b[j * NX + r];
-            else if (j < NP) value += b[NQ * NX + r] * dh;
-            next[r] = value;
-        }
-        for (int r = 0; r < NX; r++) q->S[j][r] = next[r];
-    }
-    for (int r = 0; r < NX; r++) q->X[r] = x1[r];
+/* In front of this file stand CasADi's functions
+     seaopt_rate(t, x, u, c) -> f and the nonzeros of f_x, f_p     seaopt_output(t, x, u, c) -> the same of h
+   and seaopt_rate_chain, seaopt_output_chain, which add f_x Z + f_p to the derivatives of f, and of h.
+   model: steps, period, older part of the period (fractional delay), first-order hold, then c. */
+#define SETTINGS 4
+
+/* K = [f, f_x Z + f_p] at the state Z. */
+static inline void slope(state *q, double t, const double *u, const double *c, const double (*restrict z)[NJP], double (*restrict k)[NJP]) {
+    double x[NX], f[NX], fx[NNZ_FX + 1], fp[NNZ_FP + 1];
+    const double *arg[SZ_ARG] = {&t, x, u, c};
+    double *res[SZ_RES] = {f, fx, fp};
+    for (int i = 0; i < NX; i++) x[i] = z[i][0];
+    seaopt_rate(arg, res, 0, q->work, 0);
+    seaopt_rate_chain(fx, fp, z, k);
+    for (int i = 0; i < NX; i++) k[i][0] = f[i];
 }
 
-static void observe(state *q, const seaopt_pass_args *a, const double *ua, const double *ub, long k) {
-    const double *p = a->model, *m = p + NA;
-    double y[NY], c[NY * NX], d[NY * NQ + 1], t = m[4] + k * m[1];
-    const double *now = (m[2] > 0.0) ? ub : ua;
-    const double *arg[SZ_ARG] = {&t, q->X, now, p};
-    double *res[SZ_RES] = {y, c, d};
-    seaopt_output(arg, res, 0, q->work, 0);
-    for (int o = 0; o < NY; o++) {
-        q->Y[o] = y[o];
-        for (int j = 0; j < NT; j++) {
-            double value = j < NQ ? d[j * NY + o] : 0.0;
-            for (int i = 0; i < NX; i++) value += c[i * NY + o] * q->S[j][i];
-            q->DY[o][j] = value;
+/* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. */
+static inline void one_step(state *q, double t, const double *u0, const double *u1, const double *c, double h, double dh) {
+    static const double reach[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
+    double k[NX][NJP], z[NX][NJP], sum[NX][NJP], u[NU];
+    memcpy(z, q->z, sizeof z);
+    memcpy(sum, q->z, sizeof sum);
+    for (int stage = 0; stage < 4; stage++) {
+        const double part = reach[stage] * h;
+        if (stage)
+            for (int i = 0; i < NX; i++) {
+                for (int j = 0; j < NJP; j++) z[i][j] = q->z[i][j] + part * k[i][j];
+                if (DELAYED) z[i][1 + NQ] += reach[stage] * dh * k[i][0];
+            }
+        for (int i = 0; i < NU; i++) u[i] = u0[i] + reach[stage] * (u1[i] - u0[i]);
+        slope(q, t + part, u, c, (const double (*)[NJP])z, k);
+        for (int i = 0; i < NX; i++) {
+            for (int j = 0; j < NJP; j++) sum[i][j] += weight[stage] * h * k[i][j];
+            if (DELAYED) sum[i][1 + NQ] += weight[stage] * dh * k[i][0];
         }
     }
+    memcpy(q->z, sum, sizeof sum);
+}
+
+static inline void observe(state *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP]) {
+    const double *m = a->model;
+    double x[NX], u[NU], y[NY], c[NNZ_HX + 1], d[NNZ_HP + 1], t = a->t0 + k * m[1];
+    at(a, k, m[2] > 0.0 ? a->lag_b : a->lag_a, u);
+    const double *arg[SZ_ARG] = {&t, x, u, m + SETTINGS};
+    double *res[SZ_RES] = {y, c, d};
+    for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
+    seaopt_output(arg, res, 0, q->work, 0);
+    seaopt_output_chain(c, d, (const double (*)[NJP])q->z, out);
+    for (int o = 0; o < NY; o++) out[o][0] = y[o];
 }
 
 /* With a fractional delay the older input u_b acts first, for m[2] seconds, then u_a. */
-static void advance(state *q, const seaopt_pass_args *a, const double *ua, const double *ub, long k) {
-    const double *p = a->model, *m = p + NA;
+static void advance(state *q, const seaopt_pass_args *a, long k) {
+    const double *m = a->model;
     const long steps = (long)m[0];
     const int foh = m[3] > 0.5;
-    double t = m[4] + k * m[1];
-    double parts[2] = {m[2], m[1] - m[2]}, u0[NU + 1], u1[NU + 1];
+    double t = a->t0 + k * m[1], ua[NU], ub[NU];
+    double parts[2] = {m[2], m[1] - m[2]}, u0[NU], u1[NU];
+    at(a, k, a->lag_a, ua);
+    at(a, k, a->lag_b, ub);
     for (int part = 0; part < 2; part++) {
         const double h = parts[part] / steps, dh = (part ? -1.0 : 1.0) / steps;
         const double *from = part ? ua : ub;
-        if (parts[part] <= 0.0 && !(NP > NQ)) continue;
+        if (parts[part] <= 0.0 && !DELAYED) continue;
         for (long i = 0; i < steps; i++) {
             for (int c = 0; c < NU; c++) {
                 const double slope = foh ? (ub[c] - ua[c]) / steps : 0.0;
@@ -157,60 +172,72 @@ static void advance(state *q, const seaopt_pass_args *a, const double *ua, const
                 u0[c] = base + slope * i;
                 u1[c] = base + slope * (i + 1);
             }
-            one_step(q, &t, u0, u1, p, &h, dh);
+            one_step(q, t, u0, u1, m + SETTINGS, h, dh);
             t += h;
         }
     }
 }
 #endif
 
-static double filtered(double value, const seaopt_pass_args *a, double (*z)[2]) {
-    for (long k = 0; k < a->sections; k++) {
-        const double *c = a->sos + 5 * k;
-        const double out = c[0] * value + z[k][0];
-        z[k][0] = c[1] * value - c[3] * out + z[k][1];
-        z[k][1] = c[2] * value - c[4] * out;
-        value = out;
+/* Residual and derivatives of output o: gain y + offset + drift - measured. */
+static inline void residual(const seaopt_pass_args *a, int o, const double *restrict y, double measured, double tau, double *restrict v) {
+    const double gain = a->gain[o];
+    double basis[ND + 1], older = 1.0, value = gain * y[0] + a->offset[o] - measured;
+    for (int d = 0; d < ND; d++) { /* Legendre's recurrence */
+        basis[d] = d == 0 ? tau : ((2 * d + 1) * tau * basis[d - 1] - d * older) / (d + 1);
+        if (d > 0) older = basis[d - 1];
+        value += a->drift[o * ND + d] * basis[d];
     }
-    return value;
+    for (int j = 0; j < NJ; j++) v[j] = gain * y[j];
+    for (int j = NJ; j < NCP; j++) v[j] = 0.0;
+    v[0] = value;
+    double *own = v + NS + (CORRECT ? o * OWN : 0);
+    own[0] += 1.0;
+    for (int d = 0; d < ND; d++) own[1 + d] += basis[d];
+    own[1 + ND] += y[0];
 }
 
-static void accumulate(const state *q, const seaopt_pass_args *a, long k, double (*z)[NC][MAX_SECTIONS][2]) {
-    for (int o = 0; o < NY; o++) {
-        const double measured = a->y[k * NY + o];
-        const int present = (a->keep ? a->keep[k * NY + o] : 1) && isfinite(measured);
-        double v[NC];
-        if (present) {
-            v[0] = a->gain[o] * q->Y[o] + a->offset[o] - measured;
-            for (int j = 0; j < NT; j++) v[1 + j] = a->gain[o] * q->DY[o][j];
-            v[NC - 2] = 1.0;
-            v[NC - 1] = q->Y[o];
-        } else {
-            for (int c = 0; c < NC; c++) v[c] = 0.0;
-        }
-        if (a->sections)
-            for (int c = 0; c < NC; c++) v[c] = filtered(v[c], a, z[o][c]);
-        if (a->columns) memcpy(a->columns + (k * NY + o) * NC, v, sizeof v);
-        if (!present || k < a->settle) continue;
-        const double size = fabs(v[0]), knee = a->knee[o];
-        const double weight = size <= knee ? 1.0 : knee / size;
-        double *gram = a->gram + o * NC * NC;
-        a->rho[o] += size <= knee ? 0.5 * size * size : knee * (size - 0.5 * knee);
-        a->count[o] += 1.0;
-        for (int r = 0; r < NC; r++) {
-            const double wr = weight * v[r];
-            for (int c = 0; c < NC; c++) gram[r * NC + c] += wr * v[c];
+static inline void filtered(const seaopt_pass_args *a, double *restrict v, double (*restrict z)[2][NCP]) {
+    for (long s = 0; s < a->sections; s++) {
+        const double *c = a->sos + 5 * s;
+        for (int j = 0; j < NCP; j++) {
+            const double out = c[0] * v[j] + z[s][0][j];
+            z[s][0][j] = c[1] * v[j] - c[3] * out + z[s][1][j];
+            z[s][1][j] = c[2] * v[j] - c[4] * out;
+            v[j] = out;
         }
     }
 }
 
-static const double *row(const seaopt_pass_args *a, long k) {
-    if (k < 0) k = 0;
-    if (k >= a->n) k = a->n - 1;
-    return a->u + k * NU;
+static inline double robust(const seaopt_pass_args *a, int o, double r, double *rho) {
+    const double knee = a->knee[o], size = fabs(r), part = r / knee;
+    if (a->loss == 2) {
+        const double root = sqrt(1.0 + part * part);
+        *rho = knee * knee * (root - 1.0);
+        return 1.0 / root;
+    }
+    if (a->loss == 0 || size <= knee) {
+        *rho = 0.5 * r * r;
+        return 1.0;
+    }
+    *rho = knee * (size - 0.5 * knee);
+    return knee / size;
 }
 
-/* Sensitivities to the initial state decay into denormal numbers, which cost a hundredfold: take them as zero. */
+typedef struct { double sum[NY][NC][NCP], rho[NY], count[NY]; } totals;
+
+static inline void accumulate(const seaopt_pass_args *a, long k, const double *v, int o, totals *restrict all) {
+    double rho, weight = robust(a, o, v[0], &rho);
+    all->rho[o] += rho;
+    all->count[o] += 1.0;
+    (void)k;
+    for (int r = 0; r < NC; r++) {
+        const double wr = weight * v[r];
+        for (int c = r / 4 * 4; c < NCP; c++) all->sum[o][r][c] += wr * v[c];
+    }
+}
+
+/* Denormal numbers, into which sensitivities to the initial state decay, cost a hundredfold: take them as zero. */
 static unsigned long flush_denormals(void) {
 #if defined(__SSE2__)
     const unsigned int before = _mm_getcsr();
@@ -236,24 +263,70 @@ static void restore_denormals(unsigned long before) {
 #endif
 }
 
-int seaopt_pass(const seaopt_pass_args *a) {
-    const unsigned long mode = flush_denormals();
-    state here, *const q = &here;
-    double z[NY][NC][MAX_SECTIONS][2];
-    memset(z, 0, sizeof z);
-    memset(q, 0, sizeof here);
-    for (int i = 0; i < NX; i++) { q->X[i] = a->x0[i]; q->S[NP + i][i] = 1.0; }
-    if (a->gram) memset(a->gram, 0, sizeof(double) * NY * NC * NC);
-    for (int o = 0; o < NY; o++) { a->rho[o] = 0.0; a->count[o] = 0.0; }
-    for (long k = 0; k < a->n; k++) {
-        const double *ua = row(a, k - a->lag_a), *ub = row(a, k - a->lag_b);
-        observe(q, a, ua, ub, k);
-        if (a->states) memcpy(a->states + k * NX, q->X, sizeof q->X);
-        if (a->outputs) memcpy(a->outputs + k * NY, q->Y, sizeof q->Y);
-        if (a->y) accumulate(q, a, k, z);
-        if (k + 1 < a->n || a->last) advance(q, a, ua, ub, k);
+long carry_size(void) { return sizeof(state) / sizeof(double) + 1; }
+
+static void begin(state *q, const seaopt_pass_args *a) {
+    if (a->carry && a->from > a->start) {
+        memcpy(q, a->carry, sizeof *q);
+        return;
     }
-    if (a->last) memcpy(a->last, q->X, sizeof q->X);
+    memset(q, 0, sizeof *q);
+    for (int i = 0; i < NX; i++) { q->z[i][0] = a->x0[i]; q->z[i][1 + NP + i] = 1.0; }
+}
+
+static void deliver(const state *q, const seaopt_pass_args *a, const totals *all) {
+    if (a->carry) memcpy(a->carry, q, sizeof *q);
+    if (a->last)
+        for (int i = 0; i < NX; i++) memcpy(a->last + i * NJ, q->z[i], NJ * sizeof(double));
+    for (int o = 0; o < NY; o++) {
+        a->rho[o] += all->rho[o];
+        a->count[o] += all->count[o];
+        for (int r = 0; r < NC; r++)
+            for (int c = 0; c < NC; c++) a->gram[(o * NC + r) * NC + c] += r <= c ? all->sum[o][r][c] : all->sum[o][c][r];
+    }
+}
+
+static void one_pass(const seaopt_pass_args *a) {
+    state here, *const q = &here;
+    totals all;
+    begin(q, a);
+    memset(&all, 0, sizeof all);
+    for (long k = a->from; k < a->to; k++) {
+        double y[NY][NJP], v[NY][NCP];
+        int present[NY];
+        observe(q, a, k, y);
+        if (a->states)
+            for (int i = 0; i < NX; i++) a->states[(k - a->from) * NX + i] = q->z[i][0];
+        if (a->outputs)
+            for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = y[o][0];
+        for (int o = 0; a->y[0] && o < NY; o++) {
+            const double measured = a->y[o][k];
+            present[o] = isfinite(measured) && !(a->keep[o] && !a->keep[o][k]);
+            if (present[o]) residual(a, o, y[o], measured, a->tau0 + k * a->dtau, v[o]);
+            else memset(v[o], 0, sizeof v[o]);
+        }
+        advance(q, a, k);
+#if CORRECT
+        for (int o = 0; o < NY; o++)
+            if (present[o])
+                for (int i = 0; i < NX; i++) {
+                    const double *g = a->correction + (i * NY + o) * NJP;
+                    for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];
+                    q->z[i][0] -= g[0] * v[o][0];
+                }
+#endif
+        for (int o = 0; a->y[0] && o < NY; o++) {
+            if (a->sections) filtered(a, v[o], q->filter[o]);
+            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
+            if (present[o] && k >= a->start + a->settle) accumulate(a, k, v[o], o, &all);
+        }
+    }
+    deliver(q, a, &all);
+}
+
+int seaopt_passes(const seaopt_pass_args *list, long count) {
+    const unsigned long mode = flush_denormals();
+    for (long i = 0; i < count; i++) one_pass(list + i);
     restore_denormals(mode);
     return 0;
 }

@@ -1,4 +1,4 @@
-"""One pass over a log segment: outputs, sensitivities and the Gram matrices of the weighted residuals.
+"""What a pass over a stretch of a log needs and finds: outputs, sensitivities, Gram matrices of weighted residuals.
 
 The same pass runs in two ways with the same numbers: compiled (`seaopt.simulation.compiled`), which accumulates in
 O(1) memory, and without a compiler (`seaopt.simulation.interpreted`).
@@ -6,7 +6,8 @@ O(1) memory, and without a compiler (`seaopt.simulation.interpreted`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,11 +16,12 @@ from seaopt.errors import SimulationError
 from seaopt.simulation.discretisation import Clock
 
 MAX_SECTIONS = 8  # as in pass.c
+RobustLoss = Literal["square", "huber", "soft_l1"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weights:
-    """What happens to a residual before it is squared, the same for every sample.
+    """What happens to a residual before it is summed, the same for every sample.
 
     Parameters
     ----------
@@ -27,14 +29,18 @@ class Weights:
         Second-order sections b0 b1 b2 a1 a2 of the band filter (a0 = 1); m = 0 for none.
     settle : int
         Samples left out while the filter settles.
+    loss : {"square", "huber", "soft_l1"}
+        Of the filtered residual r: r^2 / 2; the same up to the knee and straight beyond; or the smooth
+        knee^2 (sqrt(1 + (r / knee)^2) - 1).
     knee : array, shape (ny,)
-        Huber's threshold on the filtered residual, in the output's unit; infinite for least squares.
+        Where a robust loss leaves the square, in the output's unit.
 
     """
 
     sections: Float[np.ndarray, "m 5"]
     settle: int
     knee: Float[np.ndarray, " ny"]
+    loss: RobustLoss = "square"
 
     def __post_init__(self) -> None:
         if len(self.sections) > MAX_SECTIONS:
@@ -48,81 +54,136 @@ class Weights:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Segment:
-    """A gap-free stretch of a log in the order of a model's inputs and outputs.
+    """A gap-free stretch of a log: one array a channel, in the order of a model's inputs and outputs.
 
     Parameters
     ----------
-    u : array, shape (n, nu)
+    u : tuple of arrays, shape (n,)
         Input samples; finite.
-    y : array, shape (n, ny), or None
-        Measured outputs; NaN where missing. None: simulate only.
-    keep : array, shape (n, ny), or None
-        0 where a sample gets no weight.
+    y : tuple of arrays, shape (n,)
+        Measured outputs, NaN where missing. Empty: simulate only.
+    keep : tuple of arrays, shape (n,)
+        One an output, 0 where a sample gets no weight. Empty: all are kept.
     start_s : float
         Time of the first sample, for plants that depend on time.
+    drift_span : (float, float)
+        Drift's coordinate, which runs from -1 to 1 over the whole log, at the first sample, and its step.
 
     """
 
-    u: Float[np.ndarray, "n nu"]
-    y: Float[np.ndarray, "n ny"] | None = None
-    keep: UInt8[np.ndarray, "n ny"] | None = None
+    u: tuple[Float[np.ndarray, " n"], ...]
+    y: tuple[Float[np.ndarray, " n"], ...] = ()
+    keep: tuple[UInt8[np.ndarray, " n"], ...] = ()
     start_s: float = 0.0
+    drift_span: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.u[0].size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Point:
-    """Where a pass is made: the unknowns of one segment.
+    """Where passes are made: the unknowns of an experiment, but for its initial states.
 
     Parameters
     ----------
     theta : array, shape (np,)
         The model's free parameters.
-    x0 : array, shape (nx,)
-        State at the first sample.
     offset, gain : array, shape (ny,)
-        measured = gain * output + offset.
+        measured = gain * output + offset + drift.
+    drift : array, shape (ny, nd)
+        Coefficients of Legendre's polynomials 1 to nd over the log.
     clock : Clock
         Period, hold and delay.
     substeps : int
         Runge-Kutta steps a period (a linear model needs none).
+    correction : array, shape (1 + ns, nx, ny), or None
+        Gain by which the prediction error corrects the next state, and its derivatives with respect to theta, a free
+        delay, and what else it depends on (ns in all). None: the plant is simulated.
 
     """
 
     theta: Float[np.ndarray, " np"]
-    x0: Float[np.ndarray, " nx"]
     offset: Float[np.ndarray, " ny"]
     gain: Float[np.ndarray, " ny"]
     clock: Clock
+    drift: Float[np.ndarray, "ny nd"] = field(default_factory=lambda: np.zeros((1, 0)))
     substeps: int = 1
+    correction: Float[np.ndarray, "ns1 nx ny"] | None = None
+
+    @property
+    def drift_terms(self) -> int:
+        """Drift coefficients an output."""
+        return self.drift.shape[1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """The columns of v = [residual, shared, initial state, own of the output], and of the state's derivatives.
+
+    shared: d/dtheta, then d/ddelay where it is free, then what else the correction depends on. own: d/doffset,
+    d/ddrift, d/dgain; with a correction those of every output, because they act on the state.
+    """
+
+    shared: int
+    nx: int
+    ny: int
+    drift_terms: int
+    corrected: bool
+
+    @property
+    def own(self) -> int:
+        """Columns that belong to one output."""
+        return 2 + self.drift_terms
+
+    @property
+    def states(self) -> int:
+        """The state and its derivatives, in columns."""
+        return 1 + self.shared + self.nx + (self.ny * self.own if self.corrected else 0)
+
+    @property
+    def columns(self) -> int:
+        """Columns of v."""
+        return 1 + self.shared + self.nx + (self.ny if self.corrected else 1) * self.own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pass:
-    """What one pass found.
+    """What passes over shots of one segment found; a shot starts from a state of its own.
 
     Parameters
     ----------
-    gram : array, shape (ny, nc, nc)
-        Sums over samples of v v' with v = [residual, d/dtheta, (d/ddelay), d/dx0, d/doffset, d/dgain].
-    loss : array, shape (ny,)
-        Sums of the losses: half squares, or Huber's.
-    count : array, shape (ny,)
+    gram : array, shape (shots, ny, nc, nc)
+        Sums over samples of v v', weighted as the loss asks; columns as in `Layout`.
+    loss : array, shape (shots, ny)
+        Sums of the losses.
+    count : array, shape (shots, ny)
         Samples that counted.
+    last : array, shape (shots, nx, nj)
+        One step after each shot's last sample: the state, then its derivatives in the order of v.
     outputs : array, shape (n, ny), or None
         Model outputs, without gain and offset.
     columns : array, shape (n, ny, nc), or None
         The v of every sample.
     states : array, shape (n, nx), or None
         State trajectory.
-    last : array, shape (nx,)
-        State one step after the last sample.
 
     """
 
-    gram: Float[np.ndarray, "ny nc nc"]
-    loss: Float[np.ndarray, " ny"]
-    count: Float[np.ndarray, " ny"]
-    outputs: Float[np.ndarray, "n ny"] | None
-    columns: Float[np.ndarray, "n ny nc"] | None
-    states: Float[np.ndarray, "n nx"] | None
-    last: Float[np.ndarray, " nx"]
+    gram: Float[np.ndarray, "shots ny nc nc"]
+    loss: Float[np.ndarray, "shots ny"]
+    count: Float[np.ndarray, "shots ny"]
+    last: Float[np.ndarray, "shots nx nj"]
+    outputs: Float[np.ndarray, "n ny"] | None = None
+    columns: Float[np.ndarray, "n ny nc"] | None = None
+    states: Float[np.ndarray, "n nx"] | None = None
+
+
+def layout_of(nx: int, ny: int, np_: int, point: Point) -> Layout:
+    """Return the columns of passes at a point of a model with np_ free parameters."""
+    shared = np_ + point.clock.delay_free if point.correction is None else point.correction.shape[0] - 1
+    return Layout(
+        shared=shared, nx=nx, ny=ny, drift_terms=point.drift_terms, corrected=point.correction is not None
+    )

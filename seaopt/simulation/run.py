@@ -1,29 +1,42 @@
-"""The pass, compiled where there is a compiler and interpreted where there is none."""
+"""The passes, compiled where there is a compiler and interpreted where there is none."""
 
 from __future__ import annotations
 
-from seaopt.simulation.compiled import compiled_pass
-from seaopt.simulation.interpreted import interpreted_pass
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.simulation.compiled import Program
+from seaopt.simulation.interpreted import interpreted_passes
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Pass, Point, Segment, Weights
 
+CHUNK = 1 << 16
 
-def run_pass(
+
+def run_passes(
     model: Model,
     segment: Segment,
     point: Point,
+    x0: Float[np.ndarray, "shots nx"],
     weights: Weights | None = None,
     *,
+    edges: Int[np.ndarray, " shots1"] | None = None,
     outputs: bool = False,
     columns: bool = False,
     states: bool = False,
 ) -> Pass:
-    """Run one pass over a segment.
+    """Run a segment, or shots of it that each start from a state of their own.
 
     Parameters
     ----------
     model, segment, point, weights
         What is simulated, on which data, with which unknowns, and how residuals are weighted (not at all if None).
+    x0 : array, shape (shots, nx)
+        State at each shot's first sample.
+    edges : array of int, shape (shots + 1,), optional
+        First rows of the shots, and one past the last; the whole segment in one shot if left out.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
 
@@ -34,6 +47,45 @@ def run_pass(
 
     """
     chosen = weights if weights is not None else Weights.plain(model.ny)
-    keep = {"outputs": outputs, "columns": columns, "states": states}
-    result = compiled_pass(model, segment, point, chosen, **keep)
-    return result if result is not None else interpreted_pass(model, segment, point, chosen, **keep)
+    rows = edges if edges is not None else np.array([0, segment.n])
+    program = Program.make(model, segment, point, chosen)
+    if program is not None:
+        return program.run(rows, x0, outputs=outputs, columns=columns, states=states)
+    return interpreted_passes(model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states)
+
+
+def stream(
+    model: Model,
+    segment: Segment,
+    point: Point,
+    x0: Float[np.ndarray, " nx"],
+    weights: Weights | None = None,
+    *,
+    chunk: int = CHUNK,
+    columns: bool = False,
+) -> Iterator[Pass]:
+    """Yield the outputs, and the columns if asked, of one segment chunk by chunk, in the memory of one chunk."""
+    chosen = weights if weights is not None else Weights.plain(model.ny)
+    program = Program.make(model, segment, point, chosen)
+    if program is None:
+        yield from _cut(
+            interpreted_passes(
+                model, segment, point, chosen, np.array([0, segment.n]), x0[None], outputs=True, columns=columns
+            ),
+            chunk,
+        )
+        return
+    carry = program.carry()
+    for start in range(0, segment.n, chunk):
+        rows = np.array([start, min(start + chunk, segment.n)])
+        yield program.run(rows, x0[None], outputs=True, columns=columns, resume=carry)
+
+
+def _cut(whole: Pass, chunk: int) -> Iterator[Pass]:
+    assert whole.outputs is not None
+    for start in range(0, len(whole.outputs), chunk):
+        piece = slice(start, start + chunk)
+        yield Pass(
+            gram=whole.gram, loss=whole.loss, count=whole.count, last=whole.last, outputs=whole.outputs[piece],
+            columns=None if whole.columns is None else whole.columns[piece],
+        )  # fmt: skip

@@ -16,13 +16,13 @@ from seaopt.signals import Signal
 from seaopt.simulation.discretisation import Clock, Hold
 from seaopt.simulation.model import Model, make_model
 from seaopt.simulation.passes import Pass, Point, Segment
-from seaopt.simulation.run import run_pass
+from seaopt.simulation.run import run_passes
 
 MAX_SUBSTEPS = 1024
 
 
-def input_samples(plant: Plant, log: Log) -> Float[np.ndarray, "n nu"]:
-    """Return the plant's inputs from a log's channels of the same names, in the plant's order.
+def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
+    """Return the plant's inputs from a log's channels of the same names, in the plant's order; zeros if it has none.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def input_samples(plant: Plant, log: Log) -> Float[np.ndarray, "n nu"]:
                 "cut that stretch off with slice_s, or fill it and say so"
             )
         columns.append(values)
-    return np.column_stack(columns) if columns else np.zeros((len(log), 1))
+    return tuple(columns) if columns else (np.zeros(len(log)),)
 
 
 def simulate(
@@ -123,9 +123,9 @@ def simulate(
             "check the parameters, their units and the input"
         )
     signals: dict[str, Signal] = {}
-    for names, values in ((plant.inputs, u), (plant.states, states), (plant.outputs, outputs)):
-        for index, (name, unit) in enumerate(names.items()):
-            signals[name] = Signal(name=name, values=values[:, index].copy(), unit=unit)
+    for names, values in ((plant.inputs, u), (plant.states, states.T), (plant.outputs, outputs.T)):
+        for (name, unit), channel in zip(names.items(), values, strict=False):  # a plant without inputs has one of zeros
+            signals[name] = Signal(name=name, values=channel.copy(), unit=unit)
     return Log(time=log.time.copy(), signals=signals, source=f"simulation of {plant.name}")
 
 
@@ -133,13 +133,12 @@ def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clo
     def run(substeps: int) -> Pass:
         point = Point(
             theta=np.zeros(0),
-            x0=x0,
             offset=np.zeros(model.ny),
             gain=np.ones(model.ny),
             clock=clock,
             substeps=substeps,
         )
-        return run_pass(model, segment, point, outputs=True, states=True)
+        return run_passes(model, segment, point, x0[None], outputs=True, states=True)
 
     result = run(1)
     substeps = 1

@@ -14,10 +14,10 @@ from scipy.signal import butter
 
 import seaopt as so
 from seaopt.errors import LogError, SimulationError
-from seaopt.simulation import Clock, Point, Segment, Weights, make_model, run_pass
-from seaopt.simulation.compiled import compiled_pass
+from seaopt.simulation import Clock, Layout, Point, Segment, Weights, layout_of, make_model, run_passes, stream
+from seaopt.simulation.compiled import Program
 from seaopt.simulation.compiler import find_compiler
-from seaopt.simulation.interpreted import interpreted_pass
+from seaopt.simulation.interpreted import interpreted_passes
 
 RATE = 400.0
 
@@ -123,7 +123,7 @@ def test_half_a_sample_of_delay_is_the_finer_simulation(plant_name, thor):
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
 
 
-def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "eta")):
+def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "eta"), loss="square", corrected=False):
     plant, changes = CASES[case]
     params = thor.update(**changes)
     free = (*free, "f_c") if changes.get("f_c") else free
@@ -133,25 +133,32 @@ def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "
     y[7, 1] = np.nan
     keep = np.ones((n, 2), dtype=np.uint8)
     keep[100:120] = 0
-    segment = Segment(u=rng.normal(size=(n, 1)), y=y, keep=keep)
+    segment = Segment(u=(rng.normal(size=n),), y=tuple(y.T.copy()), keep=tuple(keep.T.copy()), drift_span=(-1.0, 2.0 / n))
+    clock = clock or Clock(period=1 / RATE)
+    correction = None
+    if corrected:  # weak enough to be stable, with made-up derivatives
+        shape = (1 + model.np + clock.delay_free + 2, model.nx, 2)
+        correction = 1e-5 * rng.normal(size=shape) * np.array([1e-2, *np.ones(model.nx - 1)])[:, None]
+        correction[1:] /= np.array([*params.values_of(free), *([1e-3] * clock.delay_free), 1.0, 1.0])[:, None, None]
     point = Point(
-        theta=np.array(params.values_of(free)), x0=1e-3 * rng.normal(size=model.nx), offset=rng.normal(size=2),
-        gain=np.array([1.1, 0.9]), clock=clock or Clock(period=1 / RATE), substeps=2,
+        theta=np.array(params.values_of(free)), offset=rng.normal(size=2), gain=np.array([1.1, 0.9]), clock=clock,
+        drift=rng.normal(size=(2, 2)), substeps=2, correction=correction,
     )  # fmt: skip
-    weights = Weights.plain(2)
+    weights = Weights(sections=np.zeros((0, 5)), settle=0, knee=np.array([200.0, 9e9]), loss=loss)
     if filtered:
         sos = butter(4, [5, 100], "bandpass", fs=RATE, output="sos")
-        weights = Weights(
-            sections=np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]]), settle=50, knee=np.array([200.0, 9e9])
-        )
-    return model, segment, point, weights
+        sections = np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]])
+        weights = replace(weights, sections=sections, settle=50)
+    return model, segment, point, weights, 1e-3 * rng.normal(size=(1, model.nx))
 
 
 SETTINGS = [
     {},
-    {"filtered": True},
-    {"clock": Clock(period=1 / RATE, hold="first")},
+    {"filtered": True, "loss": "huber"},
+    {"clock": Clock(period=1 / RATE, hold="first"), "loss": "soft_l1"},
     {"clock": Clock(period=1 / RATE, delay_s=0.0033, delay_free=True)},
+    {"clock": Clock(period=1 / RATE, delay_s=0.0013, delay_free=True), "corrected": True},
+    {"corrected": True},
 ]
 
 
@@ -160,36 +167,64 @@ SETTINGS = [
 @pytest.mark.parametrize("options", SETTINGS)
 def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
     keep = {"outputs": True, "columns": True, "states": True}
-    arguments = passes(case, thor, **options)
-    fast, slow = compiled_pass(*arguments, **keep), interpreted_pass(*arguments, **keep)
+    model, segment, point, weights, x0 = passes(case, thor, **options)
+    edges = np.array([0, 250, 700])
+    starts = np.vstack([x0, 2 * x0])
+    fast = Program.make(model, segment, point, weights).run(edges, starts, **keep)
+    slow = interpreted_passes(model, segment, point, weights, edges, starts, **keep)
     for name in ("gram", "loss", "count", "outputs", "columns", "states", "last"):
         a, b = getattr(fast, name), getattr(slow, name)
-        np.testing.assert_allclose(a, b, atol=1e-10 * np.max(np.abs(b)), rtol=1e-10, err_msg=name)
+        scale = np.max(np.abs(b), axis=0, keepdims=True)
+        np.testing.assert_allclose(a, b, atol=1e-10 * np.max(scale), rtol=1e-10, err_msg=name)
+        np.testing.assert_allclose(a / (scale + 1e-300), b / (scale + 1e-300), atol=1e-9, err_msg=name)
 
 
 @pytest.mark.parametrize("case", ["stand", "swing friction"])
 @pytest.mark.parametrize("options", SETTINGS)
 def test_derivatives_are_finite_differences(case, options, thor):
-    model, segment, point, weights = passes(case, thor, n=250, **options)
+    """Every column of v: shared, initial state, then each output's own. The correction's gain moves as it says it does."""
+    model, segment, point, weights, x0 = passes(case, thor, n=250, **options)
+    weights = replace(weights, loss="square")
+    layout = layout_of(model.nx, model.ny, model.np, point)
 
-    def residual(moved):
-        return run_pass(model, segment, moved, weights, columns=True).columns[:, :, 0]
+    def residual(moved, start=x0):
+        return run_passes(model, segment, moved, start, weights, columns=True).columns[:, :, 0]
 
-    columns = run_pass(model, segment, point, weights, columns=True).columns
-    moves = [("theta", i, 1e-5 * value) for i, value in enumerate(point.theta)]
-    moves += [("x0", i, 1e-6) for i in range(model.nx)]
-    if point.clock.delay_free:
-        moves.insert(len(point.theta), ("delay", 0, 1e-7))
-    for column, (what, i, step) in enumerate(moves, start=1):
+    def moved(what, i, step):
+        shift = step * np.eye(1, 99, i).ravel()
+        g = point.correction
+        gain = None if g is None else {"correction": np.concatenate([g[:1] + step * g[i + 1 : i + 2], g[1:]])}
+        if what == "theta":
+            return replace(point, theta=point.theta + shift[: model.np], **(gain or {})), x0
         if what == "delay":
-            ends = [replace(point, clock=replace(point.clock, delay_s=point.clock.delay_s + s * step)) for s in (1, -1)]
-        else:
-            base = getattr(point, what)
-            ends = [replace(point, **{what: base + s * step * np.eye(base.size)[i]}) for s in (1, -1)]
-        numeric = (residual(ends[0]) - residual(ends[1])) / (2 * step)
+            clock = replace(point.clock, delay_s=point.clock.delay_s + step)
+            return replace(point, clock=clock, **(gain or {})), x0
+        if what == "rest":
+            return replace(point, **gain), x0
+        return point, x0 + shift[: model.nx]
+
+    shared = [("theta", i, 1e-5 * value) for i, value in enumerate(point.theta)]
+    shared += [("delay", model.np, 1e-7)] * point.clock.delay_free
+    shared += [("rest", i, 1e-5) for i in range(len(shared), layout.shared)]
+    columns = run_passes(model, segment, point, x0, weights, columns=True).columns
+    for column, (what, i, step) in enumerate(shared + [("x0", i, 1e-6) for i in range(model.nx)], start=1):
+        numeric = (residual(*moved(what, i, step)) - residual(*moved(what, i, -step))) / (2 * step)
         check_derivative(columns[:, :, column], numeric)
         with pytest.raises(AssertionError):
             check_derivative(columns[:, :, column] * (1 + 1e-5), numeric)
+    for o in range(2):
+        own = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
+        for k, (what, place, step) in enumerate(
+            [("offset", o, 0.01), ("drift", (o, 0), 0.01), ("drift", (o, 1), 0.01), ("gain", o, 1e-5)]
+        ):
+            ends = []
+            for sign in (1, -1):
+                value = getattr(point, what).copy()
+                value[place] += sign * step
+                ends.append(residual(replace(point, **{what: value})))
+            numeric = (ends[0] - ends[1]) / (2 * step)
+            where = slice(None) if layout.corrected else o
+            check_derivative(columns[:, where, own + k], numeric[:, where])
 
 
 def check_derivative(exact, numeric):
@@ -197,14 +232,24 @@ def check_derivative(exact, numeric):
 
 
 def test_gram_is_the_product_of_the_columns(thor):
-    model, segment, point, weights = passes("stand", thor)
-    found = run_pass(model, segment, point, weights, columns=True)
+    model, segment, point, weights, x0 = passes("stand", thor)
+    found = run_passes(model, segment, point, x0, weights, columns=True)
     for o in range(2):
         v = found.columns[:, o]
-        v = v[(segment.keep[:, o] > 0) & np.isfinite(segment.y[:, o])]
-        np.testing.assert_allclose(found.gram[o], v.T @ v, rtol=1e-9)
-        assert found.count[o] == len(v)
-        assert found.loss[o] == pytest.approx(0.5 * np.sum(v[:, 0] ** 2))
+        v = v[(segment.keep[o] > 0) & np.isfinite(segment.y[o])]
+        np.testing.assert_allclose(found.gram[0, o], v.T @ v, rtol=1e-9, atol=1e-9 * np.max(found.gram[0, o]))
+        assert found.count[0, o] == len(v)
+        assert found.loss[0, o] == pytest.approx(0.5 * np.sum(v[:, 0] ** 2))
+
+
+@pytest.mark.parametrize("options", [{}, {"filtered": True}, {"corrected": True}])
+def test_a_stream_is_the_whole(options, thor):
+    model, segment, point, weights, x0 = passes("stand", thor, **options)
+    whole = run_passes(model, segment, point, x0, weights, outputs=True, columns=True)
+    pieces = list(stream(model, segment, point, x0[0], weights, chunk=123, columns=True))
+    assert len(pieces) == 6
+    np.testing.assert_allclose(np.vstack([piece.columns for piece in pieces]), whole.columns, rtol=1e-12)
+    np.testing.assert_allclose(np.vstack([piece.outputs for piece in pieces]), whole.outputs, rtol=1e-12)
 
 
 def test_bad_input_is_refused(stand, swing, thor):
@@ -235,7 +280,8 @@ def test_other_parameter_values_need_no_other_code(swing, thor):
     """Fixed parameters are data: the kernel's source depends on which are zero, not on their values."""
     from seaopt.simulation.compiled import kernel_source
 
-    a, b = (kernel_source(make_model(swing, thor.update(I_p=v), ("J",)), False) for v in (0.2, 0.5))
+    layout = Layout(shared=1, nx=4, ny=2, drift_terms=0, corrected=False)
+    a, b = (kernel_source(make_model(swing, thor.update(I_p=v), ("J",)), layout, False) for v in (0.2, 0.5))
     assert a == b
 
 
