@@ -1,4 +1,4 @@
-r"""Covariance of a fit, honest for coloured residuals, and what the data cannot tell.
+r"""Covariance of a fit, honest for coloured residuals.
 
 With residuals and derivatives in units of sigma, :math:`H = J^T J + P` (P from the priors), the covariance for white
 residuals is :math:`H^{-1}`. Residuals of a real log are coloured; then
@@ -7,8 +7,12 @@ residuals is :math:`H^{-1}`. Residuals of a real log are coloured; then
 
 with R the correlation of the residuals of all outputs, at all lags (Ljung, System Identification, 2nd ed., Sec. 9.5;
 Newey and West 1987). R is estimated from the residuals under a Parzen window, whose spectral matrix is never
-indefinite, and the double sum is done in the frequency domain. With Huber's loss the residuals in B are clipped, and
-J^T J counts only those that are not (Huber, Robust Statistics, 1981, ch. 7).
+indefinite. With a robust loss the residuals in B are what the loss makes of them, and J^T J counts each sample with the
+loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
+
+Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on them,
+:math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter, in the
+frequency domain (overlap-save), chunk by chunk: memory does not grow with the log but for the residuals themselves.
 """
 
 from __future__ import annotations
@@ -18,9 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.residuals import Residuals
+from seaopt.estimation.residuals import Huber, Linear, Residuals
+from seaopt.simulation import Segment, stream
 
 RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
+CHUNK = 1 << 17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,116 +42,188 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[i, i], 0.0)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Identifiability:
-    """What the data tell of the free parameters.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Errors:
+    """What one segment's outputs leave over.
 
     Parameters
     ----------
-    rank, free : int
-        Directions seen in the data (and priors), and free parameters.
-    condition : float
-        Ratio of the largest to the smallest singular value of the normalised sensitivities.
-    unidentifiable : tuple of mappings
-        One a direction that is not seen: relative changes {NAME: weight} that leave every output as it is.
+    weighted : array, shape (n, ny)
+        Filtered residuals in sigma; zero where a sample does not count.
+    raw : array, shape (n, ny)
+        Model minus measured, neither filtered nor weighted; NaN where missing.
 
     """
 
-    rank: int
-    free: int
-    condition: float
-    unidentifiable: tuple[dict[str, float], ...]
+    weighted: Float[np.ndarray, "n ny"]
+    raw: Float[np.ndarray, "n ny"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Sandwich:
-    """B and J^T J (without priors) at the minimum, and the whiteness p-value of each experiment's outputs."""
-
-    meat: Float[np.ndarray, "n n"]
-    bread: Float[np.ndarray, "n n"]
-    whiteness: list[list[float]]
-
-
-def sandwich(problem: Residuals, z: Float[np.ndarray, " n"]) -> Sandwich:
-    """Return the parts of the covariance of the module docstring."""
-    n = z.size
-    meat, bread = np.zeros((n, n)), np.zeros((n, n))
-    whiteness: list[list[float]] = []
+def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]:
+    """Return the residuals of every experiment and segment."""
+    found: list[list[Errors]] = []
     for e, pieces in enumerate(problem.segments):
-        weights, sigma = problem.weights(e), problem.sigma[e]
-        row = [1.0] * len(sigma)
-        for s in range(len(pieces)):
-            columns = problem.run(e, s, z, columns=True).columns
-            assert columns is not None
-            present = counted(problem, e, s, weights.settle)
-            residual = columns[:, :, 0] / sigma * present
-            knee = weights.knee / sigma
-            jacobians: list[Float[np.ndarray, "m n"]] = []
-            for o in range(len(sigma)):
-                j = np.zeros((residual.shape[0], n))
-                for column, k in enumerate(problem.columns_of(e, s, o), start=1):
-                    if k is not None:
-                        j[:, k] = columns[:, o, column] / sigma[o] * present[:, o]
-                jacobians.append(j)
-                inside = j[np.abs(residual[:, o]) <= knee[o]]
-                bread += inside.T @ inside
-                used = present[:, o] > 0.0
-                if np.count_nonzero(used) >= 8:
-                    row[o] = min(row[o], ljung_box(residual[used, o]))
-            if residual.shape[0] >= 8:
-                meat += coloured_gram(jacobians, np.clip(residual, -knee, knee))
-        whiteness.append(row)
-    return Sandwich(meat=meat, bread=bread, whiteness=whiteness)
+        model, point, weights = problem.unknowns.models[e], problem.point(e, z), problem.weights(e)
+        row: list[Errors] = []
+        for s, piece in enumerate(pieces):
+            raw, first = np.empty((piece.n, model.ny)), 0
+            filtered = np.empty((piece.n, model.ny)) if len(weights.sections) else raw
+            drift = _drift(piece, point.drift)
+            for part in stream(
+                model, piece, point, problem.start(e, s, z), weights, chunk=CHUNK, columns=bool(len(weights.sections))
+            ):
+                assert part.outputs is not None
+                rows = slice(first, first + len(part.outputs))
+                measured = np.column_stack([channel[rows] for channel in piece.y])
+                raw[rows] = part.outputs * point.gain + point.offset + drift(rows) - measured
+                if part.columns is not None:
+                    filtered[rows] = part.columns[:, :, 0]
+                first = rows.stop
+            weighted = np.where(counted(piece, weights.settle), filtered / problem.sigma[e], 0.0)
+            row.append(Errors(weighted=weighted, raw=raw))
+        found.append(row)
+    return found
 
 
-def counted(problem: Residuals, e: int, s: int, settle: int) -> Float[np.ndarray, "n ny"]:
-    """Return 1 for each sample that takes part in the cost, 0 for the others."""
-    segment = problem.segments[e][s]
-    assert segment.y is not None
-    present = np.isfinite(segment.y).astype(float)
-    if segment.keep is not None:
-        present *= segment.keep
-    present[:settle] = 0.0
+def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]):  # noqa: ANN202
+    """Return the function from rows to drift."""
+    legendre = np.hstack([np.zeros((len(coefficients), 1)), coefficients])
+
+    def values(rows: slice) -> Float[np.ndarray, "m ny"]:
+        tau = piece.drift_span[0] + piece.drift_span[1] * np.arange(rows.start, rows.stop)
+        return np.polynomial.legendre.legval(tau, legendre.T).T if coefficients.shape[1] else np.zeros((1, 1))
+
+    return values
+
+
+def counted(piece: Segment, settle: int) -> Float[np.ndarray, "n ny"]:
+    """Return which samples take part in the cost."""
+    present = np.column_stack([np.isfinite(channel) for channel in piece.y])
+    if piece.keep:
+        present &= np.column_stack([mask > 0 for mask in piece.keep])
+    present[:settle] = False
     return present
 
 
-def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:
-    """Return sum_t r_t r_(t+k) / n for k = 0..lags."""
-    size = 1 << int(np.ceil(np.log2(r.size + lags + 1)))
-    spectrum = np.abs(np.fft.rfft(r, size)) ** 2
-    return np.fft.irfft(spectrum, size)[: lags + 1] / r.size
+def robust_bread(
+    problem: Residuals, z: Float[np.ndarray, " n"], left: list[list[Errors]]
+) -> Float[np.ndarray, "n n"]:
+    """Return J^T J with the loss's second derivative as weight."""
+    bread = np.zeros((z.size, z.size))
+    for e, row in enumerate(left):
+        for s, error in enumerate(row):
+            curvature = _curvature(problem, error.weighted)
+            for rows, columns in _columns(problem, e, s, z):
+                for o, places in enumerate(problem.columns(e, s)):
+                    used = np.flatnonzero(places >= 0)
+                    j = columns[:, o, 1 + used] / problem.sigma[e][o]
+                    counts = (error.weighted[rows, o] != 0.0) * curvature[rows, o]
+                    bread[np.ix_(places[used], places[used])] += (j * counts[:, None]).T @ j
+    return bread
 
 
-def coloured_gram(j: list[Float[np.ndarray, "n p"]], r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "p p"]:
-    """Return the sum over outputs a, b and times t, s of J_a(t) R_ab(t - s) J_b(s)'.
+def _curvature(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+    if isinstance(problem.loss, Huber):
+        return (np.abs(r) <= problem.loss.threshold).astype(float)
+    if isinstance(problem.loss, Linear):
+        return np.ones_like(r)
+    return (1.0 + (r / problem.loss.threshold) ** 2) ** -1.5
 
-    Parameters
-    ----------
-    j : list of ny arrays, shape (n, p)
-        Derivatives of each output's residuals.
-    r : array, shape (n, ny)
-        Residuals; zero where missing.
 
-    """
-    n, ny = r.shape
-    lags = int(min(max(32, 4 * np.sqrt(n)), n // 4))
-    x = np.arange(lags + 1) / lags
+def _pull(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+    """Return the loss's derivative at each residual."""
+    if isinstance(problem.loss, Huber):
+        return np.clip(r, -problem.loss.threshold, problem.loss.threshold)
+    return r if isinstance(problem.loss, Linear) else r / np.sqrt(1.0 + (r / problem.loss.threshold) ** 2)
+
+
+def _columns(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]):  # noqa: ANN202
+    """Yield rows and their columns, chunk by chunk."""
+    first = 0
+    arguments = problem.unknowns.models[e], problem.segments[e][s], problem.point(e, z), problem.start(e, s, z)
+    for part in stream(*arguments, problem.weights(e), chunk=CHUNK, columns=True):
+        assert part.columns is not None
+        rows = slice(first, first + len(part.columns))
+        first = rows.stop
+        yield rows, part.columns
+
+
+def coloured(
+    problem: Residuals, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"], left: list[list[Errors]]
+) -> Float[np.ndarray, "p p"]:
+    """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E."""
+    total = np.zeros((inverse.shape[1],) * 2)
+    for e, row in enumerate(left):
+        pulls = [_pull(problem, error.weighted) for error in row]
+        density = correlations(pulls)
+        for s, pull in enumerate(pulls):
+            if len(pull) < 8:
+                continue
+            tail = np.zeros((density.shape[0] - 1, pull.shape[1], inverse.shape[1]))
+            for rows, columns in _columns(problem, e, s, z):
+                influence = np.empty((len(columns), pull.shape[1], inverse.shape[1]))
+                for o, places in enumerate(problem.columns(e, s)):
+                    used = np.flatnonzero(places >= 0)
+                    influence[:, o] = columns[:, o, 1 + used] @ (inverse[places[used]] / problem.sigma[e][o])
+                influence *= _counts(pull[rows])[:, :, None]
+                total += _coloured_part(influence, tail, density)
+                tail = np.concatenate([tail, influence])[-len(tail) :] if len(tail) else tail
+    return total
+
+
+def _counts(pull: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+    """Return 1 where a sample counted: a residual of exactly zero is one that was left out."""
+    return (pull != 0.0).astype(float)
+
+
+def correlations(pulls: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "lags1 ny ny"]:
+    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window."""
+    from scipy.fft import irfft, next_fast_len, rfft  # deferred: 0.1 s
+
+    longest, ny = max(len(pull) for pull in pulls), pulls[0].shape[1]
+    lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
+    found, counts = np.zeros((lags + 1, ny, ny)), np.zeros(ny)
+    for pull in pulls:
+        counts += np.count_nonzero(pull, axis=0)
+        for start in range(0, len(pull), CHUNK):
+            now = pull[start : start + CHUNK]
+            before = pull[max(start - lags, 0) : start + CHUNK]
+            shift = len(before) - len(now)
+            size = next_fast_len(len(before) + lags, real=True)
+            spectrum = rfft(before, size, axis=0)
+            own = spectrum if shift == 0 else rfft(np.vstack([np.zeros((shift, ny)), now]), size, axis=0)
+            for a in range(ny):
+                for b in range(ny):
+                    found[:, a, b] += irfft(own[:, a] * np.conj(spectrum[:, b]), size)[: lags + 1]
+    x = np.arange(lags + 1) / max(lags, 1)
     parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
-    size = 1 << int(np.ceil(np.log2(n + lags + 1)))
-    window = np.zeros(size)
-    window[: lags + 1], window[size - lags :] = parzen, parzen[1:][::-1]
-    counted_samples = np.maximum(np.count_nonzero(r, axis=0), 1)
-    rf = np.fft.rfft(r, size, axis=0)
-    half = np.full(rf.shape[0], 2.0)
-    half[0] = half[-1] = 1.0
-    jf = [np.fft.rfft(item, size, axis=0) for item in j]
-    total = np.zeros((j[0].shape[1],) * 2)
+    scale = np.sqrt(np.outer(np.maximum(counts, 1.0), np.maximum(counts, 1.0)))
+    return found * parzen[:, None, None] / scale
+
+
+def _coloured_part(
+    now: Float[np.ndarray, "n ny p"], before: Float[np.ndarray, "lags ny p"], r: Float[np.ndarray, "lags1 ny ny"]
+) -> Float[np.ndarray, "p p"]:
+    """Return the terms of the double sum in which t is now, and s is now or before (twice, for their mirror image)."""
+    from scipy.fft import next_fast_len, rfft
+
+    n, ny, p = now.shape
+    past = before if np.any(before) else before[:0]
+    size = next_fast_len(len(past) + n + len(r), real=True)
+    spectrum = rfft(np.concatenate([past, now]), size, axis=0)
+    own = spectrum if not len(past) else rfft(np.concatenate([np.zeros_like(past), now]), size, axis=0)
+    kernel = rfft(np.concatenate([np.zeros((1, ny, ny)), r[1:]]), size, axis=0)
+    half = np.full(len(spectrum), 2.0 / size)
+    half[0] = 1.0 / size
+    if size % 2 == 0:
+        half[-1] = 1.0 / size
+    later = np.zeros((p, p))
     for a in range(ny):
         for b in range(ny):
-            correlation = np.fft.irfft(rf[:, a] * np.conj(rf[:, b]), size) * window
-            density = np.fft.rfft(correlation) / np.sqrt(counted_samples[a] * counted_samples[b])
-            total += (jf[a].conj().T @ (jf[b] * (density * half / size)[:, None])).real
-    return 0.5 * (total + total.T)
+            weighted = spectrum[:, b] * (kernel[:, a, b] * half)[:, None]
+            later += (own[:, a].conj().T @ weighted).real
+    here = np.einsum("tap,ab,tbq->pq", now, r[0], now, optimize=True)
+    return here + later + later.T
 
 
 def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:
@@ -155,62 +233,28 @@ def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:
     n = r.size
     lags = min(lags, n // 5)
     centred = r - r.mean()
-    r_of = autocorrelation(centred, lags)
-    if lags < 1 or r_of[0] <= 0.0:
+    if lags < 1 or not np.any(centred):
         return 1.0
-    rho = r_of[1:] / r_of[0]
+    power = float(centred @ centred)
+    rho = np.array([centred[k:] @ centred[:-k] for k in range(1, lags + 1)]) / power
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
     return float(gammaincc(lags / 2, statistic / 2))
 
 
-def posterior(
-    bread: Float[np.ndarray, "n n"], meat: Float[np.ndarray, "n n"], prior: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "n n"]:
-    """Return H^-1 (B + P) H^-1 with H = bread + P, over what is seen; the rest has infinite variance.
-
-    Bounds are not taken into account: the value of a parameter on its bound has the variance that the curvature there
-    gives it, to be truncated at the bound.
-    """
-    hessian = bread + np.diag(prior)
+def inverse(hessian: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    """Return H^-1 over what is seen, and how much of each unknown is not (0 to 1, squared)."""
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
     seen = values > RANK * max(values[-1], 1e-300)
-    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / np.outer(scale, scale)
-    covariance = inverse @ (meat + np.diag(prior)) @ inverse
-    lost = np.sum(vectors[:, ~seen] ** 2, axis=1) > 1e-8
-    covariance[lost, :] = covariance[:, lost] = np.inf
-    return covariance
+    found = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / np.outer(scale, scale)
+    return found, np.sum(vectors[:, ~seen] ** 2, axis=1)
 
 
-def identifiability(
-    hessian: Float[np.ndarray, "n n"], names: tuple[str, ...], values: Float[np.ndarray, " p"]
-) -> Identifiability:
-    """Return what the normalised Hessian says of the first ``len(names)`` unknowns, the others eliminated.
-
-    `values` are the unknowns' own, to which changes along an unseen direction are relative.
-    """
-    p = len(names)
-    reduced = hessian[:p, :p].copy()
-    if hessian.shape[0] > p:
-        rest = hessian[p:, p:]
-        scale = np.sqrt(np.maximum(np.diag(rest), 1e-300))
-        inverse = np.linalg.pinv(rest / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
-        reduced -= hessian[:p, p:] @ inverse @ hessian[p:, :p]
-    own = np.diag(hessian)[:p]
-    size = np.sqrt(np.where(own > 0.0, own, 1.0))
-    eigenvalues, vectors = np.linalg.eigh(reduced / np.outer(size, size))
-    largest = max(float(eigenvalues[-1]), 1e-300)
-    unseen = np.flatnonzero(eigenvalues <= RANK * largest)
-    smallest = max(float(eigenvalues[0]), 0.0)
-    relative = size * np.where(values != 0.0, np.abs(values), 1.0)
-    directions: list[dict[str, float]] = []
-    for k in unseen:
-        weights = vectors[:, k] / relative
-        weights = weights / np.max(np.abs(weights))
-        directions.append({name: float(w) for name, w in zip(names, weights, strict=True) if abs(w) > 1e-3})
-    return Identifiability(
-        rank=p - unseen.size,
-        free=p,
-        condition=float(np.sqrt(largest / smallest)) if smallest > RANK * largest else np.inf,
-        unidentifiable=tuple(directions),
-    )
+def with_infinities(
+    matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "p p"]:
+    """Return a covariance in which what is not seen has infinite variance."""
+    lost = unseen > 1e-6
+    found = 0.5 * (matrix + matrix.T)
+    found[lost, :] = found[:, lost] = np.inf
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from seaopt.simulation.simulate import input_samples
 from seaopt.units import same_dimension
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+MAX_DRIFT = 5
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
@@ -45,14 +47,20 @@ class Experiment:
         Unknown in each segment; zero; or known (zero where left out).
     offset : bool or mapping
         One unknown offset an output; none; or known ones.
+    drift : int
+        Slow drift of the sensors: order, up to 5, of a polynomial over the log that is added to each output (Legendre's,
+        so that the offset stays the mean). 0: none.
     gain : mapping of output to float or Parameter
-        measured = gain * output + offset; 1 where left out. A free Parameter is estimated.
+        measured = gain * output + offset + drift; 1 where left out. A free Parameter is estimated.
     delay_s : float or Parameter
         Of the input; a free Parameter is estimated.
     hold : {"zero", "first"}
         The input between samples: a command is held, a measured current is better drawn as a line.
     gaps : {"split", "error"}
         A gap in the log starts a new segment with its own initial state, or is an error.
+    shots : int
+        Cut each segment into so many that start from states of their own: for a plant that runs away in simulation, at
+        the price of what the joints would tell.
 
     Raises
     ------
@@ -68,10 +76,12 @@ class Experiment:
     sigma: Mapping[str, float] = field(default_factory=dict[str, float])
     initial_state: InitialState = "estimate"
     offset: bool | Mapping[str, float] = True
+    drift: int = 0
     gain: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
     delay_s: float | Parameter = 0.0
     hold: Hold = "zero"
     gaps: Literal["split", "error"] = "split"
+    shots: int = 1
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -129,6 +139,11 @@ class Experiment:
                 raise EstimationError(
                     f"experiment {self.name}: sigma of {name} = {value:g} is not positive; leave it out to estimate it"
                 )
+        if isinstance(self.drift, bool) or not 0 <= self.drift <= MAX_DRIFT:
+            raise EstimationError(
+                f"experiment {self.name}: drift = {self.drift!r} is not the order of a polynomial; "
+                f"give 0 (none) to {MAX_DRIFT}"
+            )
         if isinstance(self.initial_state, str):
             if self.initial_state not in ("estimate", "rest"):
                 raise EstimationError(
@@ -142,6 +157,8 @@ class Experiment:
                         f'experiment {self.name}: initial_state names "{name}", which is not a state of '
                         f"{self.plant.name}; {suggestion(name, self.plant.states)}"
                     )
+        if isinstance(self.shots, bool) or self.shots < 1:
+            raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
         if self.gaps == "error" and len(self.log.segments) > 1:
             count = _counted(len(self.log.segments) - 1, "gap")
             raise EstimationError(
@@ -156,17 +173,31 @@ class Experiment:
     def segments(self, holdout: float = 0.0) -> list[Segment]:
         """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""
         u = input_samples(self.plant, self.log)
-        y = np.column_stack([self.log[name] for name in self.outputs])
+        y = tuple(self.log[name] for name in self.outputs)
         clock = self.log.time - self.log.time[0]
-        used = np.repeat((clock <= (1.0 - holdout) * clock[-1])[:, None], y.shape[1], axis=1).astype(np.uint8)
+        used = (clock <= (1.0 - holdout) * clock[-1]).astype(np.uint8) if holdout else None
+        step = 2.0 * self.log.period / clock[-1]
         return [
             Segment(
-                u=np.ascontiguousarray(u[piece]),
-                y=np.ascontiguousarray(y[piece]),
-                keep=np.ascontiguousarray(used[piece]) if holdout else None,
+                u=tuple(channel[piece] for channel in u),
+                y=tuple(channel[piece] for channel in y),
+                keep=() if used is None else (used[piece],) * len(y),
                 start_s=float(self.log.time[piece.start]),
+                drift_span=(2.0 * float(clock[piece.start] / clock[-1]) - 1.0, step),
             )
-            for piece in self.log.segments
+            for piece in self.pieces
+        ]
+
+    @property
+    def pieces(self) -> list[slice]:
+        """The stretches that are simulated each from a state of its own."""
+        if self.shots == 1:
+            return self.log.segments
+        return [
+            slice(int(a), int(b))
+            for whole in self.log.segments
+            for a, b in pairwise(np.linspace(whole.start, whole.stop, self.shots + 1).astype(int))
+            if b - a >= 2
         ]
 
     def renamed(self, name: str) -> Experiment:

@@ -7,14 +7,15 @@ At each iterate the step solves
 over the unknowns that are not held by a bound, with :math:`H = J^T J` and Marquardt's scaling (SIAM J. 11(2), 1963),
 is clipped to the bounds, and is taken if the cost falls; :math:`\lambda` follows Nielsen's rule (IMM-REP-1999-05).
 Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance to the minimum
-in standard deviations: the search ends when that distance is negligible.
+in standard deviations: the search ends when that distance is negligible. An evaluation may move the point (to the best
+linear unknowns, see `residuals`); those unknowns are not damped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -23,6 +24,7 @@ from seaopt.estimation.residuals import Evaluation
 
 Status = Literal["converged", "max_iterations", "stalled"]
 Callback = Callable[[int, float], None]
+Evaluate = Callable[[Any, "Evaluation | None", float], Evaluation]
 
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE = 1e-12  # of the cost
@@ -40,8 +42,8 @@ class Solution:
 
 
 def minimise(
-    evaluate: Callable[[Float[np.ndarray, " n"]], Evaluation],
-    start: Float[np.ndarray, " n"],
+    evaluate: Evaluate,
+    start: Float[np.ndarray, " n"] | Evaluation,
     low: Float[np.ndarray, " n"],
     high: Float[np.ndarray, " n"],
     *,
@@ -54,9 +56,11 @@ def minimise(
     Parameters
     ----------
     evaluate : callable
-        Cost, gradient and Gauss-Newton Hessian at a point.
-    start, low, high : array, shape (n,)
-        First point and bounds.
+        (z, where the step came from, damping) -> cost, gradient and Gauss-Newton Hessian at z.
+    start : array, shape (n,), or Evaluation
+        First point, or what was found there.
+    low, high : array, shape (n,)
+        Bounds.
     reach : array, shape (n,), optional
         No step is longer than twice the larger of this and the present value, unknown by unknown: a far start must not
         be thrown out of the world. Infinite entries are free.
@@ -66,15 +70,15 @@ def minimise(
         Called with the iteration and the cost.
 
     """
-    z = np.clip(start, low, high)
-    here = evaluate(z)
+    here = start if isinstance(start, Evaluation) else evaluate(np.clip(start, low, high), None, 0.0)
+    z = here.z
     if not np.isfinite(here.cost):
         message = "the simulation overflows at the first guess; start closer or check units"
         return Solution(z=z, evaluation=here, status="stalled", message=message, iterations=0)
     damping, growth = 1e-4, 2.0
     for iteration in range(1, max_iterations + 1):
         held = _held(z, here, low, high)
-        distance = _decrement(here, held)
+        distance = _decrement(here, held) + 2.0 * here.pending
         if distance <= DECREMENT + RELATIVE * here.cost:
             return Solution(
                 z=z, evaluation=here, status="converged", iterations=iteration - 1,
@@ -86,16 +90,16 @@ def minimise(
             step = step / max(1.0, float(np.max(size)))
         trial = np.clip(z + step, low, high)
         moved = trial - z
-        if not np.any(np.abs(moved) > 1e-15 * np.abs(z)):
+        if not np.any(np.abs(moved) > 1e-15 * np.abs(z)) and damping > 1.0:
             return Solution(
                 z=z, evaluation=here, status="stalled", iterations=iteration,
                 message="no smaller step can be told from rounding, and the gradient is not zero",
             )  # fmt: skip
-        predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved)
-        there = evaluate(trial)
+        predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved) + here.pending
+        there = evaluate(trial, here, damping)
         ratio = (here.cost - there.cost) / predicted if predicted > 0.0 else -1.0
         if np.isfinite(there.cost) and ratio > 1e-4:
-            z, here = trial, there
+            z, here = there.z, there
             damping = max(damping * max(1.0 / 9.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-12)
             growth = 2.0
         else:
@@ -132,7 +136,7 @@ def _decrement(here: Evaluation, held: Bool[np.ndarray, " n"]) -> float:
 
 def _step(here: Evaluation, held: Bool[np.ndarray, " n"], damping: float) -> Float[np.ndarray, " n"]:
     matrix, scale = _scaled(here, held)
-    damped = matrix + damping * np.eye(scale.size)
+    damped = matrix + np.diag(np.where(here.undamped[~held], 1e-12, damping))
     step = np.zeros(held.size)
     step[~held] = -np.linalg.solve(damped, here.gradient[~held] / scale) / scale
     return step

@@ -1,24 +1,36 @@
-"""The weighted least-squares problem of a fit, evaluated by one pass a segment.
+r"""The weighted least-squares problem of a fit, evaluated by one pass a segment.
 
 Residuals are in units of sigma: the cost is half their squared norm plus half that of the priors' residuals. A pass
 gives each output's Gram matrix of [residual, derivatives]; weighting by 1/sigma^2 and adding up gives the cost, its
 gradient and the Gauss-Newton Hessian.
+
+Residuals are affine in some unknowns :math:`\nu` (offsets, drifts, initial states of linear plants). With squares as the
+loss each evaluation moves to the best of them, which the same Gram matrices give exactly (variable projection, Golub
+and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
+
+.. math:: \nu^* = \nu - H_{\nu\nu}^{-1} g_\nu, \qquad
+          c^* = c - \tfrac12 g_\nu^T H_{\nu\nu}^{-1} g_\nu, \qquad
+          g_\zeta^* = g_\zeta - H_{\zeta\nu} H_{\nu\nu}^{-1} g_\nu .
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.simulation import Clock, Pass, Point, Segment, Weights, run_pass
+from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, run_passes
+
+if TYPE_CHECKING:
+    from seaopt.estimation.observer import Observer
+
+ALONE = 50_000  # samples below which experiments are not worth a thread each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,18 +52,43 @@ class Huber:
     threshold: float = 1.345
 
 
-Loss = Linear | Huber
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SoftL1:
+    """Squares near zero that bend smoothly into absolute values: 2 (sqrt(1 + s^2) - 1), s in thresholds.
+
+    Parameters
+    ----------
+    threshold : float
+        In sigma.
+
+    """
+
+    threshold: float = 1.345
+
+
+Loss = Linear | Huber | SoftL1
+_NAMES: dict[type, RobustLoss] = {Linear: "square", Huber: "huber", SoftL1: "soft_l1"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evaluation:
-    """Cost, gradient and Gauss-Newton Hessian at a point, and each output's weighted sum of squares and count."""
+    """Cost, gradient and Gauss-Newton Hessian at `z`, and each output's weighted sum of squares and count.
 
+    `passes` were made at `origin`, which differs from `z` in the linear unknowns alone. `undamped` tells which unknowns
+    a step may change at will: the linear ones. `pending` is the fall of the cost still expected from unknowns that are
+    not in z (see `shooting`).
+    """
+
+    z: Float[np.ndarray, " n"]
     cost: float
     gradient: Float[np.ndarray, " n"]
     hessian: Float[np.ndarray, "n n"]
     squares: tuple[Float[np.ndarray, " ny"], ...]
     counts: tuple[Float[np.ndarray, " ny"], ...]
+    undamped: Bool[np.ndarray, " n"]
+    origin: Float[np.ndarray, " n"]
+    passes: tuple[tuple[Pass, ...], ...]
+    pending: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,12 +103,16 @@ class Residuals:
         What may change.
     sigma : tuple of arrays, shape (ny,)
         Of the filtered residual, one array an experiment.
-    loss : Linear or Huber
+    loss : Linear, Huber or SoftL1
         Applied to residuals in sigma.
     band_hz : (low, high) or None
         Residuals are filtered to this band.
     substeps : tuple of int
         Integration steps a sample, one an experiment.
+    observers : tuple of Observer or None
+        One an experiment: the residual is then the error of the prediction one sample ahead.
+    holdout : float
+        Last fraction of each log that gets no weight.
 
     """
 
@@ -82,15 +123,17 @@ class Residuals:
     loss: Loss = Linear()
     band_hz: tuple[float, float] | None = None
     substeps: tuple[int, ...] = ()
+    observers: tuple[Observer, ...] | None = None
+    holdout: float = 0.0
 
-    def point(self, e: int, s: int, z: Float[np.ndarray, " n"]) -> Point:
-        """Return where the pass of experiment e, segment s is made."""
+    def point(self, e: int, z: Float[np.ndarray, " n"]) -> Point:
+        """Return where the passes of experiment e are made."""
         experiment, places = self.experiments[e], self.unknowns.locals_of[e]
-        return Point(
+        point = Point(
             theta=self.unknowns.theta(self.unknowns.models[e], z),
-            x0=np.array([slot.at(z) for slot in places.initial[s]]),
             offset=np.array([slot.at(z) for slot in places.offset]),
             gain=np.array([slot.at(z) for slot in places.gain]),
+            drift=np.array([[slot.at(z) for slot in row] for row in places.drift]),
             clock=Clock(
                 period=experiment.log.period,
                 hold=experiment.hold,
@@ -99,62 +142,115 @@ class Residuals:
             ),
             substeps=self.substeps[e] if self.substeps else 1,
         )
+        if self.observers is None:
+            return point
+        noise = np.array([slot.at(z) for slot in places.noise])
+        return replace(point, correction=self.observers[e].correction(self.unknowns.models[e], point, noise))
+
+    def start(self, e: int, s: int, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nx"]:
+        """Return the state at the first sample of a segment."""
+        return np.array([slot.at(z) for slot in self.unknowns.locals_of[e].initial[s]])
 
     def weights(self, e: int) -> Weights:
         """Return the filter and loss of experiment e."""
         knee = np.full(len(self.sigma[e]), np.inf)
-        if isinstance(self.loss, Huber):
+        if not isinstance(self.loss, Linear):
             knee = self.loss.threshold * self.sigma[e]
         sections, settle = band_filter(self.band_hz, self.experiments[e].log.period)
-        return Weights(sections=sections, settle=settle, knee=knee)
+        return Weights(sections=sections, settle=settle, knee=knee, loss=_NAMES[type(self.loss)])
 
-    def columns_of(self, e: int, s: int, output: int) -> list[int | None]:
-        """Return, for each derivative column of a pass, its unknown; None where that is known."""
-        places, model = self.unknowns.locals_of[e], self.unknowns.models[e]
-        index: list[int | None] = [*self.unknowns.theta_index(model)]
-        if places.delay.index is not None:
-            index.append(places.delay.index)
-        index += [slot.index for slot in places.initial[s]]
-        return [*index, places.offset[output].index, places.gain[output].index]
+    def columns(self, e: int, s: int) -> list[Int[np.ndarray, " nc"]]:
+        """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""
+        return self.unknowns.columns(e, s, self.observers is not None)
 
     def run(self, e: int, s: int, z: Float[np.ndarray, " n"], **keep: bool) -> Pass:
         """Run the pass of experiment e, segment s."""
-        return run_pass(self.unknowns.models[e], self.segments[e][s], self.point(e, s, z), self.weights(e), **keep)
+        model, start = self.unknowns.models[e], self.start(e, s, z)[None]
+        return run_passes(model, self.segments[e][s], self.point(e, z), start, self.weights(e), **keep)
 
-    def map(self, call: Callable[[int, int], Any]) -> list[list[Any]]:
-        """Call for every (experiment, segment), in order."""
-        return [[call(e, s) for s in range(len(self.segments[e]))] for e in range(len(self.experiments))]
+    def _passes_of(self, e: int, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+        model, point, weights = self.unknowns.models[e], self.point(e, z), self.weights(e)
+        pieces = enumerate(self.segments[e])
+        return tuple(run_passes(model, piece, point, self.start(e, s, z)[None], weights) for s, piece in pieces)
 
-    def evaluate(self, z: Float[np.ndarray, " n"]) -> Evaluation:
-        """Return cost, gradient and Hessian at `z`; the cost is infinite where the simulation overflows."""
-        n = z.size
+    def passes(self, z: Float[np.ndarray, " n"]) -> tuple[tuple[Pass, ...], ...]:
+        """Run every pass; experiments in threads of their own where they are long enough."""
+        from seaopt.simulation.compiled import threads
+
+        count = len(self.experiments)
+        if count < 2 or sum(piece.n for row in self.segments for piece in row) < ALONE:
+            return tuple(self._passes_of(e, z) for e in range(count))
+        return tuple(threads().map(lambda e: self._passes_of(e, z), range(count)))
+
+    def evaluate(
+        self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0
+    ) -> Evaluation:
+        """Return cost, gradient and Hessian at the best linear unknowns; the cost is infinite if the plant overflows."""
+        del here, damping  # all unknowns are in z
+        return self.assemble(z, self.passes(z))
+
+    def assemble(self, z: Float[np.ndarray, " n"], passes: tuple[tuple[Pass, ...], ...]) -> Evaluation:
+        """Return the evaluation that passes at `z` give: other sigmas need no other passes."""
+        n, unknowns = z.size, self.unknowns
         cost, gradient, hessian = 0.0, np.zeros(n), np.zeros((n, n))
-        squares = tuple(np.zeros(len(sigma)) for sigma in self.sigma)
-        counts = tuple(np.zeros(len(sigma)) for sigma in self.sigma)
-        passes = self.map(lambda e, s: self.run(e, s, z))
         for e, row in enumerate(passes):
             for s, found in enumerate(row):
-                for o, sigma in enumerate(self.sigma[e]):
-                    gram = found.gram[o] / sigma**2
-                    cost += float(found.loss[o]) / sigma**2
-                    index = self.columns_of(e, s, o)
-                    kept = [i for i, k in enumerate(index) if k is not None]
-                    place = [k for k in index if k is not None]
-                    gradient[place] += gram[0, 1:][kept]
-                    hessian[np.ix_(place, place)] += gram[1:, 1:][np.ix_(kept, kept)]
-                    squares[e][o] += found.gram[o, 0, 0]
-                    counts[e][o] += found.count[o]
-        prior = (z - self.unknowns.start) / self.unknowns.prior_std
+                for o, places in enumerate(self.columns(e, s)):
+                    gram = found.gram[0, o] / self.sigma[e][o] ** 2
+                    cost += float(found.loss[0, o]) / self.sigma[e][o] ** 2
+                    used = np.flatnonzero(places >= 0)
+                    index = places[used]
+                    gradient[index] += gram[0, 1 + used]
+                    hessian[np.ix_(index, index)] += gram[np.ix_(1 + used, 1 + used)]
+        prior = (z - unknowns.start) / unknowns.prior_std
         cost += 0.5 * float(prior @ prior)
-        gradient += prior / self.unknowns.prior_std
-        hessian[np.diag_indices(n)] += self.unknowns.prior_std**-2.0
-        if not (np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))):
-            cost = np.inf
-        return Evaluation(cost=cost, gradient=gradient, hessian=hessian, squares=squares, counts=counts)
+        gradient += prior / unknowns.prior_std
+        hessian[np.diag_indices(n)] += unknowns.prior_std**-2.0
+        finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
+        linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
+        moved = np.zeros(n)
+        if finite and np.any(linear):
+            moved[linear] = -_solved(hessian[np.ix_(linear, linear)], gradient[linear])
+            cost += 0.5 * float(moved @ gradient)
+            gradient = np.where(linear, 0.0, gradient + hessian @ moved)
+        squares, counts = self._sums(passes, moved)
+        return Evaluation(
+            z=z + moved, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian, squares=squares,
+            counts=counts, undamped=linear, origin=z, passes=passes,
+        )  # fmt: skip
+
+    @property
+    def exactly_linear(self) -> bool:
+        """Whether the linear unknowns' best values follow from one evaluation."""
+        if not isinstance(self.loss, Linear):
+            return False
+        return self.observers is None or all(model.linear for model in self.unknowns.models)
+
+    def _sums(
+        self, passes: tuple[tuple[Pass, ...], ...], moved: Float[np.ndarray, " n"]
+    ) -> tuple[tuple[Float[np.ndarray, " ny"], ...], tuple[Float[np.ndarray, " ny"], ...]]:
+        """Return each output's sum of squares after the linear unknowns have moved, and its count."""
+        squares = tuple(np.zeros(len(sigma)) for sigma in self.sigma)
+        counts = tuple(np.zeros(len(sigma)) for sigma in self.sigma)
+        for e, row in enumerate(passes):
+            for s, found in enumerate(row):
+                for o, places in enumerate(self.columns(e, s)):
+                    step = np.concatenate([[1.0], np.where(places >= 0, moved[places], 0.0)])
+                    squares[e][o] += max(float(step @ found.gram[0, o] @ step), 0.0)
+                    counts[e][o] += found.count[0, o]
+        return squares, counts
 
     def with_sigma(self, sigma: tuple[Float[np.ndarray, " ny"], ...]) -> Residuals:
         """Return the problem with other sigmas."""
         return replace(self, sigma=sigma)
+
+
+def _solved(matrix: Float[np.ndarray, "m m"], vector: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return matrix^-1 vector over what is seen; the rest stays where it is."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    seen = values > 1e-13 * max(values[-1], 1e-300)
+    return (vectors[:, seen] @ ((vectors[:, seen].T @ (vector / scale)) / values[seen])) / scale
 
 
 @lru_cache(maxsize=32)

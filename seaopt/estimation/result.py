@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import FileError
-from seaopt.estimation.covariance import Covariance, Identifiability
+from seaopt.estimation.covariance import Covariance, Errors
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.identifiability import Identifiability
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.simulation import Clock, Point, make_model, run_pass
+from seaopt.simulation import Clock, Point, make_model, run_passes
 
 SCHEMA = "seaopt/fit/1"
 STATUSES = ("converged", "max_iterations", "stalled", "not_identifiable")
@@ -33,6 +34,8 @@ class OutputFit:
         The same over the samples kept back; None if there are none.
     band_fit_percent : float or None
         The same for the signals filtered to the fit's band; None without one.
+    one_step_fit_percent : float or None
+        The same for the prediction one sample ahead, of a prediction-error fit; None otherwise.
     rms_residual : float
         Of the samples used, unfiltered, in `unit`.
     sigma : float
@@ -51,13 +54,16 @@ class OutputFit:
     unit: str
     whiteness_p: float
     band_fit_percent: float | None = None
+    one_step_fit_percent: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nuisance:
     """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment.
 
-    `substeps` is how many integration steps a sample took (a linear plant needs one).
+    `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise over
+    each state's size (of a prediction-error fit), `substeps` how many integration steps a sample took (a linear plant
+    needs one).
     """
 
     delay_s: float
@@ -65,6 +71,8 @@ class Nuisance:
     offset: dict[str, float]
     initial_state: tuple[dict[str, float], ...]
     substeps: int = 1
+    drift: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
+    noise: dict[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,8 +124,17 @@ class Fit:
         Least-squares iterations; samples that counted, all outputs together.
     wall_s : float
         Seconds from call to result.
-    step_error_sigma : float
-        Largest integration error in an output, in sigma; zero for linear plants, which are discretised exactly.
+    step_error_sigma, step_error_parameter : float
+        Largest integration error in an output, in sigma, and in a parameter, in its standard deviations; zero for linear
+        plants, which are discretised exactly.
+    log_likelihood : float
+        Gaussian, with each output's sigma at its best value.
+    unknowns : int
+        All that was estimated, experiments' own included, sigmas not.
+    method : str
+        "output_error", "multiple_shooting" or "prediction_error".
+    residuals : list of lists of Errors
+        Of each experiment and segment; empty when read from a file.
     experiments : tuple of Experiment
         The data; empty when read from a file.
 
@@ -137,6 +154,11 @@ class Fit:
     samples: int
     wall_s: float
     step_error_sigma: float = 0.0
+    step_error_parameter: float = 0.0
+    log_likelihood: float = math.nan
+    unknowns: int = 0
+    method: str = "output_error"
+    residuals: list[list[Errors]] = field(default_factory=list[list[Errors]], repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
 
     @property
@@ -144,24 +166,43 @@ class Fit:
         """Whether the search converged and every free parameter can be told."""
         return self.status == "converged"
 
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, -2 log L + 2 k, with k the unknowns and one sigma an output."""
+        return 2.0 * self._count - 2.0 * self.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, -2 log L + k log N."""
+        return self._count * math.log(max(self.samples, 1)) - 2.0 * self.log_likelihood
+
+    @property
+    def _count(self) -> int:
+        return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
+
     def predict(self, experiment: Experiment) -> Prediction:
         """Return measured and model outputs of one of the fit's experiments."""
         own = self.nuisance[experiment.name]
         model = make_model(experiment.plant, self.parameters, (), experiment.outputs)
         n = len(experiment.log)
         y = np.full((n, len(experiment.outputs)), np.nan)
-        gain = np.array([own.gain[name] for name in experiment.outputs])
-        offset = np.array([own.offset[name] for name in experiment.outputs])
-        clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=own.delay_s)
-        pieces = zip(experiment.segments(), experiment.log.segments, own.initial_state, strict=True)
-        for segment, piece, state in pieces:
-            point = Point(
-                theta=np.zeros(0), x0=np.array(list(state.values())), offset=offset, gain=gain, clock=clock,
-                substeps=own.substeps,
-            )  # fmt: skip
-            found = run_pass(model, segment, point, outputs=True).outputs
+        point = Point(
+            theta=np.zeros(0),
+            gain=np.array([own.gain[name] for name in experiment.outputs]),
+            offset=np.array([own.offset[name] for name in experiment.outputs]),
+            clock=Clock(period=experiment.log.period, hold=experiment.hold, delay_s=own.delay_s),
+            drift=np.zeros((len(experiment.outputs), 0)),
+            substeps=own.substeps,
+        )
+        for segment, piece, state in zip(experiment.segments(), experiment.pieces, own.initial_state, strict=True):
+            found = run_passes(model, segment, point, np.array([list(state.values())]), outputs=True).outputs
             assert found is not None
-            y[piece] = found * gain + offset
+            y[piece] = found * point.gain + point.offset
+            first, step = segment.drift_span
+            for o, name in enumerate(experiment.outputs):
+                if own.drift.get(name):
+                    series = np.concatenate([[0.0], own.drift[name]])
+                    y[piece, o] += np.polynomial.legendre.legval(first + step * np.arange(segment.n), series)
         log = experiment.log
         return Prediction(
             time=log.time,
@@ -195,9 +236,17 @@ class Fit:
                 "free": self.identifiability.free,
                 "condition": self.identifiability.condition,
                 "unidentifiable": list(self.identifiability.unidentifiable),
+                "weak": list(self.identifiability.weak),
+                "structural_rank": self.identifiability.structural_rank,
             },
             "experiments": {name: _fields(item) for name, item in self.nuisance.items()},
             "step_error_sigma": self.step_error_sigma,
+            "step_error_parameter": self.step_error_parameter,
+            "method": self.method,
+            "log_likelihood": self.log_likelihood,
+            "unknowns": self.unknowns,
+            "aic": self.aic,
+            "bic": self.bic,
         }
 
     @classmethod
@@ -228,6 +277,7 @@ class Fit:
             for output, item in row.items():
                 held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"
                 held += "" if item.band_fit_percent is None else f", in the band {item.band_fit_percent:.2f} %"
+                held += "" if item.one_step_fit_percent is None else f", one step {item.one_step_fit_percent:.2f} %"
                 lines.append(
                     f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
                     f"rms residual {item.rms_residual:.4g} {item.unit}"
@@ -303,17 +353,24 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
             name: Nuisance(
                 delay_s=item["delay_s"], gain=item["gain"], offset=item["offset"],
                 initial_state=tuple(item["initial_state"]), substeps=int(item.get("substeps", 1)),
+                drift={output: tuple(row) for output, row in item.get("drift", {}).items()},
+                noise=dict(item.get("noise", {})),
             )
             for name, item in content.get("experiments", {}).items()
         },
         identifiability=Identifiability(
             rank=found["rank"], free=found["free"], condition=_number(found["condition"], math.inf),
-            unidentifiable=tuple(found["unidentifiable"]),
+            unidentifiable=tuple(found["unidentifiable"]), weak=tuple(found.get("weak", ())),
+            structural_rank=int(found.get("structural_rank", -1)),
         ),
         cost=_number(content["cost"], math.inf),
         iterations=content["iterations"],
         samples=content["samples"],
         wall_s=content["wall_s"],
         step_error_sigma=float(content.get("step_error_sigma", 0.0)),
+        step_error_parameter=float(content.get("step_error_parameter", 0.0)),
+        log_likelihood=_number(content.get("log_likelihood"), math.nan),
+        unknowns=int(content.get("unknowns", 0)),
+        method=str(content.get("method", "output_error")),
         experiments=experiments,
     )  # fmt: skip

@@ -6,13 +6,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.experiment import Experiment
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.linear import point
 from seaopt.simulation import Model, make_model
+
+
+NOISE_START, NOISE_PRIOR = math.log(1e-2), 3.0  # of the logarithm of process noise over the state's size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,12 +32,17 @@ class Slot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Locals:
-    """The slots of one experiment: delay, gain and offset an output, initial state a segment."""
+    """The slots of one experiment: delay; gain, offset and drift an output; initial state a segment.
+
+    `noise` is there for prediction-error fits alone: logarithms of the process noise a state.
+    """
 
     delay: Slot
     gain: tuple[Slot, ...]
     offset: tuple[Slot, ...]
+    drift: tuple[tuple[Slot, ...], ...]
     initial: tuple[tuple[Slot, ...], ...]
+    noise: tuple[Slot, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,6 +57,8 @@ class Unknowns:
         First value and bounds.
     prior_std : array, shape (n,)
         Infinite where there is no prior; a prior is centred on `start`.
+    linear : array of bool, shape (n,)
+        What residuals are affine in: offsets, drifts, and initial states of linear plants.
     shared : int
         The first so many are parameters of the plants.
     locals_of : tuple of Locals
@@ -63,6 +73,7 @@ class Unknowns:
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
     prior_std: Float[np.ndarray, " n"]
+    linear: Bool[np.ndarray, " n"]
     shared: int
     locals_of: tuple[Locals, ...]
     models: tuple[Model, ...]
@@ -75,15 +86,35 @@ class Unknowns:
         """Return where a model's free parameters stand."""
         return [self.names.index(name) for name in model.free]
 
+    def columns(self, e: int, s: int, corrected: bool = False) -> list[Int[np.ndarray, " nc"]]:
+        """Return, for each output of experiment e, which unknown each derivative column of segment s is; -1 for none."""
+        places, model = self.locals_of[e], self.models[e]
+        own = [
+            [offset, *drift, gain]
+            for offset, drift, gain in zip(places.offset, places.drift, places.gain, strict=True)
+        ]
+        shared = self.theta_index(model)
+        shared += [] if places.delay.index is None else [places.delay.index]
+        if corrected:
+            shared += [slot.index for slot in places.noise if slot.index is not None]
+        found: list[Int[np.ndarray, " nc"]] = []
+        for o in range(len(own)):
+            rest = [slot for row in (own if corrected else [own[o]]) for slot in row]
+            index = [-1 if slot.index is None else slot.index for slot in (*places.initial[s], *rest)]
+            found.append(np.array([*shared, *index], dtype=int))
+        return found
+
 
 class _Builder:
     """Collects unknowns one by one; lives only inside `collect`."""
 
     def __init__(self) -> None:
         self.items: list[Parameter] = []
+        self.linear: list[bool] = []
 
-    def add(self, item: Parameter) -> Slot:
+    def add(self, item: Parameter, linear: bool = False) -> Slot:
         self.items.append(item)
+        self.linear.append(linear)
         return Slot(value=item.value, index=len(self.items) - 1)
 
     def maybe(self, given: float | Parameter, name: str, low: float) -> Slot:
@@ -100,8 +131,8 @@ class _Builder:
         )  # fmt: skip
 
 
-def collect(experiments: tuple[Experiment, ...], params: ParameterSet) -> Unknowns:
-    """List the unknowns of a fit.
+def collect(experiments: tuple[Experiment, ...], params: ParameterSet, noise: bool = False) -> Unknowns:
+    """List the unknowns of a fit; with `noise`, those of the process noise too.
 
     Raises
     ------
@@ -122,7 +153,8 @@ def collect(experiments: tuple[Experiment, ...], params: ParameterSet) -> Unknow
         builder.add(params[name])
     shared = len(builder.items)
     models = tuple(make_model(e.plant, params, params.free_names, e.outputs) for e in experiments)
-    places = tuple(_locals(builder, experiment) for experiment in experiments)
+    pairs = zip(experiments, models, strict=True)
+    places = tuple(_locals(builder, experiment, model.linear, noise) for experiment, model in pairs)
     items = builder.items
     return Unknowns(
         names=tuple(item.name for item in items),
@@ -130,35 +162,65 @@ def collect(experiments: tuple[Experiment, ...], params: ParameterSet) -> Unknow
         low=np.array([item.min for item in items]),
         high=np.array([item.max for item in items]),
         prior_std=np.array([item.prior_std if item.prior_std is not None else math.inf for item in items]),
+        linear=np.array(builder.linear),
         shared=shared,
         locals_of=places,
         models=models,
     )
 
 
-def _locals(builder: _Builder, experiment: Experiment) -> Locals:
-    name, plant = experiment.name, experiment.plant
+def _locals(builder: _Builder, experiment: Experiment, linear: bool, noise: bool) -> Locals:
+    name = experiment.name
     delay = builder.maybe(experiment.delay_s, f"{name}.delay_s", 0.0)
     gain = tuple(builder.maybe(experiment.gain.get(o, 1.0), f"{name}.gain.{o}", -math.inf) for o in experiment.outputs)
-    offset: list[Slot] = []
-    for output in experiment.outputs:
-        if experiment.offset is True:
-            unit = plant.outputs[output]
-            offset.append(builder.add(Parameter(name=f"{name}.offset.{output}", value=0.0, unit=unit, free=True)))
-        else:
-            known = experiment.offset if experiment.offset else {}
-            offset.append(Slot(value=float(known.get(output, 0.0))))
-    initial: list[tuple[Slot, ...]] = []
-    for number in range(len(experiment.log.segments)):
-        if experiment.initial_state == "estimate":
-            label = f"{name}.initial" if number == 0 else f"{name}.initial{number + 1}"
-            initial.append(
-                tuple(
-                    builder.add(Parameter(name=f"{label}.{state}", value=0.0, unit=unit, free=True))
-                    for state, unit in plant.states.items()
-                )
+    return Locals(
+        delay=delay, gain=gain, offset=_offsets(builder, experiment), drift=_drifts(builder, experiment),
+        initial=_initial(builder, experiment, linear), noise=_noise(builder, experiment) if noise else (),
+    )  # fmt: skip
+
+
+def _free(builder: _Builder, name: str, unit: str, linear: bool = True) -> Slot:
+    return builder.add(Parameter(name=name, value=0.0, unit=unit, free=True), linear)
+
+
+def _offsets(builder: _Builder, experiment: Experiment) -> tuple[Slot, ...]:
+    if experiment.offset is True:
+        units = experiment.plant.outputs
+        return tuple(_free(builder, f"{experiment.name}.offset.{o}", units[o]) for o in experiment.outputs)
+    known = experiment.offset if experiment.offset else {}
+    return tuple(Slot(value=float(known.get(o, 0.0))) for o in experiment.outputs)
+
+
+def _drifts(builder: _Builder, experiment: Experiment) -> tuple[tuple[Slot, ...], ...]:
+    return tuple(
+        tuple(
+            _free(builder, f"{experiment.name}.drift{order}.{o}", experiment.plant.outputs[o])
+            for order in range(1, experiment.drift + 1)
+        )
+        for o in experiment.outputs
+    )
+
+
+def _initial(builder: _Builder, experiment: Experiment, linear: bool) -> tuple[tuple[Slot, ...], ...]:
+    plant = experiment.plant
+    count = len(experiment.pieces)
+    if experiment.initial_state != "estimate":
+        known = None if experiment.initial_state == "rest" else dict(experiment.initial_state)
+        return (tuple(Slot(value=float(v)) for v in point("state", plant.states, known)),) * count
+    labels = [f"{experiment.name}.initial{number + 1 if number else ''}" for number in range(count)]
+    return tuple(
+        tuple(_free(builder, f"{label}.{state}", unit, linear) for state, unit in plant.states.items())
+        for label in labels
+    )
+
+
+def _noise(builder: _Builder, experiment: Experiment) -> tuple[Slot, ...]:
+    """Add the logarithms of the process noise, relative to each state's size; a wide prior holds what is not seen."""
+    return tuple(
+        builder.add(
+            Parameter(
+                name=f"{experiment.name}.noise.{state}", value=NOISE_START, unit="-", free=True, prior_std=NOISE_PRIOR
             )
-        else:
-            known_state = None if experiment.initial_state == "rest" else dict(experiment.initial_state)
-            initial.append(tuple(Slot(value=float(v)) for v in point("state", plant.states, known_state)))
-    return Locals(delay=delay, gain=gain, offset=tuple(offset), initial=tuple(initial))
+        )
+        for state in experiment.plant.states
+    )

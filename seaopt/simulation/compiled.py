@@ -95,10 +95,10 @@ def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]
     """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives a row."""
     a, b = pattern
     lines = [f"static inline void seaopt_{name}_chain(const double *a, const double *b, const double (*restrict z)[NJP],",
-             "        double (*restrict out)[NJP]) {"]  # fmt: skip
+             "        double (*restrict out)[NJP]) {", "    const vec zero = {0.0, 0.0, 0.0, 0.0}; (void)zero;"]  # fmt: skip
     for row in range(rows):
-        terms = " + ".join(f"a[{k}] * z[{j}][j]" for k, (i, j) in enumerate(a) if i == row) or "0.0"
-        lines.append(f"    for (int j = 0; j < NJP; j++) out[{row}][j] = {terms};")
+        terms = " + ".join(f"a[{k}] * ((const vec *)z[{j}])[j]" for k, (i, j) in enumerate(a) if i == row)
+        lines.append(f"    for (int j = 0; j < NJP / 4; j++) ((vec *)out[{row}])[j] = {terms or 'zero'};")
         lines += [f"    out[{row}][{1 + j}] += b[{k}];" for k, (i, j) in enumerate(b) if i == row]
     return "\n".join([*lines, "}"])
 
@@ -120,14 +120,14 @@ def _padded(count: int) -> int:
 
 
 def _linear_data(model: Model, point: Point, layout: Layout, delayed: bool) -> Float[np.ndarray, " m"]:
-    """Return A and D of pass.c: rows of [x+; y], then their derivatives as forcing, derivatives last."""
+    """Return D and A of pass.c: rows of [x+; y], forced with derivatives last, and by the state."""
     blocks = transition(model, point.theta, point.clock)
     nx, nu, rows = model.nx, model.nu, model.nx + model.ny
     used = [*range(nx + nu * (1 + delayed))] + ([nx + 2 * nu] if _has_constant(model) else [])
     d = np.zeros((rows, len(used), _padded(layout.states)))
     d[:, :, : blocks.shape[0]] = blocks[:, :, used].transpose(1, 2, 0)
     d[:, :nx, 0] = 0.0  # the state itself goes through A
-    return np.concatenate([blocks[0, :, :nx].ravel(), d.ravel()])
+    return np.concatenate([d.ravel(), blocks[0, :, :nx].ravel()])
 
 
 def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:

@@ -19,8 +19,8 @@ import tempfile
 from functools import lru_cache
 from pathlib import Path
 
-FLAGS = ("-O3", "-std=gnu99", "-fPIC", "-shared", "-fno-math-errno")
-NATIVE = "-march=native"  # whole vectors of this processor, where the compiler knows it
+FLAGS = ("-O3", "-std=gnu99", "-fPIC", "-shared", "-fno-math-errno", "-fvisibility=hidden")
+NATIVE = ("-march=native", "-mprefer-vector-width=256", "-mno-avx512f",)
 
 
 def find_compiler() -> list[str] | None:
@@ -96,7 +96,7 @@ def _processor() -> str:
 
 
 def _compile(compiler: list[str], source: str, library: Path) -> bool:
-    return any(_compiled([*compiler, *FLAGS, *extra], source, library) for extra in ((NATIVE,), ()))
+    return any(_compiled([*compiler, *FLAGS, *extra], source, library) for extra in (NATIVE, ()))
 
 
 def _compiled(start: list[str], source: str, library: Path) -> bool:

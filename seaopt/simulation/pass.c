@@ -23,7 +23,7 @@ typedef struct {
     long start;                    /* first row of the stretch; later than `from` is not allowed */
     double t0;                     /* time of row 0 */
     double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
-    const double *model;           /* LINEAR: A (NX + NY)(NX), D (NX + NY)(NX + NI)(NJP); else the step's settings, then c */
+    const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
     const double *correction;      /* CORRECT: NX x NY x NJP, gain and its derivatives */
     const double *x0;
     const double *offset, *gain;   /* NY */
@@ -42,13 +42,23 @@ typedef struct {
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
 } seaopt_pass_args;
 
+/* What goes on from one sample to the next. */
 typedef struct {
     double z[NX][NJP];
     double filter[NY][MAX_SECTIONS][2][NCP];
-#if !LINEAR
+} state;
+
+/* All that a sample touches stands close together: stores and loads 4096 bytes apart would wait for each other. */
+typedef struct {
+    double z[NX][NJP], next[NX][NJP], y[NY][NJP], v[NY][NCP], sum[NY][NC][NCP];
+    double filter[NY][MAX_SECTIONS][2][NCP];
+#if LINEAR
+    double model[(NX + NY) * (NX + (NX + NI) * NJP)];
+#else
     double work[SZ_W + 1];
 #endif
-} state;
+    double rho[NY], count[NY];
+} hot __attribute__((aligned(32)));
 
 static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {
     long row = k - lag;
@@ -63,19 +73,18 @@ static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {
 /* Rows of [x+; y] with all derivatives: A Z + D [x; forcing]. */
 static inline void rows(const double *restrict model, const double (*restrict z)[NJP], const double *restrict w, int first, int count,
                         double (*restrict out)[NJP]) {
-    const double *A = model + first * NX, *D = model + (NX + NY) * NX + first * NF * NJP;
+    const double *A = model + (NX + NY) * NF * NJP + first * NX, *D = model + first * NF * NJP;
     for (int r = 0; r < count; r++) {
-        double sum[NJP];
-        for (int j = 0; j < NJP; j++) sum[j] = 0.0;
-        for (int i = 0; i < NX; i++)
-            for (int j = 0; j < NJP; j++) sum[j] += A[r * NX + i] * z[i][j];
-        for (int i = 0; i < NF; i++)
-            for (int j = 0; j < NJP; j++) sum[j] += D[(r * NF + i) * NJP + j] * w[i];
-        memcpy(out[r], sum, sizeof sum);
+        for (int j = 0; j < NJP / 4; j++) {
+            vec sum = {0.0, 0.0, 0.0, 0.0};
+            for (int i = 0; i < NX; i++) sum += A[r * NX + i] * ((const vec *)z[i])[j];
+            for (int i = 0; i < NF; i++) sum += w[i] * ((const vec *)(D + (r * NF + i) * NJP))[j];
+            ((vec *)out[r])[j] = sum;
+        }
     }
 }
 
-static inline void forcing(const state *q, const seaopt_pass_args *a, long k, double *w) {
+static inline void forcing(const hot *q, const seaopt_pass_args *a, long k, double *w) {
     double u[NU];
     for (int i = 0; i < NX; i++) w[i] = q->z[i][0];
     at(a, k, a->lag_a, u);
@@ -87,17 +96,18 @@ static inline void forcing(const state *q, const seaopt_pass_args *a, long k, do
     if (NI > NU * (1 + DELAYED)) w[NF - 1] = 1.0;
 }
 
-static inline void observe(state *q, const seaopt_pass_args *a, long k, double (*restrict y)[NJP]) {
+static inline void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict y)[NJP]) {
     double w[NF + 1];
     forcing(q, a, k, w);
-    rows(a->model, (const double (*)[NJP])q->z, w, NX, NY, y);
+    rows(q->model, (const double (*)[NJP])q->z, w, NX, NY, y);
 }
 
-static inline void advance(state *q, const seaopt_pass_args *a, long k) {
-    double w[NF + 1], next[NX][NJP];
+static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
+    double w[NF + 1];
     forcing(q, a, k, w);
-    rows(a->model, (const double (*)[NJP])q->z, w, 0, NX, next);
-    memcpy(q->z, next, sizeof next);
+    rows(q->model, (const double (*)[NJP])q->z, w, 0, NX, q->next);
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NJP / 4; j++) ((vec *)q->z[i])[j] = ((vec *)q->next[i])[j];
 }
 #else
 /* In front of this file stand CasADi's functions
@@ -107,7 +117,7 @@ static inline void advance(state *q, const seaopt_pass_args *a, long k) {
 #define SETTINGS 4
 
 /* K = [f, f_x Z + f_p] at the state Z. */
-static inline void slope(state *q, double t, const double *u, const double *c, const double (*restrict z)[NJP], double (*restrict k)[NJP]) {
+static inline void slope(hot *q, double t, const double *u, const double *c, const double (*restrict z)[NJP], double (*restrict k)[NJP]) {
     double x[NX], f[NX], fx[NNZ_FX + 1], fp[NNZ_FP + 1];
     const double *arg[SZ_ARG] = {&t, x, u, c};
     double *res[SZ_RES] = {f, fx, fp};
@@ -117,30 +127,33 @@ static inline void slope(state *q, double t, const double *u, const double *c, c
     for (int i = 0; i < NX; i++) k[i][0] = f[i];
 }
 
+typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
+
 /* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. */
-static inline void one_step(state *q, double t, const double *u0, const double *u1, const double *c, double h, double dh) {
+static inline void one_step(hot *q, double t, const double *u0, const double *u1, const double *c, double h, double dh) {
     static const double reach[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
-    double k[NX][NJP], z[NX][NJP], sum[NX][NJP], u[NU];
+    hot_columns k, z, sum;
+    double u[NU];
     memcpy(z, q->z, sizeof z);
     memcpy(sum, q->z, sizeof sum);
     for (int stage = 0; stage < 4; stage++) {
         const double part = reach[stage] * h;
         if (stage)
             for (int i = 0; i < NX; i++) {
-                for (int j = 0; j < NJP; j++) z[i][j] = q->z[i][j] + part * k[i][j];
+                for (int j = 0; j < NJP / 4; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
                 if (DELAYED) z[i][1 + NQ] += reach[stage] * dh * k[i][0];
             }
         for (int i = 0; i < NU; i++) u[i] = u0[i] + reach[stage] * (u1[i] - u0[i]);
         slope(q, t + part, u, c, (const double (*)[NJP])z, k);
         for (int i = 0; i < NX; i++) {
-            for (int j = 0; j < NJP; j++) sum[i][j] += weight[stage] * h * k[i][j];
+            for (int j = 0; j < NJP / 4; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
             if (DELAYED) sum[i][1 + NQ] += weight[stage] * dh * k[i][0];
         }
     }
     memcpy(q->z, sum, sizeof sum);
 }
 
-static inline void observe(state *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP]) {
+static inline void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP]) {
     const double *m = a->model;
     double x[NX], u[NU], y[NY], c[NNZ_HX + 1], d[NNZ_HP + 1], t = a->t0 + k * m[1];
     at(a, k, m[2] > 0.0 ? a->lag_b : a->lag_a, u);
@@ -153,7 +166,7 @@ static inline void observe(state *q, const seaopt_pass_args *a, long k, double (
 }
 
 /* With a fractional delay the older input u_b acts first, for m[2] seconds, then u_a. */
-static void advance(state *q, const seaopt_pass_args *a, long k) {
+static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
     const double *m = a->model;
     const long steps = (long)m[0];
     const int foh = m[3] > 0.5;
@@ -188,8 +201,8 @@ static inline void residual(const seaopt_pass_args *a, int o, const double *rest
         if (d > 0) older = basis[d - 1];
         value += a->drift[o * ND + d] * basis[d];
     }
-    for (int j = 0; j < NJ; j++) v[j] = gain * y[j];
-    for (int j = NJ; j < NCP; j++) v[j] = 0.0;
+    for (int j = 0; j < NJP / 4; j++) ((vec *)v)[j] = gain * ((const vec *)y)[j];
+    for (int j = NJP; j < NCP; j++) v[j] = 0.0;
     v[0] = value;
     double *own = v + NS + (CORRECT ? o * OWN : 0);
     own[0] += 1.0;
@@ -210,9 +223,9 @@ static inline void filtered(const seaopt_pass_args *a, double *restrict v, doubl
 }
 
 static inline double robust(const seaopt_pass_args *a, int o, double r, double *rho) {
-    const double knee = a->knee[o], size = fabs(r), part = r / knee;
+    const double knee = a->knee[o], size = fabs(r);
     if (a->loss == 2) {
-        const double root = sqrt(1.0 + part * part);
+        const double part = r / knee, root = sqrt(1.0 + part * part);
         *rho = knee * knee * (root - 1.0);
         return 1.0 / root;
     }
@@ -224,16 +237,15 @@ static inline double robust(const seaopt_pass_args *a, int o, double r, double *
     return knee / size;
 }
 
-typedef struct { double sum[NY][NC][NCP], rho[NY], count[NY]; } totals;
-
-static inline void accumulate(const seaopt_pass_args *a, long k, const double *v, int o, totals *restrict all) {
+static inline void accumulate(const seaopt_pass_args *a, hot *q, int o) {
+    const double *v = q->v[o];
     double rho, weight = robust(a, o, v[0], &rho);
-    all->rho[o] += rho;
-    all->count[o] += 1.0;
-    (void)k;
+    q->rho[o] += rho;
+    q->count[o] += 1.0;
     for (int r = 0; r < NC; r++) {
         const double wr = weight * v[r];
-        for (int c = r / 4 * 4; c < NCP; c++) all->sum[o][r][c] += wr * v[c];
+        vec *sum = (vec *)q->sum[o][r];
+        for (int c = r / 4; c < NCP / 4; c++) sum[c] += wr * ((const vec *)v)[c];
     }
 }
 
@@ -263,47 +275,55 @@ static void restore_denormals(unsigned long before) {
 #endif
 }
 
-long carry_size(void) { return sizeof(state) / sizeof(double) + 1; }
+#define EXPORTED __attribute__((visibility("default")))
 
-static void begin(state *q, const seaopt_pass_args *a) {
+EXPORTED long carry_size(void) { return sizeof(state) / sizeof(double) + 1; }
+
+static void begin(hot *q, const seaopt_pass_args *a) {
+    memset(q, 0, sizeof *q);
+#if LINEAR
+    memcpy(q->model, a->model, sizeof q->model);
+#endif
     if (a->carry && a->from > a->start) {
-        memcpy(q, a->carry, sizeof *q);
+        const state *before = (const state *)a->carry;
+        memcpy(q->z, before->z, sizeof q->z);
+        memcpy(q->filter, before->filter, sizeof q->filter);
         return;
     }
-    memset(q, 0, sizeof *q);
     for (int i = 0; i < NX; i++) { q->z[i][0] = a->x0[i]; q->z[i][1 + NP + i] = 1.0; }
 }
 
-static void deliver(const state *q, const seaopt_pass_args *a, const totals *all) {
-    if (a->carry) memcpy(a->carry, q, sizeof *q);
+static void deliver(const hot *q, const seaopt_pass_args *a) {
+    if (a->carry) {
+        state *after = (state *)a->carry;
+        memcpy(after->z, q->z, sizeof q->z);
+        memcpy(after->filter, q->filter, sizeof q->filter);
+    }
     if (a->last)
         for (int i = 0; i < NX; i++) memcpy(a->last + i * NJ, q->z[i], NJ * sizeof(double));
     for (int o = 0; o < NY; o++) {
-        a->rho[o] += all->rho[o];
-        a->count[o] += all->count[o];
+        a->rho[o] += q->rho[o];
+        a->count[o] += q->count[o];
         for (int r = 0; r < NC; r++)
-            for (int c = 0; c < NC; c++) a->gram[(o * NC + r) * NC + c] += r <= c ? all->sum[o][r][c] : all->sum[o][c][r];
+            for (int c = 0; c < NC; c++) a->gram[(o * NC + r) * NC + c] += r <= c ? q->sum[o][r][c] : q->sum[o][c][r];
     }
 }
 
 static void one_pass(const seaopt_pass_args *a) {
-    state here, *const q = &here;
-    totals all;
+    hot here, *const q = &here;
     begin(q, a);
-    memset(&all, 0, sizeof all);
     for (long k = a->from; k < a->to; k++) {
-        double y[NY][NJP], v[NY][NCP];
         int present[NY];
-        observe(q, a, k, y);
+        observe(q, a, k, q->y);
         if (a->states)
             for (int i = 0; i < NX; i++) a->states[(k - a->from) * NX + i] = q->z[i][0];
         if (a->outputs)
-            for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = y[o][0];
+            for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = q->y[o][0];
         for (int o = 0; a->y[0] && o < NY; o++) {
             const double measured = a->y[o][k];
             present[o] = isfinite(measured) && !(a->keep[o] && !a->keep[o][k]);
-            if (present[o]) residual(a, o, y[o], measured, a->tau0 + k * a->dtau, v[o]);
-            else memset(v[o], 0, sizeof v[o]);
+            if (present[o]) residual(a, o, q->y[o], measured, a->tau0 + k * a->dtau, q->v[o]);
+            else memset(q->v[o], 0, sizeof q->v[o]);
         }
         advance(q, a, k);
 #if CORRECT
@@ -311,20 +331,20 @@ static void one_pass(const seaopt_pass_args *a) {
             if (present[o])
                 for (int i = 0; i < NX; i++) {
                     const double *g = a->correction + (i * NY + o) * NJP;
-                    for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];
-                    q->z[i][0] -= g[0] * v[o][0];
+                    for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * q->v[o][j] + g[j] * q->v[o][0];
+                    q->z[i][0] -= g[0] * q->v[o][0];
                 }
 #endif
         for (int o = 0; a->y[0] && o < NY; o++) {
-            if (a->sections) filtered(a, v[o], q->filter[o]);
-            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
-            if (present[o] && k >= a->start + a->settle) accumulate(a, k, v[o], o, &all);
+            if (a->sections) filtered(a, q->v[o], q->filter[o]);
+            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, q->v[o], NC * sizeof(double));
+            if (present[o] && k >= a->start + a->settle) accumulate(a, q, o);
         }
     }
-    deliver(q, a, &all);
+    deliver(q, a);
 }
 
-int seaopt_passes(const seaopt_pass_args *list, long count) {
+EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     const unsigned long mode = flush_denormals();
     for (long i = 0; i < count; i++) one_pass(list + i);
     restore_denormals(mode);

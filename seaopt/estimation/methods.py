@@ -1,0 +1,85 @@
+"""How a plant is compared with a log: the methods of `fit`, as objects with their own options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from seaopt.errors import EstimationError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputError:
+    """Single shooting: the plant is simulated over each segment from its initial state.
+
+    Parameters
+    ----------
+    max_iterations : int
+        Of least squares.
+    search : bool
+        Look for a start: from the logs' frequency responses, over two decades around the given values, and, where that
+        ends badly, by predicting sample by sample with an observer that holds the simulation to the log. The given
+        values are kept where they explain the logs better.
+    seed : int
+        Of that search.
+
+    """
+
+    max_iterations: int = 60
+    search: bool = True
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MultipleShooting:
+    """Each segment is cut into shots that start from states of their own; the shots are joined while the fit goes on.
+
+    For plants that are unstable, or start far off: a simulation that starts anew every so often cannot run away. At the
+    end the shots join to rounding, so that the result is that of `OutputError` wherever both find it.
+
+    Parameters
+    ----------
+    segments : int
+        Shots a log segment.
+    max_iterations : int
+        Of least squares, each time the joints are made stiffer.
+    search : bool
+        Start from the logs' frequency responses where they explain the logs better than the given values.
+    seed : int
+        Of that search.
+
+    """
+
+    segments: int = 50
+    max_iterations: int = 60
+    search: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.segments < 1:
+            raise EstimationError(f"MultipleShooting(segments={self.segments}): give at least 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictionError:
+    """The residual is the error of the prediction one sample ahead, by a steady-state Kalman filter.
+
+    For plants that noise drives, not only sensors: process noise (one strength a state) and measurement noise are
+    estimated with the parameters, and the filter's gain follows from them and from the plant.
+
+    Parameters
+    ----------
+    max_iterations : int
+        Of least squares.
+    search : bool
+        Start from the logs' frequency responses where they explain the logs better than the given values.
+    seed : int
+        Of that search.
+
+    """
+
+    max_iterations: int = 60
+    search: bool = True
+    seed: int = 0
+
+
+Method = OutputError | MultipleShooting | PredictionError

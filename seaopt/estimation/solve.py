@@ -1,0 +1,320 @@
+"""From a problem to its minimum: starts, rounds of least squares, sigma, and the integration step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.estimation.covariance import errors, inverse
+from seaopt.estimation.first_guess import first_guess
+from seaopt.estimation.least_squares import Callback, Solution, minimise
+from seaopt.estimation.methods import Method
+from seaopt.estimation.observer import Observer
+from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.unknowns import Unknowns
+from seaopt.simulation import Point, Segment, run_passes
+
+STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
+STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
+EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
+MAX_SUBSTEPS = 256
+MAX_ROUNDS = 12  # of estimating sigma and choosing the step
+UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
+PLACES = 48  # over which a nonlinear plant is linearised for its filter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepError:
+    """Integration error at the minimum: largest in an output, in sigma, and in a parameter, in standard deviations."""
+
+    output: float = 0.0
+    parameter: float = 0.0
+
+    @property
+    def small(self) -> bool:
+        """Whether it may be left out of account."""
+        return self.output <= STEP_ERROR_SIGMA and self.parameter <= STEP_ERROR_PARAMETER
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solved:
+    """A minimum, and the problem with the sigma and the step with which it was found."""
+
+    problem: Residuals
+    solution: Solution
+    step_error: StepError
+
+
+def output_error(
+    problem: Residuals, method: Method, band_hz: tuple[float, float] | None, callback: Callback | None
+) -> Solved:
+    """Single shooting from the best start that can be found."""
+    best, guessed = best_start(problem, method, band_hz)
+    found = settle(problem, best, method.max_iterations, callback)
+    if not method.search or not _doubtful(found, guessed):
+        return found
+    for start in {id(z): z for z in (problem.unknowns.start, best.z)}.values():
+        predicted = held_start(found.problem, start, method.max_iterations)
+        if predicted is None:
+            continue
+        other = settle(problem, problem.evaluate(predicted), method.max_iterations, callback)
+        found = min(found, other, key=_misfit)
+        if not _doubtful(found, guessed):
+            break
+    return found
+
+
+def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
+    """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
+    unknowns, here, iterations = problem.unknowns, start, 0
+    reach = reach_of(unknowns)
+    refined, _ = _refined(problem, here.z, 0.1)
+    if refined.substeps != problem.substeps:
+        problem, here = refined, refined.evaluate(here.z)
+    for attempt in range(MAX_ROUNDS):
+        solution = minimise(
+            problem.evaluate, here, unknowns.low, unknowns.high, reach=reach, max_iterations=max_iterations,
+            callback=callback,
+        )  # fmt: skip
+        here, iterations = solution.evaluation, iterations + solution.iterations
+        solution = replace(solution, iterations=iterations)
+        if not np.isfinite(here.cost):
+            return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
+        sigma = estimated_sigma(problem, here)
+        settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(sigma, problem.sigma, strict=True))
+        finer, error = _refined(problem.with_sigma(sigma), here.z, STEP_ERROR_SIGMA)
+        if (settled and finer.substeps == problem.substeps) or attempt == MAX_ROUNDS - 1:
+            return Solved(problem=problem, solution=solution, step_error=error)
+        same = finer.substeps == problem.substeps and isinstance(problem.loss, Linear) and problem.observers is None
+        problem = finer
+        here = problem.assemble(here.origin, here.passes) if same else problem.evaluate(here.z)
+    raise AssertionError  # the last attempt returns
+
+
+def reach_of(unknowns: Unknowns) -> Float[np.ndarray, " n"]:
+    """Return the size of the plants' parameters, and infinity for what starts at zero and the experiments' own."""
+    reach = np.full(unknowns.start.size, np.inf)
+    shared = np.abs(unknowns.start[: unknowns.shared])
+    reach[: unknowns.shared] = np.where(shared > 0.0, shared, np.inf)
+    return reach
+
+
+def best_start(problem: Residuals, method: Method, band_hz: tuple[float, float] | None) -> tuple[Evaluation, bool]:
+    """Return the better of the given values and those that match the frequency responses, and whether there are such."""
+    given = problem.evaluate(problem.unknowns.start)
+    if not method.search:
+        return given, False
+    guess = first_guess(problem.experiments, problem.unknowns, band_hz, np.random.default_rng(method.seed))
+    if guess is None:
+        return given, False
+    guessed = problem.evaluate(guess)
+    return (guessed if guessed.cost <= given.cost else given), True
+
+
+def _doubtful(found: Solved, guessed: bool) -> bool:
+    """Tell whether another start is worth trying: it did not converge, or a nonlinear plant explains little."""
+    if found.solution.status != "converged" or not np.isfinite(found.solution.evaluation.cost):
+        return True
+    if guessed and all(model.linear for model in found.problem.unknowns.models):
+        return False
+    evaluation = found.solution.evaluation
+    for e, experiment in enumerate(found.problem.experiments):
+        for o, name in enumerate(experiment.outputs):
+            spread = float(np.nanstd(experiment.log[name]))
+            rms = float(np.sqrt(evaluation.squares[e][o] / max(evaluation.counts[e][o], 1.0)))
+            if rms > UNEXPLAINED * spread:
+                return True
+    return False
+
+
+def _misfit(found: Solved) -> float:
+    """Return a likelihood that does not depend on the sigmas that were assumed."""
+    evaluation = found.solution.evaluation
+    if not np.isfinite(evaluation.cost):
+        return np.inf
+    rows = zip(evaluation.squares, evaluation.counts, strict=True)
+    return float(sum(np.sum(n * np.log(np.maximum(s, 1e-300) / np.maximum(n, 1.0))) for s, n in rows))
+
+
+def held_start(problem: Residuals, start: Float[np.ndarray, " n"], iterations: int) -> Float[np.ndarray, " n"] | None:
+    """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log.
+
+    The filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain
+    is made anew from where the state has been, a few times. None where that finds nothing finite.
+    """
+    problem = replace(problem, substeps=(1,) * len(problem.experiments), loss=Linear(), band_hz=None)
+    z = start.copy()
+    for _ in range(4):
+        watched = with_observers(problem, z, follows=False)
+        if watched is None:
+            return None
+        low, high = problem.unknowns.low, problem.unknowns.high
+        solution = minimise(watched.evaluate, z, low, high, reach=reach_of(problem.unknowns), max_iterations=iterations)
+        if not np.isfinite(solution.evaluation.cost):
+            return None
+        z = solution.z
+        problem = problem.with_sigma(estimated_sigma(watched, solution.evaluation))
+    return z
+
+
+def with_observers(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: bool) -> Residuals | None:
+    """Return the problem whose residuals are errors of prediction; None where the filter finds no finite state."""
+    observers: list[Observer] = []
+    for e, experiment in enumerate(problem.experiments):
+        spread = [float(np.nanstd(experiment.log[name])) for name in experiment.outputs]
+        sensors = [noise_of(experiment.log[name], s) for name, s in zip(experiment.outputs, spread, strict=True)]
+        observer = _observer(problem, e, z, np.array(sensors), np.array(spread))
+        if observer is None:
+            return None
+        observers.append(replace(observer, follows=follows))
+    return replace(problem, observers=tuple(observers))
+
+
+def noise_of(y: Float[np.ndarray, " n"], spread: float) -> float:
+    """Return the standard deviation of white noise on a smooth signal: the median third difference, over sqrt(20)."""
+    third = np.abs(np.diff(y[np.isfinite(y)], 3))
+    noise = 1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0
+    return max(noise, EXACT * spread, 1e-300)
+
+
+def _observer(
+    problem: Residuals, e: int, z: Float[np.ndarray, " n"], sensors: Float[np.ndarray, " ny"],
+    spread: Float[np.ndarray, " ny"],
+) -> Observer | None:  # fmt: skip
+    """Return an observer whose sizes and places come from its own estimates of the state, after a few rounds."""
+    model, piece, point = problem.unknowns.models[e], problem.segments[e][0], problem.point(e, z)
+    places = np.zeros((PLACES, model.nx + model.nu))
+    size = _first_size(problem, e, point, spread)
+    observer = Observer(size=size, sensors=sensors, places=places, follows=False)
+    rows = np.linspace(0, min(piece.n, 20_000) - 1, PLACES).astype(int)
+    short = Segment(u=tuple(c[:20_000] for c in piece.u), y=tuple(c[:20_000] for c in piece.y), start_s=piece.start_s)
+    for _ in range(3):
+        correction = observer.correction(model, replace(point, clock=replace(point.clock, delay_free=False)), np.zeros(0))
+        if not np.all(np.isfinite(correction)):
+            return None
+        settings = replace(point, clock=replace(point.clock, delay_free=False), correction=correction)
+        states = run_passes(model, short, settings, np.zeros((1, model.nx)), states=True).states
+        assert states is not None
+        if not np.all(np.isfinite(states)):
+            return None
+        places = np.column_stack([states[rows], *(channel[rows] for channel in short.u)])
+        size = np.maximum(np.std(states, axis=0), 1e-9 * np.max(np.abs(size)))
+        observer = Observer(size=size, sensors=sensors, places=places, follows=False)
+    return observer
+
+
+def _first_size(
+    problem: Residuals, e: int, point: Point, spread: Float[np.ndarray, " ny"]
+) -> Float[np.ndarray, " nx"]:
+    """Return the size of each state that would show as the outputs' spread within ten samples."""
+    model = problem.unknowns.models[e]
+    observer = Observer(size=np.ones(model.nx), sensors=np.ones(model.ny), places=np.zeros((1, model.nx + model.nu)))
+    a, c = observer.plants(model, point, point.theta[None])
+    rows, power = [], np.eye(model.nx)
+    for _ in range(10):
+        rows.append(np.max(np.abs(c[0] @ power) / spread[:, None], axis=0))
+        power = a[0] @ power
+    seen = np.max(rows, axis=0)
+    return 1.0 / np.where(np.isfinite(seen) & (seen > 0.0), seen, 1.0)
+
+
+def estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.ndarray, " ny"], ...]:
+    """Return the rms of each residual where sigma is not given; never less than rounding of the signal."""
+    out: list[Float[np.ndarray, " ny"]] = []
+    robust = None if isinstance(problem.loss, Linear) else _median_scales(problem, found.z)
+    for e, experiment in enumerate(problem.experiments):
+        row: list[float] = []
+        for o, name in enumerate(experiment.outputs):
+            rms = float(np.sqrt(found.squares[e][o] / max(found.counts[e][o], 1.0)))
+            if robust is not None:
+                rms = robust[e][o]
+            floor = 1e-9 * float(np.nanmax(np.abs(experiment.log[name])))
+            row.append(experiment.sigma.get(name, max(rms, floor, 1e-300)))
+        out.append(np.array(row))
+    return tuple(out)
+
+
+def _median_scales(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[float]]:
+    """Return 1.4826 times the median absolute residual: the standard deviation of Gaussian noise under outliers."""
+    found: list[list[float]] = []
+    for e, row in enumerate(errors(problem, z)):
+        weighted = np.concatenate([error.weighted for error in row])
+        used = [weighted[weighted[:, o] != 0.0, o] for o in range(weighted.shape[1])]
+        found.append(
+            [1.4826 * float(np.median(np.abs(r))) * float(s) for r, s in zip(used, problem.sigma[e], strict=True)]
+        )
+    return found
+
+
+def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> tuple[Residuals, StepError]:
+    """Return the problem with integration steps whose error is below `allowed` sigma, and that error."""
+    substeps, worst = list(problem.substeps), StepError()
+    if all(model.linear for model in problem.unknowns.models):
+        return problem, worst
+    for e, model in enumerate(problem.unknowns.models):
+        if model.linear:
+            continue
+        while True:
+            error = step_error(replace(problem, substeps=tuple(substeps)), e, z)
+            fine = error.output <= allowed and error.parameter <= STEP_ERROR_PARAMETER * allowed / STEP_ERROR_SIGMA
+            if fine or substeps[e] >= MAX_SUBSTEPS:
+                break
+            substeps[e] *= 2
+        worst = StepError(output=max(worst.output, error.output), parameter=max(worst.parameter, error.parameter))
+    return replace(problem, substeps=tuple(substeps)), worst
+
+
+def step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> StepError:
+    """Return the integration error of experiment e, from steps of half the length (order four: 16/15 of the change).
+
+    In an output it is the largest change, in sigma. In a parameter it is the move of the minimum,
+    H^-1 (change of the gradient), in standard deviations: an error far below the noise can add up over a long log.
+    """
+    halved = replace(problem, substeps=tuple(2 * m if i == e else m for i, m in enumerate(problem.substeps)))
+    n, worst = z.size, 0.0
+    gradient, hessian = np.zeros(n), np.diag(problem.unknowns.prior_std**-2.0)
+    gain = problem.point(e, z).gain
+    spread = np.array([float(np.nanstd(problem.experiments[e].log[name])) for name in problem.experiments[e].outputs])
+    sigma = np.maximum(problem.sigma[e], EXACT * spread)
+    for s in range(len(problem.segments[e])):
+        coarse, fine = problem.run(e, s, z, outputs=True), halved.run(e, s, z, outputs=True)
+        assert coarse.outputs is not None and fine.outputs is not None
+        with np.errstate(invalid="ignore", over="ignore"):
+            change = float(np.max(np.abs(gain * (coarse.outputs - fine.outputs)) / sigma)) * 16.0 / 15.0
+        worst = max(worst, change if np.isfinite(change) else np.inf)
+        for o, places in enumerate(problem.columns(e, s)):
+            used = np.flatnonzero(places >= 0)
+            index = places[used]
+            gradient[index] += (fine.gram[0, o, 0, 1 + used] - coarse.gram[0, o, 0, 1 + used]) / sigma[o] ** 2
+            hessian[np.ix_(index, index)] += coarse.gram[0, o][np.ix_(1 + used, 1 + used)] / sigma[o] ** 2
+    if not (np.isfinite(worst) and np.all(np.isfinite(hessian)) and np.all(np.isfinite(gradient))):
+        return StepError(output=np.inf, parameter=np.inf)
+    back, _ = inverse(hessian)
+    p = problem.unknowns.shared
+    std = np.sqrt(np.maximum(np.diag(back)[:p], 1e-300))
+    moved = np.abs(back @ gradient)[:p] * 16.0 / 15.0 / std
+    return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
+
+
+def prediction_error(
+    problem: Residuals, method: Method, band_hz: tuple[float, float] | None, callback: Callback | None
+) -> Solved:
+    """Prediction errors: first of a filter that hardly trusts the plant, then of one whose noise is estimated."""
+    best, _ = best_start(problem, method, band_hz)
+    starts = [best.z] if np.isfinite(best.cost) else []
+    found: Solved | None = None
+    for start in (*starts, problem.unknowns.start):
+        z = held_start(problem, start, method.max_iterations)
+        watched = None if z is None else with_observers(problem, z, follows=True)
+        if z is None or watched is None:
+            continue
+        one = settle(watched, watched.evaluate(z), method.max_iterations, callback)
+        again = with_observers(one.problem, one.solution.z, follows=True)
+        if again is not None and not all(model.linear for model in problem.unknowns.models):
+            one = settle(again, again.evaluate(one.solution.z), method.max_iterations, callback)
+        found = one if found is None else min(found, one, key=_misfit)
+        if found.solution.status == "converged":
+            break
+    return found if found is not None else settle(problem, best, method.max_iterations, callback)

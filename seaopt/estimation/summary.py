@@ -1,0 +1,255 @@
+"""From a minimum to the result of a fit: covariance, what cannot be told, how well each output is explained."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import EstimationError
+from seaopt.estimation.covariance import (
+    Covariance,
+    Errors,
+    coloured,
+    counted,
+    errors,
+    inverse,
+    ljung_box,
+    robust_bread,
+    with_infinities,
+)
+from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
+from seaopt.estimation.least_squares import Solution
+from seaopt.estimation.methods import Method, MultipleShooting, OutputError
+from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit
+from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError
+from seaopt.estimation.unknowns import Unknowns
+from seaopt.parameters import ParameterSet
+
+VAGUE = 3.0  # a std of so many times the value is no estimate
+
+
+def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics: bool, started: float) -> Fit:
+    """Return the result at a minimum."""
+    problem, solution = solved.problem, solved.solution
+    unknowns, z, p = problem.unknowns, solution.z, problem.unknowns.shared
+    found = solution.evaluation
+    if not np.isfinite(found.cost):
+        raise EstimationError(f"the fit has no finite cost: {solution.message}")
+    left = errors(problem, z) if diagnostics else None
+    white, robust = _covariances(problem, found, left)
+    names = unknowns.names[:p]
+    seen = identifiability(found.hessian, names, z[:p])
+    if seen.rank < seen.free:
+        seen = replace(seen, structural_rank=structural_rank(problem, z))
+    std = np.sqrt(np.diag(robust))
+    fitted = params.with_parameters(
+        *(replace(params[name], value=float(z[i]), std=float(std[i])) for i, name in enumerate(names))
+    )
+    covariance = Covariance(names=names, matrix=robust)
+    status, message = _status(solution, seen, found.hessian, names, solved.step_error)
+    if status == "converged":
+        status, message = _open(fitted, params, message)
+    return Fit(
+        status=status,
+        message=message,
+        parameters=fitted,
+        covariance=covariance,
+        white_covariance=Covariance(names=names, matrix=white),
+        derived=_derived(problem.experiments, fitted, covariance),
+        outputs=_outputs(problem, z, left) if left is not None else {},
+        nuisance={e.name: _nuisance(e, unknowns, i, z, problem.substeps[i]) for i, e in enumerate(problem.experiments)},
+        identifiability=seen,
+        cost=found.cost,
+        iterations=solution.iterations,
+        samples=int(sum(float(np.sum(row)) for row in found.counts)),
+        wall_s=time.perf_counter() - started,
+        step_error_sigma=solved.step_error.output,
+        step_error_parameter=solved.step_error.parameter,
+        log_likelihood=_log_likelihood(problem, found),
+        unknowns=z.size,
+        method=_method_name(method),
+        residuals=left or [],
+        experiments=problem.experiments,
+    )
+
+
+def _method_name(method: Method) -> str:
+    if isinstance(method, OutputError):
+        return "output_error"
+    return "multiple_shooting" if isinstance(method, MultipleShooting) else "prediction_error"
+
+
+def _covariances(
+    problem: Residuals, found: Evaluation, left: list[list[Errors]] | None
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
+    """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
+    p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-2.0
+    bread = found.hessian
+    if left is not None and not isinstance(problem.loss, Linear):
+        bread = robust_bread(problem, found.z, left) + np.diag(prior)
+    back, unseen = inverse(bread)
+    white = with_infinities(back[:p, :p], unseen[:p])
+    if left is None:
+        return white, white
+    columns = back[:, :p]
+    meat = coloured(problem, found.z, columns, left) + (columns.T * prior) @ columns
+    return white, with_infinities(meat, unseen[:p])
+
+
+def _log_likelihood(problem: Residuals, found: Evaluation) -> float:
+    """Return the Gaussian likelihood at the residuals' own sigma, which is that of its best value."""
+    total = 0.0
+    for squares, counts, sigma in zip(found.squares, found.counts, problem.sigma, strict=True):
+        variance = np.maximum(squares / np.maximum(counts, 1.0), (1e-12 * sigma) ** 2)
+        total -= 0.5 * float(np.sum(counts * (np.log(2.0 * np.pi * variance) + 1.0)))
+    return total
+
+
+def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[str, str]:
+    """Call a fit not identifiable whose parameters are less certain than their size: the log hardly shows them."""
+    vague = [
+        f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
+        for name, item in fitted.items()
+        if item.free and item.std is not None and item.std > VAGUE * max(abs(item.value), abs(given[name].value))
+    ]
+    if not vague:
+        return "converged", message
+    return "not_identifiable", f"the logs hardly show {', '.join(vague)}: excite more, fix it, or give it a prior"
+
+
+def _status(
+    solution: Solution, seen: Identifiability, hessian: Float[np.ndarray, "n n"], names: tuple[str, ...],
+    step: StepError,
+) -> tuple[str, str]:  # fmt: skip
+    if seen.rank == seen.free:
+        if not step.small:
+            found = f"{step.output:.2g} sigma in an output and {step.parameter:.2g} std in a parameter"
+            return "stalled", f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {found}"
+        weak = "; ".join(f"{listed(sorted(direction))} are hardly told apart" for direction in seen.weak)
+        return solution.status, f"{solution.message}; {weak}" if weak else solution.message
+    seen_alone = {name: bool(hessian[i, i] > 0.0) for i, name in enumerate(names)}
+    words = "; ".join(told(direction, seen_alone.get(min(direction), True)) for direction in seen.unidentifiable)
+    if 0 <= seen.structural_rank < seen.free:
+        return "not_identifiable", f"{words}: fix one, give it a prior, or measure another output"
+    return "not_identifiable", f"{words} in this log: excite more, fix one, or give it a prior"
+
+
+def _nuisance(
+    experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.ndarray, " n"], substeps: int
+) -> Nuisance:
+    places = unknowns.locals_of[e]
+    return Nuisance(
+        delay_s=places.delay.at(z),
+        gain={name: slot.at(z) for name, slot in zip(experiment.outputs, places.gain, strict=True)},
+        offset={name: slot.at(z) for name, slot in zip(experiment.outputs, places.offset, strict=True)},
+        drift={
+            name: tuple(slot.at(z) for slot in row)
+            for name, row in zip(experiment.outputs, places.drift, strict=True)
+        },
+        initial_state=tuple(
+            {name: slot.at(z) for name, slot in zip(experiment.plant.states, row, strict=True)}
+            for row in places.initial
+        ),
+        noise={name: slot.at(z) for name, slot in zip(experiment.plant.states, places.noise, strict=False)},
+        substeps=substeps,
+    )
+
+
+def _derived(experiments: tuple[Experiment, ...], fitted: ParameterSet, covariance: Covariance) -> dict[str, Derived]:
+    """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g."""
+    out: dict[str, Derived] = {}
+    for experiment in experiments:
+        plant = experiment.plant
+        values = plant.parameter_values(fitted)
+        names = list(plant.parameters)
+        free = [name for name in covariance.names if name in names]
+        rows = [covariance.names.index(name) for name in free]
+        matrix = covariance.matrix[np.ix_(rows, rows)]
+        for name, (expression, unit) in plant.derived_values().items():
+            function: Any = ca.Function(
+                "derived", [plant.p], [expression, ca.densify(ca.gradient(expression, plant.p))]
+            )
+            value, slope = function(values)
+            g = np.array(slope).ravel()[[names.index(item) for item in free]]
+            used = g != 0.0
+            block = matrix[np.ix_(used, used)]
+            variance = float(g[used] @ block @ g[used]) if np.all(np.isfinite(block)) else np.inf
+            std = float(np.sqrt(max(variance, 0.0)))
+            out.setdefault(name, Derived(value=float(value), unit=unit, std=std))
+    return out
+
+
+def _outputs(
+    problem: Residuals, z: Float[np.ndarray, " n"], left: list[list[Errors]]
+) -> dict[str, dict[str, OutputFit]]:
+    """Return how well each output is explained, on the samples used and on those held out."""
+    free = left if problem.observers is None else errors(replace(problem, observers=None), z)
+    found: dict[str, dict[str, OutputFit]] = {}
+    for e, experiment in enumerate(problem.experiments):
+        pieces = problem.segments[e]
+        measured = [np.concatenate(channels) for channels in zip(*(piece.y for piece in pieces), strict=True)]
+        used = np.concatenate([counted(piece, 0) for piece in pieces])
+        # A segment that lies wholly in the part held out has no initial state: it says nothing of the model.
+        started = np.concatenate(
+            [np.full(piece.n, not piece.keep or bool(np.any(piece.keep[0]))) for piece in pieces]
+        )
+        raw = np.concatenate([error.raw for error in free[e]])
+        predicted = np.concatenate([error.raw for error in left[e]])
+        found[experiment.name] = {}
+        for o, name in enumerate(experiment.outputs):
+            kept = used[:, o]
+            rest = ~kept & started & np.isfinite(measured[o])
+            found[experiment.name][name] = OutputFit(
+                fit_percent=_fit_percent(measured[o][kept], raw[kept, o]),
+                holdout_fit_percent=_fit_percent(measured[o][rest], raw[rest, o]) if np.any(rest) else None,
+                band_fit_percent=_band_fit_percent(problem, e, o, z),
+                one_step_fit_percent=(
+                    None if problem.observers is None else _fit_percent(measured[o][kept], predicted[kept, o])
+                ),
+                rms_residual=float(np.sqrt(np.mean(raw[kept, o] ** 2))),
+                sigma=float(problem.sigma[e][o]),
+                unit=experiment.plant.outputs[name],
+                whiteness_p=_whiteness(left[e], o),
+            )
+    return found
+
+
+def _whiteness(row: list[Errors], o: int) -> float:
+    """Return the smallest p-value of the segments' weighted residuals."""
+    found = [1.0]
+    for error in row:
+        used = error.weighted[:, o] != 0.0
+        if np.count_nonzero(used) >= 8:
+            found.append(ljung_box(error.weighted[used, o]))
+    return min(found)
+
+
+def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float | None:
+    """Return the fit of the filtered signals, over the samples that counted; None without a band."""
+    weights = problem.weights(e)
+    if not len(weights.sections):
+        return None
+    residual, signal = 0.0, 0.0
+    point = problem.point(e, z)
+    for s, piece in enumerate(problem.segments[e]):
+        columns = problem.run(e, s, z, columns=True).columns
+        assert columns is not None
+        present = counted(piece, weights.settle)[:, o]
+        own = columns[:, o, -(2 + point.drift_terms) :]  # filtered: 1, drift's polynomials, the model output
+        modelled = own[:, 0] * point.offset[o] + own[:, 1:-1] @ point.drift[o] + point.gain[o] * own[:, -1]
+        measured = (modelled - columns[:, o, 0])[present]
+        residual += float(np.sum(columns[present, o, 0] ** 2))
+        signal += float(np.sum((measured - np.mean(measured)) ** 2))
+    return 100.0 * (1.0 - float(np.sqrt(residual / max(signal, 1e-300))))
+
+
+def _fit_percent(measured: Float[np.ndarray, " n"], residual: Float[np.ndarray, " n"]) -> float:
+    spread = float(np.linalg.norm(measured - np.mean(measured)))
+    return 100.0 * (1.0 - float(np.linalg.norm(residual)) / max(spread, 1e-300))
