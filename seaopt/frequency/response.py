@@ -6,8 +6,9 @@ Welch's averages of Hann-windowed stretches that overlap by half (Bendat and Pie
           \qquad \sigma_{|H_1|} / |H_1| = \sqrt{(1 - \gamma^2) / (2 \gamma^2 n_d)} .
 
 The window spreads a line over its neighbours, in amplitude by (-1/4, 1/2, -1/4): for an input that is white nearby, H1
-estimates the mean of the response over three lines, weighted by the squares (1/6, 2/3, 1/6). That bias is small where the
-stretch is long against the plant's memory; models compared with H1 are spread likewise (`FrequencyResponse.expected`).
+estimates the mean of the response over three lines, weighted by the squares (1/6, 2/3, 1/6). That bias is small where
+the stretch is long against the plant's memory; models compared with H1 are spread likewise
+(`FrequencyResponse.expected`).
 """
 
 from __future__ import annotations
@@ -58,11 +59,9 @@ class FrequencyResponse:
         """
         f = self.frequency_hz
         line = f[1] - f[0]
-        centre = response(f)
-        spread = centre / 1.5
-        spread[1:] += (response(f[1:] - line) + response(f[1:] + line)) / 6.0
-        spread[0] = centre[0]
-        return spread
+        everywhere = response(np.concatenate([f, f[1:] - line, f[1:] + line]))
+        centre, below, above = np.split(everywhere, [f.size, 2 * f.size - 1])
+        return np.concatenate([centre[:1], centre[1:] / 1.5 + (below + above) / 6.0])
 
 
 def h1(

@@ -12,15 +12,15 @@ The fit is least squares on the complex response, each frequency weighted by the
 sampled as the log was: input held or a straight line between samples, and delayed. It starts from iterated linear least
 squares (Levy, IRE Trans. AC-4, 1959; Sanathanan and Koerner, IEEE TAC 8(1), 1963), so that no guess is needed.
 
-Neighbouring lines of a Hann-windowed estimate are correlated, 4/9 one line apart and 1/36 two: a parameter that averages
-over lines has 1 + 2 (4/9 + 1/36) = 35/18 of the variance that independent lines would give.
+Neighbouring lines of a Hann-windowed estimate are correlated, 4/9 one line apart and 1/36 two: a parameter that
+averages over lines has 1 + 2 (4/9 + 1/36) = 35/18 of the variance that independent lines would give.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -313,7 +313,7 @@ def _linear(
 
 def _stacked(values: Complex[np.ndarray, "m ..."]) -> Float[np.ndarray, "n ..."]:
     """Return real parts above imaginary parts."""
-    return np.concatenate([values.real, values.imag])
+    return np.concatenate([np.real(values), np.imag(values)])
 
 
 def _refined(
@@ -323,30 +323,35 @@ def _refined(
     """Return the least-squares values, and derivatives and residuals there, in standard deviations."""
     from scipy.optimize import least_squares  # deferred: 0.3 s
 
+    solve: Any = least_squares
+
     count = 4 if clock.delay_free else 3
 
-    def evaluated(x: Float[np.ndarray, " c"]) -> tuple[Any, Any]:
-        moved = replace(clock, delay_s=float(x[3])) if clock.delay_free else clock
+    @lru_cache(maxsize=1)
+    def evaluated(*x: float) -> Complex[np.ndarray, "m n"]:
+        """Return residuals and derivatives, in standard deviations; asked for one after the other at the same point."""
+        moved = replace(clock, delay_s=x[3]) if clock.delay_free else clock
 
         def both(f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "m n"]:
-            response, slopes = sampled_response(_form(), x[:3], moved, f)
+            response, slopes = sampled_response(_form(), np.array(x[:3]), moved, f)
             return np.column_stack([response[:, 0], slopes[:, :, 0].T])
 
-        spread = estimate.expected(both)[chosen]
-        return spread[:, 0], spread[:, 1:]
+        found = estimate.expected(both)[chosen]
+        found[:, 0] -= estimate.response[chosen]
+        return found / sigma[:, None]
 
     size = np.append(np.abs(start[:3]), clock.period)[:count]
     low = np.append(np.full(3, -np.inf), 0.0)[:count]
-    found = least_squares(
-        lambda x: _stacked((evaluated(x)[0] - estimate.response[chosen]) / sigma),
+    found = solve(
+        lambda x: _stacked(evaluated(*x.tolist())[:, 0]),
         start[:count],
-        jac=lambda x: _stacked(evaluated(x)[1] / sigma[:, None]),
+        jac=lambda x: _stacked(evaluated(*x.tolist())[:, 1:]),
         bounds=(low, np.inf),
         x_scale=np.maximum(size, 1e-300),
         method="trf",
-        xtol=1e-12,
-        ftol=1e-12,
-        gtol=1e-12,
+        xtol=1e-9,
+        ftol=1e-9,
+        gtol=1e-9,
     )
     values = np.append(start[:3], clock.delay_s)
     values[:count] = found.x

@@ -312,8 +312,8 @@ def _pair_dict(found: Survey, pair: Pair, params: ParameterSet) -> dict[str, Any
         "actuator": {name: _fields(item) for name, item in _fields(drive).items()} if drive is not None else None,
         "model_misfit": pair.misfit(found.model(pair, params)),
         "frequency_hz": estimate.frequency_hz,
-        "real": estimate.response.real,
-        "imag": estimate.response.imag,
+        "real": np.real(estimate.response),
+        "imag": np.imag(estimate.response),
         "relative_std": estimate.relative_std,
         "coherence": estimate.coherence,
     }
