@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from rich.table import Table
 
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
+from seaopt.estimation.result import Nuisance
 from seaopt.frequency import Drive, Pair, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
@@ -58,9 +59,9 @@ class Responses:
 
     def show(self, console: Console) -> None:
         """Print a row a response, and what those of the form (16) say of the actuator."""
-        table = Table(box=None, pad_edge=False, header_style="dim")
+        table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
         for number, title in enumerate([*HEAD, *(["fit"] if self.fitted else [])]):
-            table.add_column(title, justify="left" if number < 2 else "right", no_wrap=number > 0)
+            table.add_column(title, justify="left" if number < 2 else "right", no_wrap=True)
         for name, found in self.surveys.items():
             for pair in found.pairs:
                 table.add_row(name, *self._cells(name, found, pair))
@@ -110,10 +111,15 @@ def responses(
         try:
             surveys[experiment.name] = experiment_survey(experiment, stretch_s=stretch_s)
             if fit is not None and experiment.name in fit.nuisance:
-                fitted[experiment.name] = (experiment_survey(experiment, fit, stretch_s), fit)
+                fitted[experiment.name] = (_under(surveys[experiment.name], fit.nuisance[experiment.name]), fit)
         except LogError as error:
             raise LogError(f"{problem.source}: experiment {experiment.name}: {error}") from error
     return Responses(surveys=surveys, given=problem.parameters, fitted=fitted)
+
+
+def _under(found: Survey, own: Nuisance) -> Survey:
+    """Return a survey whose models have a fit's delay and gains."""
+    return replace(found, clock=replace(found.clock, delay_s=own.delay_s, delay_free=False), gain=own.gain)
 
 
 def _reading(pair: Pair, drive: Drive) -> str:
