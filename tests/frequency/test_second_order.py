@@ -115,7 +115,7 @@ def test_derivatives_are_those_of_finite_differences(stand, thor, hold):
 
 def test_the_windows_spread_is_the_estimates_bias():
     """With white input and short stretches H1 misses the peak; spread over three lines, scipy's response meets it."""
-    form = (1.0, 12.0, (2 * np.pi * 12) ** 2)
+    form = (1.0, 20.0, (2 * np.pi * 12) ** 2)
     gain, a, b = form
     num, den, _ = cont2discrete(([gain], [1.0, a, b]), 1 / RATE, method="zoh")
     u, y = record(form, 400_000, np.random.default_rng(5))
@@ -127,8 +127,8 @@ def test_the_windows_spread_is_the_estimates_bias():
     near = (estimate.frequency_hz > 10) & (estimate.frequency_hz < 14)
     bare, spread = (np.abs(h[near] / estimate.response[near] - 1) for h in (known(estimate.frequency_hz),
                                                                           estimate.expected(known)))  # fmt: skip
-    assert np.max(bare) > 0.06
-    assert np.max(spread) < 0.025
+    assert np.max(bare) > 0.1
+    assert np.max(spread) < 3 * np.max(estimate.relative_std[near])
 
 
 def test_incoherent_estimates_are_refused():
