@@ -60,12 +60,13 @@ class Responses:
     def show(self, console: Console) -> None:
         """Print a row a response, and what those of the form (16) say of the actuator."""
         table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
-        for number, title in enumerate([*HEAD, *(["fit"] if self.fitted else [])]):
+        titles = (*HEAD, "fit") if self.fitted else HEAD
+        for number, title in enumerate(titles):
             table.add_column(title, justify="left" if number < 2 else "right", no_wrap=True)
         for name, found in self.surveys.items():
             for pair in found.pairs:
                 table.add_row(name, *self._cells(name, found, pair))
-        console.print(table, highlight=False, markup=False)
+        console.print(table)
         console.print(NOTE, style="dim", highlight=False, markup=False)
         for name, found in self.surveys.items():
             for pair in found.pairs:

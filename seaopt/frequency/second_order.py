@@ -215,7 +215,7 @@ def second_order(
     unit : str
         Output unit over input unit.
     use : bool array, shape (m,), optional
-        The frequencies to fit; those of coherence above 0.8 if left out.
+        The frequencies to fit; all coherent ones if left out, see `coherent`.
 
     Returns
     -------
@@ -239,7 +239,7 @@ def second_order(
     True
 
     """
-    chosen = np.flatnonzero(estimate.coherence > COHERENT if use is None else use)
+    chosen = np.flatnonzero(coherent(estimate) if use is None else use)
     if chosen.size < LINES:
         raise LogError(
             f"{chosen.size} frequencies have a coherence above {COHERENT:g} and a second-order fit takes {LINES}; "
@@ -258,6 +258,13 @@ def second_order(
         values=values, covariance=covariance, clock=replace(clock, delay_s=float(values[3]), delay_free=False),
         unit=unit, band_hz=(float(f[0]), float(f[-1])), lines=int(f.size), misfit=misfit,
     )  # fmt: skip
+
+
+def coherent(estimate: FrequencyResponse) -> Bool[np.ndarray, " m"]:
+    """Return which lines have a coherence above 0.8; never the first, beside the mean that stretches are rid of."""
+    found = estimate.coherence > COHERENT
+    found[0] = False
+    return found
 
 
 @cache

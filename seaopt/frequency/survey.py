@@ -17,7 +17,7 @@ from jaxtyping import Bool, Complex, Float
 from seaopt.errors import LogError
 from seaopt.frequency.response import FrequencyResponse, h1
 from seaopt.frequency.sampled import sampled_response
-from seaopt.frequency.second_order import COHERENT, LINES, Drive, SecondOrder, second_order
+from seaopt.frequency.second_order import COHERENT, LINES, Drive, SecondOrder, coherent, second_order
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -74,8 +74,8 @@ class Pair:
 
     @property
     def used(self) -> Bool[np.ndarray, " m"]:
-        """The coherent frequencies, the first line apart: the mean that a stretch is rid of lies beside it."""
-        return _coherent(self.estimate)
+        """The coherent frequencies, those that are compared with models."""
+        return coherent(self.estimate)
 
     def misfit(self, response: Response) -> float:
         """Return how far a response, a function of frequencies in Hz, lies from the estimate.
@@ -229,19 +229,13 @@ def _check(log: Log, names: Sequence[str]) -> None:
 def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretch_s: float | None) -> Pair:
     estimate = h1(log[source], log[output], log.period, stretch_s=stretch_s)
     unit = f"{plant.outputs[output]}/{_divisor(plant.inputs[source])}"
-    used = _coherent(estimate)
+    used = coherent(estimate)
     form = second_order(estimate, clock, unit=unit, use=used) if np.count_nonzero(used) >= LINES else None
     band = _good_band(estimate)
     return Pair(
         source=source, output=output, unit=unit, estimate=estimate, good_band_hz=band, peak=_peak(estimate, band),
         second_order=form,
     )  # fmt: skip
-
-
-def _coherent(estimate: FrequencyResponse) -> Bool[np.ndarray, " m"]:
-    used = estimate.coherence > COHERENT
-    used[0] = False
-    return used
 
 
 def _divisor(unit: str) -> str:
