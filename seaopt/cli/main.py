@@ -82,6 +82,24 @@ def simulate(problem: ProblemFile, output: Folder = Path("out"), json: Json = Fa
     _finish(session, json, ["simulate"])
 
 
+@app.command()
+def frf(
+    problem: ProblemFile,
+    output: Folder = Path("out"),
+    json: Json = False,
+    stretch: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", min=0.0, help="Length of a stretch, one over the resolution in Hz."),
+    ] = None,
+) -> None:
+    """Estimate frequency responses (H1, coherence, second-order fit); write frf.json and figure."""
+    from seaopt.cli.session import Session
+
+    session = Session(problem, output, stretch_s=stretch)
+    session.run("frf")
+    _finish(session, json, ["frf"])
+
+
 def _stage(name: str, text: str) -> Callable[..., None]:
     def command(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
         from seaopt.cli.session import Session

@@ -15,6 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from seaopt.cli.responses import responses
 from seaopt.control import Controller, tune
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, fit
@@ -27,10 +28,16 @@ from seaopt.robustness import Certificate, certify
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
-SCHEMAS = {"fit": "seaopt/fit/1", "tune": "seaopt/controller/1", "certify": "seaopt/robustness/1"}
-FILES = {"fit": "fit.json", "tune": "controller.json", "certify": "robustness.json"}
+SCHEMAS = {
+    "fit": "seaopt/fit/1",
+    "frf": "seaopt/frf/1",
+    "tune": "seaopt/controller/1",
+    "certify": "seaopt/robustness/1",
+}
+FILES = {"fit": "fit.json", "frf": "frf.json", "tune": "controller.json", "certify": "robustness.json"}
 LABELS = {
     "simulate": "simulating",
+    "frf": "frequency responses",
     "fit": "fitting the logs",
     "tune": "tuning the controller",
     "certify": "certifying",
@@ -41,7 +48,7 @@ LABELS = {
 class Session:
     """Runs stages for one problem and one folder; later stages read earlier ones' JSON where they did not run."""
 
-    def __init__(self, problem: Path, folder: Path) -> None:
+    def __init__(self, problem: Path, folder: Path, stretch_s: float | None = None) -> None:
         if folder.exists() and not folder.is_dir():
             raise ProblemError(f"{folder}: is a file; give a folder for the results with -o")
         self.problem: Problem = read_problem(problem)
@@ -50,6 +57,7 @@ class Session:
         except OSError as error:
             raise ProblemError(f"{folder}: cannot be made ({error.strerror}); give another folder with -o") from error
         self.folder = folder
+        self.stretch_s = stretch_s
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
@@ -78,7 +86,7 @@ class Session:
         """Run one stage and write its result."""
         stages: dict[str, Callable[[Callable[[str], None]], None]] = {
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
-            "report": self._report,
+            "report": self._report, "frf": self._frf,
         }  # fmt: skip
         with self._progress(LABELS[stage]) as tell:
             stages[stage](tell)
@@ -151,8 +159,8 @@ class Session:
         """Return a digest of the parts of the problem that a stage reads, and of the result before it."""
         table = self.problem.table.model_dump(mode="json")
         parts = ["parameters", "plant", "experiment", "fit"]
-        earlier = {"fit": None, "tune": "fit.json", "certify": "controller.json"}[stage]
-        if stage != "fit":
+        earlier = {"fit": None, "frf": None, "tune": "fit.json", "certify": "controller.json"}[stage]
+        if stage not in ("fit", "frf"):
             parts += ["controller", "robustness"]
         if earlier == "fit.json" and not self.problem.table.experiment:
             earlier = None
@@ -203,6 +211,27 @@ class Session:
         self.results["fit"] = result
         self._write("fit", result.to_dict())
 
+    def _frf(self, tell: Callable[[str], None]) -> None:
+        if not self.problem.table.experiment:
+            raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; add one")
+        experiments = self.experiments()
+        fitted = self._present_fit()
+        found = responses(experiments, self.problem, fitted, self.stretch_s)
+        tell(", ".join(found.surveys))
+        self.results["frf"] = found
+        self._write("frf", {"schema": SCHEMAS["frf"], **found.to_dict()})
+        self.written += found.draw(self.folder / "frf")
+
+    def _present_fit(self) -> Fit | None:
+        """Return the folder's fit; None where there is none, or with a word where it was made from something else."""
+        if not (self.folder / FILES["fit"]).exists():
+            return None
+        try:
+            return Fit.from_dict(self._read("fit"))
+        except ProblemError as error:
+            self._console.print(f"left out: {error}", highlight=False, markup=False, soft_wrap=True)
+            return None
+
     def _tune(self, tell: Callable[[str], None]) -> None:
         design, values = self.problem.design_plant, self.values()
         spec = self.problem.spec
@@ -251,6 +280,8 @@ class Session:
 
     def _verdict(self, stage: str) -> list[tuple[bool, str]]:
         found = self.results.get(stage)
+        if stage == "frf":
+            return found.verdict() if found is not None else []
         return verdict(
             found if stage == "fit" else None,
             found if stage == "tune" else None,
@@ -266,7 +297,9 @@ class Session:
             return
         console = Console(soft_wrap=True)
         for stage in stages:
-            if stage in ("fit", "tune", "certify"):
+            if stage == "frf":
+                self.results[stage].show(console)
+            elif stage in ("fit", "tune", "certify"):
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
         for stage in ["fit", "tune", "certify"] if "report" in stages else stages:
             for good, text in self._verdict(stage):

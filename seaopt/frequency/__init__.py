@@ -1,5 +1,9 @@
-"""Frequency responses of logs."""
+"""Frequency responses of logs: H1 estimates, second-order forms, and what a whole log shows."""
 
 from seaopt.frequency.response import FrequencyResponse, h1
+from seaopt.frequency.second_order import Drive, SecondOrder, Uncertain, second_order
+from seaopt.frequency.survey import Pair, Peak, Survey, survey
 
-__all__ = ["FrequencyResponse", "h1"]
+__all__ = [
+    "Drive", "FrequencyResponse", "Pair", "Peak", "SecondOrder", "Survey", "Uncertain", "h1", "second_order", "survey",
+]  # fmt: skip

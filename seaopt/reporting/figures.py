@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller, Loop
-from seaopt.errors import LogError
-from seaopt.estimation import Experiment, Fit, Prediction
-from seaopt.frequency import h1
+from seaopt.estimation import Fit, Prediction
+from seaopt.frequency import Survey
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.simulation import Clock, linearised, make_model, transition
+from seaopt.reporting.comparison import survey_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,61 +73,6 @@ def _envelope(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], bi
     return low, high, time[edges]
 
 
-def response_figure(experiment: Experiment, parameters: ParameterSet, delay_s: float) -> Figure | None:
-    """Draw the H1 estimate of every output over the model's response; None where the log does not allow one."""
-    log, plant = experiment.log, experiment.plant
-    active = [name for name in plant.inputs if name in log.signals and np.ptp(log[name]) > 0.0]
-    if len(active) != 1 or len(log.segments) > 1:
-        return None
-    names = [name for name in experiment.outputs if np.all(np.isfinite(log[name]))]
-    try:
-        estimates = {name: h1(log[active[0]], log[name], log.period) for name in names}
-    except LogError:
-        return None
-    if not estimates:
-        return None
-    figure, axes = _figure(2, len(estimates), 4.4, sharex=True)
-    for column, (name, estimate) in enumerate(estimates.items()):
-        good = estimate.coherence > 0.3
-        f = estimate.frequency_hz[good]
-        dense = np.geomspace(f[0], f[-1], 800)
-        model = _sampled_response(plant, parameters, experiment, active[0], name, delay_s, dense)
-        unit = f"{plant.outputs[name]}/{plant.inputs[active[0]]}"
-        dots = {"color": MEASURED, "marker": ".", "markersize": 2.5, "linestyle": ""}
-        line = {"color": MODEL, "linewidth": 1.3}
-        phase = np.degrees(np.unwrap(np.angle(model)))
-        # Measured phase is drawn on the branch nearest the model's: noise at a dip must not shift the rest by a turn.
-        nearest = np.interp(f, dense, phase)
-        turned = np.degrees(np.angle(estimate.response[good] * np.exp(-1j * np.radians(nearest)))) + nearest
-        _bode(axes[:, column], f, estimate.response[good], turned, dots)
-        _bode(axes[:, column], dense, model, phase, line)
-        axes[0, column].set_title(f"{name}/{active[0]} [{unit}]", fontsize="medium")
-        axes[1, column].set_xlabel("frequency [Hz]")
-    labels = ("measured (H1, coherence above 0.3)", "model")
-    figure.legend(axes[0, 0].lines[:2], labels, loc="outside upper left", frameon=False, ncols=2)
-    axes[0, 0].set_ylabel("magnitude [dB]")
-    axes[1, 0].set_ylabel("phase [deg]")
-    return figure
-
-
-def _sampled_response(
-    plant: Plant, parameters: ParameterSet, experiment: Experiment, source: str, output: str, delay_s: float,
-    f: Float[np.ndarray, " m"],
-) -> Any:  # fmt: skip
-    """Return the response from input samples to output samples of the plant linearised at rest."""
-    model = linearised(make_model(plant, parameters, (), (output,)))
-    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=delay_s)
-    block = transition(model, np.zeros(0), clock)[0]
-    nx, nu = model.nx, model.nu
-    k = list(plant.inputs).index(source)
-    z = np.exp(2j * np.pi * f * clock.period)
-    lag_a, lag_b = clock.lags
-    drive = z[:, None] ** -lag_a * block[:, nx + k] + z[:, None] ** -lag_b * block[:, nx + nu + k]
-    inner = z[:, None, None] * np.eye(nx) - block[:nx, :nx]
-    state = np.linalg.solve(inner, drive[:, :nx, None])[:, :, 0]
-    return state @ block[nx, :nx] + drive[:, nx]
-
-
 def _bode(axes: Iterable[Axes], f: Any, response: Any, phase_deg: Any, style: dict[str, Any]) -> None:
     magnitude, phase = axes
     magnitude.semilogx(f, 20 * np.log10(np.maximum(np.abs(response), 1e-12)), **style)
@@ -172,17 +116,22 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
 
 
 def all_figures(
-    fit: Fit | None, controller: Controller | None, plants: dict[str, tuple[Plant, ParameterSet]]
+    fit: Fit | None,
+    surveys: Mapping[str, Survey],
+    controller: Controller | None,
+    plants: dict[str, tuple[Plant, ParameterSet]],
 ) -> dict[str, Figure]:
-    """Return every figure that the results allow, by file name."""
+    """Return every figure that the results allow, by file name; `surveys` are the fit's experiments in frequency."""
     out: dict[str, Figure] = {}
     for experiment in fit.experiments if fit is not None else ():
         assert fit is not None
         units = {name: experiment.plant.outputs[name] for name in experiment.outputs}
         out[f"time_{experiment.name}"] = time_figure(fit.predict(experiment), units)
-        response = response_figure(experiment, fit.parameters, fit.nuisance[experiment.name].delay_s)
-        if response is not None:
-            out[f"response_{experiment.name}"] = response
+        if experiment.name in surveys:
+            found = surveys[experiment.name]
+            out[f"response_{experiment.name}"] = survey_figure(
+                {experiment.name: found}, fitted={experiment.name: (found, fit)}
+            )
     if controller is not None and plants:
         out["loop"] = loop_figure(controller, plants)
     return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,17 @@ from seaopt.control import Controller
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Fit
 from seaopt.files import write_bytes, write_text
+from seaopt.frequency import Survey
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.reporting.comparison import fit_surveys, sentence, survey_figure
 from seaopt.reporting.figures import all_figures
 from seaopt.robustness import Certificate
 
 Result = Fit | Controller | Certificate
 _CAPTIONS = {
     "time": "Measured and model outputs in the time domain",
-    "response": "Frequency response: H1 estimate of the log over the fitted model",
+    "response": "Frequency response: H1 estimate of the log, the fitted model and the second-order fit (16)",
     "loop": "The closed loop on every plant",
 }
 
@@ -65,7 +67,8 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
         raise SeaoptError("write_report got no result; give a Fit, a Controller or a Certificate")
     if controller is None and certificate is not None:
         controller = certificate.controller
-    figures = all_figures(fit, controller, _plants(controller, certificate))
+    surveys = fit_surveys(fit) if fit is not None else {}
+    figures = all_figures(fit, surveys, controller, _plants(controller, certificate))
     target = Path(path)
     drawn: list[dict[str, str]] = []
     for name, figure in figures.items():
@@ -78,9 +81,45 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
                 "kind": name.split("_")[0],
                 "caption": _caption(name),
                 "svg": _inline(svg.decode(), name),
+                "note": _note(name, surveys, fit),
             }
         )
     return write_text(target, _page(title, fit, controller, certificate, drawn))
+
+
+def write_frequency_figure(
+    surveys: Mapping[str, Survey],
+    path: Path | str,
+    *,
+    given: ParameterSet | None = None,
+    fitted: Mapping[str, tuple[Survey, Fit]] | None = None,
+) -> list[Path]:
+    """Draw frequency responses of experiments to SVG and PNG.
+
+    Parameters
+    ----------
+    surveys : mapping of experiment to Survey
+        At least one.
+    path : path
+        Without suffix; ``.svg`` and ``.png`` are added.
+    given : ParameterSet, optional
+        Values before a fit: the plant's model is drawn with them.
+    fitted : mapping of experiment to (Survey, Fit), optional
+        Surveys under a fit's delays and gains, and the fit: the model is drawn as fitted.
+
+    Returns
+    -------
+    list of Path
+        The two files.
+
+    Raises
+    ------
+    FileError
+        The folder cannot be written.
+
+    """
+    figure = survey_figure(surveys, given, fitted)
+    return [write_bytes(f"{path}.{kind}", _rendered(figure, kind)) for kind in ("svg", "png")]
 
 
 def _only(results: Sequence[Result], kind: type) -> Any:
@@ -127,6 +166,12 @@ def _inline(svg: str, name: str) -> str:
 def _caption(name: str) -> str:
     kind, _, rest = name.partition("_")
     return _CAPTIONS[kind] + (f": {rest}" if rest else "")
+
+
+def _note(name: str, surveys: Mapping[str, Survey], fit: Fit | None) -> str:
+    """Return what a figure of frequency responses shows, in words; nothing for other figures."""
+    kind, _, experiment = name.partition("_")
+    return sentence(surveys[experiment], fit) if kind == "response" and fit is not None else ""
 
 
 def number(value: Any, digits: int = 4) -> str:

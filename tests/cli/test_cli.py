@@ -177,5 +177,55 @@ def test_the_report_stands_alone(folder, done):
     assert len(ids) == len(set(ids))
 
 
+def test_frf_shows_and_writes_what_the_logs_say_in_frequency(folder, done):
+    out = seaopt("frf", "short.toml", "-o", "all", cwd=folder)
+    assert out.returncode == 0, out.stderr
+    assert "as (16)" in out.stdout and "efficiency" in out.stdout
+    for name in ("frf.json", "frf.svg", "frf.png"):
+        assert (folder / "all" / name).stat().st_size > 500
+    content = json.loads((folder / "all" / "frf.json").read_text(encoding="utf-8"))
+    assert content["schema"] == "seaopt/frf/1"
+    pair = content["experiments"]["chirp"]["pairs"][0]
+    assert (pair["input"], pair["output"], pair["unit"]) == ("I", "F1", "N/A")
+    assert pair["fitted_misfit"] < pair["model_misfit"]
+    assert pair["actuator"]["efficiency"]["value"] == pytest.approx(0.95, abs=0.01)
+    assert len(pair["frequency_hz"]) == len(pair["coherence"]) == len(pair["real"]) == len(pair["imag"])
+    only = seaopt("frf", "short.toml", "-o", "alone", "--json", "--stretch", "2.5", cwd=folder)
+    alone = json.loads(only.stdout)["experiments"]["chirp"]["pairs"][0]
+    assert alone["frequency_hz"][0] == pytest.approx(0.4)
+    assert alone["fitted_misfit"] is None
+
+
+def test_frf_of_a_log_that_says_nothing_exits_1(folder):
+    drowned = SHORT.replace("noise_std = { F1 = 2.0, F2 = 2.0 }", "noise_std = { F1 = 1e6, F2 = 1e6 }")
+    (folder / "drowned.toml").write_text(drowned, encoding="utf-8")
+    out = seaopt("frf", "drowned.toml", "-o", "drowned", cwd=folder)
+    assert out.returncode == 1, out.stderr
+    assert "too little coherence in F1/I, F2/I" in out.stdout
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([(t / 400, 1.0, t % 7) for t in range(400)], "I is constant or absent"),
+        ([(t / 400 + (t > 200), t % 3, t % 7) for t in range(400)], "2 stretches between gaps"),
+        ([(t / 400, t % 3, t % 7) for t in range(100)], "100 samples are too few"),
+    ],
+)
+def test_frf_of_a_bad_log_is_one_line_and_exits_2(folder, rows, words):
+    lines = ["time [s],I [A],F1 [N]", *(f"{t:.6f},{i},{f}" for t, i, f in rows)]
+    (folder / "bad.csv").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "bad.toml").write_text(
+        'schema = 1\n[plant.a]\nkind = "high_impedance"\n[[experiment]]\nname = "x"\nplant = "a"\nlog = "bad.csv"\n'
+        'time = "time [s]"\ninputs = { I = "I [A]" }\noutputs = { F1 = "F1 [N]" }\n',
+        encoding="utf-8",
+    )
+    out = seaopt("frf", "bad.toml", "-o", "bad", cwd=folder)
+    assert out.returncode == 2
+    (last,) = out.stderr.strip().splitlines()
+    assert last.startswith("seaopt: bad.toml: experiment x: ") and words in last
+    assert not list((folder / "bad").glob("*"))
+
+
 def test_nothing_is_half_written(folder, done):
     assert not [path for path in Path(folder).rglob(".*") if path.is_file()]

@@ -1,0 +1,134 @@
+"""Frequency responses of a problem's experiments, as the command shows and writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from seaopt.errors import LogError
+from seaopt.estimation import Experiment, Fit
+from seaopt.estimation.result import Nuisance
+from seaopt.frequency import Drive, Pair, Survey
+from seaopt.parameters import ParameterSet
+from seaopt.problem import Problem
+from seaopt.reporting import experiment_survey, write_frequency_figure
+
+HEAD = ("experiment", "response", "coherent", "peak", "gain", "natural", "damping", "2nd order", "file")
+
+NOTE = (
+    "coherent: band of coherence above 0.8, peak and natural frequency in Hz; gain, natural and damping: of the "
+    "second-order fit; 2nd order, file, fit: how far the second-order fit and the model with the file's and the fitted "
+    "values lie from H1, in its standard deviations"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Responses:
+    """Surveys of the experiments under the file's values and, where DIR has a fit, under its own."""
+
+    surveys: Mapping[str, Survey]
+    given: ParameterSet
+    fitted: Mapping[str, tuple[Survey, Fit]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of frf.json, without its schema."""
+        content: dict[str, Any] = {}
+        for name, found in self.surveys.items():
+            content[name] = found.to_dict(self.given)
+            for row, pair in zip(content[name]["pairs"], found.pairs, strict=True):
+                row["fitted_misfit"] = self._fitted_misfit(name, pair)
+        return {"experiments": content}
+
+    def draw(self, path: Path) -> list[Path]:
+        """Write the figure as SVG and PNG."""
+        return write_frequency_figure(self.surveys, path, given=self.given, fitted=self.fitted)
+
+    def verdict(self) -> list[tuple[bool, str]]:
+        """Return one line an experiment: whether every response is coherent enough for a second-order fit."""
+        lines: list[tuple[bool, str]] = []
+        for name, found in self.surveys.items():
+            poor = [pair.name for pair in found.pairs if pair.second_order is None]
+            what = f"too little coherence in {', '.join(poor)}; excite more" if poor else "every response is coherent"
+            lines.append((not poor, f"{name}: {what}"))
+        return lines
+
+    def show(self, console: Console) -> None:
+        """Print a row a response, and what those of the form (16) say of the actuator."""
+        table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
+        titles = (*HEAD, "fit") if self.fitted else HEAD
+        for number, title in enumerate(titles):
+            table.add_column(title, justify="left" if number < 2 else "right", no_wrap=True)
+        for name, found in self.surveys.items():
+            for pair in found.pairs:
+                table.add_row(name, *self._cells(name, found, pair))
+        console.print(table)
+        console.print(NOTE, style="dim", highlight=False, markup=False)
+        for name, found in self.surveys.items():
+            for pair in found.pairs:
+                drive = found.drive(pair, self.given)
+                if drive is not None:
+                    console.print(f"{name}: {_reading(pair, drive)}", highlight=False, markup=False)
+
+    def _cells(self, name: str, found: Survey, pair: Pair) -> list[str]:
+        band, peak, form = pair.good_band_hz, pair.peak, pair.second_order
+        figures = (form.static_gain, form.natural_frequency_hz, form.damping_ratio) if form is not None else ()
+        misfits = [form.misfit if form is not None else None, pair.misfit(found.model(pair, self.given))]
+        misfits += [self._fitted_misfit(name, pair)] if self.fitted else []
+        return [
+            pair.name,
+            f"{band[0]:.2g}–{band[1]:.3g}" if band is not None else "none",
+            f"{peak.frequency_hz:.3g}" if peak is not None else "–",
+            *(f"{item.value:.3g}" for item in figures),
+            *(["–"] * (3 - len(figures))),
+            *(f"{item:.3g}" if item is not None else "–" for item in misfits),
+        ]
+
+    def _fitted_misfit(self, name: str, pair: Pair) -> float | None:
+        if name not in self.fitted:
+            return None
+        own, fit = self.fitted[name]
+        return pair.misfit(own.model(pair, fit.parameters))
+
+
+def responses(
+    experiments: tuple[Experiment, ...], problem: Problem, fit: Fit | None, stretch_s: float | None
+) -> Responses:
+    """Estimate the frequency responses of every experiment.
+
+    Raises
+    ------
+    LogError
+        A log does not allow one: nothing is excited, it has gaps or missing samples, or is too short.
+
+    """
+    surveys: dict[str, Survey] = {}
+    fitted: dict[str, tuple[Survey, Fit]] = {}
+    for experiment in experiments:
+        try:
+            surveys[experiment.name] = experiment_survey(experiment, stretch_s=stretch_s)
+            if fit is not None and experiment.name in fit.nuisance:
+                fitted[experiment.name] = (_under(surveys[experiment.name], fit.nuisance[experiment.name]), fit)
+        except LogError as error:
+            raise LogError(f"{problem.source}: experiment {experiment.name}: {error}") from error
+    return Responses(surveys=surveys, given=problem.parameters, fitted=fitted)
+
+
+def _under(found: Survey, own: Nuisance) -> Survey:
+    """Return a survey whose models have a fit's delay and gains."""
+    return replace(found, clock=replace(found.clock, delay_s=own.delay_s, delay_free=False), gain=own.gain)
+
+
+def _reading(pair: Pair, drive: Drive) -> str:
+    form = pair.second_order
+    assert form is not None
+    return (
+        f"{pair.name} as (16), per newton of motor force: {drive.K.value:.5g}/(s² + {form.a.value:.4g} s + "
+        f"{form.b.value:.5g})\n"
+        f"  with k known: m_k = {drive.m_k}, b_m = {drive.b_m}, efficiency {drive.efficiency}\n"
+        f"  K and b averaged, as the paper does: m_k = {drive.m_k_averaged}, b_m = {drive.b_m_averaged}"
+    )

@@ -1,0 +1,327 @@
+"""The frequency responses of one log: from each excited input to each measured output, and what they show.
+
+A pair has its H1 estimate, the band in which it can be trusted, its peak and its second-order form. The form is read as
+the source paper reads (16) where the plant says so: two poles, no zero, b = k/m_k.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from seaopt.errors import LogError
+from seaopt.frequency.response import FrequencyResponse, h1
+from seaopt.frequency.sampled import sampled_response
+from seaopt.frequency.second_order import COHERENT, LINES, Drive, SecondOrder, coherent, second_order
+from seaopt.logs import Log
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.simulation import Clock, linearised, make_model
+
+SHORTEST = 256  # samples
+SMOOTH = 5  # lines of which the median coherence decides where a band ends
+NEAR_PEAK = 0.89  # of the peak's height: 1 dB below it
+Response = Callable[[Any], Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Peak:
+    """The largest response inside the good band; `magnitude` has the pair's unit."""
+
+    frequency_hz: float
+    magnitude: float
+    std: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pair:
+    """From one input to one output.
+
+    Parameters
+    ----------
+    source, output : str
+        Names of input and output.
+    unit : str
+        Output unit over input unit.
+    estimate : FrequencyResponse
+        H1 and coherence.
+    good_band_hz : (low, high) or None
+        The widest band, on a logarithmic axis, in which the coherence stays above 0.8.
+    peak : Peak or None
+        None where the response is largest at an end of the good band.
+    second_order : SecondOrder or None
+        None where too few frequencies are coherent.
+
+    """
+
+    source: str
+    output: str
+    unit: str
+    estimate: FrequencyResponse
+    good_band_hz: tuple[float, float] | None
+    peak: Peak | None
+    second_order: SecondOrder | None
+
+    @property
+    def name(self) -> str:
+        """Output over input, such as F1/I."""
+        return f"{self.output}/{self.source}"
+
+    @property
+    def used(self) -> Bool[np.ndarray, " m"]:
+        """The coherent frequencies, those that are compared with models."""
+        return coherent(self.estimate)
+
+    def misfit(self, response: Response) -> float:
+        """Return how far a response, a function of frequencies in Hz, lies from the estimate.
+
+        The root mean square over the coherent frequencies in standard deviations of the estimate; 1 explains the log.
+        """
+        used = self.used
+        if not np.any(used):
+            return float("nan")
+        measured = self.estimate.response[used]
+        sigma = np.maximum(self.estimate.relative_std[used], 1e-9) * np.abs(measured)
+        away = (self.estimate.expected(response)[used] - measured) / sigma
+        return float(np.sqrt(np.mean(np.abs(away) ** 2) / 2.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Survey:
+    """The pairs of one log.
+
+    Parameters
+    ----------
+    plant : Plant
+        What was on the bench.
+    clock : Clock
+        Of the log.
+    gain : mapping of output to float
+        Of the sensors: measured = gain * output.
+    pairs : tuple of Pair
+        Input by input.
+
+    """
+
+    plant: Plant
+    clock: Clock
+    gain: Mapping[str, float]
+    pairs: tuple[Pair, ...]
+
+    def model(self, pair: Pair, params: ParameterSet) -> Response:
+        """Return the plant's response as the sensors see it, linearised at rest, as a function of frequencies in Hz."""
+        model = linearised(make_model(self.plant, params, (), (pair.output,)))
+        clock = replace(self.clock, delay_free=False)
+        source, gain = list(self.plant.inputs).index(pair.source), self.gain.get(pair.output, 1.0)
+
+        def response(f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+            return gain * sampled_response(model, np.zeros(0), clock, f, source)[0][:, 0]
+
+        return response
+
+    def drive(self, pair: Pair, params: ParameterSet) -> Drive | None:
+        """Return what a pair's second-order form says of the actuator, with k known, as the source paper reads (16).
+
+        None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output.
+        """
+        values = self.plant.complete(params)
+        if pair.second_order is None or any(name not in values for name in ("k", "K_tau", "l", "N_p")):
+            return None
+        if not _is_form(self.plant, values, pair):
+            return None
+        k = values["k"]
+        force = values["K_tau"].value * 2 * np.pi * values["N_p"].value / values["l"].value
+        per_input = force * self.gain.get(pair.output, 1.0)
+        return pair.second_order.drive(k.value, per_input, k_std=k.std or k.prior_std or 0.0)
+
+    def to_dict(self, params: ParameterSet) -> dict[str, Any]:
+        """Return one experiment's part of frf.json; `params` are the values that models are drawn with."""
+        return {
+            "period_s": self.clock.period,
+            "hold": self.clock.hold,
+            "pairs": [_pair_dict(self, pair, params) for pair in self.pairs],
+        }
+
+
+def survey(
+    plant: Plant,
+    log: Log,
+    *,
+    outputs: Sequence[str] = (),
+    clock: Clock | None = None,
+    gain: Mapping[str, float] | None = None,
+    stretch_s: float | None = None,
+) -> Survey:
+    """Estimate the frequency responses of a log.
+
+    Parameters
+    ----------
+    plant : Plant
+        Its input and output names are those of the log's channels.
+    log : Log
+        One stretch without gaps. Inputs excited together count as noise to one another.
+    outputs : sequence of str, optional
+        Every output of the plant that the log has, if left out.
+    clock : Clock, optional
+        The log's period and hold and the input's delay, estimated where ``delay_free``; no delay and a zero-order hold
+        if left out.
+    gain : mapping of output to float, optional
+        Of the sensors; 1 where left out.
+    stretch_s : float, optional
+        Length of a stretch, as of `h1`.
+
+    Raises
+    ------
+    LogError
+        No input is excited, an output has missing samples, or the log is too short or has gaps.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.bench import PAPER_STAND
+    >>> plant = so.plants.high_impedance()
+    >>> log = so.virtual_log(plant, so.plants.thor(), PAPER_STAND, duration_s=20, rate_hz=400, seed=1)
+    >>> [pair.name for pair in survey(plant, log, outputs=("F1", "F2")).pairs]
+    ['F1/I', 'F2/I']
+
+    """
+    names = tuple(outputs) or tuple(name for name in plant.outputs if name in log.signals)
+    sources = _excited(plant, log)
+    _check(log, (*sources, *names))
+    chosen = clock if clock is not None else Clock(period=log.period)
+    pairs = [_pair(plant, log, chosen, source, name, stretch_s) for source in sources for name in names]
+    return Survey(plant=plant, clock=chosen, gain=dict(gain or {}), pairs=tuple(pairs))
+
+
+def _excited(plant: Plant, log: Log) -> list[str]:
+    present = [name for name in plant.inputs if name in log.signals]
+    excited = [name for name in present if np.ptp(log[name]) != 0.0]
+    if not excited:
+        what = ", ".join(present) or "an input"
+        raise LogError(f"{log.source}: {what} is constant or absent; a frequency response needs excitation")
+    return excited
+
+
+def _check(log: Log, names: Sequence[str]) -> None:
+    if len(log.segments) != 1:
+        raise LogError(
+            f"{log.source}: the log has {len(log.segments)} stretches between gaps and a frequency response takes one; "
+            "choose one with slice_s"
+        )
+    if len(log) < SHORTEST:
+        raise LogError(
+            f"{log.source}: {len(log)} samples are too few for a frequency response; use a log of {SHORTEST} or more"
+        )
+    for name in names:
+        lost = int(np.count_nonzero(~np.isfinite(log[name])))
+        if lost:
+            raise LogError(
+                f"{log.source}: {lost} samples of {name} are missing and a frequency response takes all; "
+                "choose a stretch with slice_s"
+            )
+
+
+def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretch_s: float | None) -> Pair:
+    estimate = h1(log[source], log[output], log.period, stretch_s=stretch_s)
+    unit = f"{plant.outputs[output]}/{_divisor(plant.inputs[source])}"
+    used = coherent(estimate)
+    form = second_order(estimate, clock, unit=unit, use=used) if np.count_nonzero(used) >= LINES else None
+    band = _good_band(estimate)
+    return Pair(
+        source=source, output=output, unit=unit, estimate=estimate, good_band_hz=band, peak=_peak(estimate, band),
+        second_order=form,
+    )  # fmt: skip
+
+
+def _divisor(unit: str) -> str:
+    return f"({unit})" if " " in unit or "/" in unit else unit
+
+
+def _good_band(estimate: FrequencyResponse) -> tuple[float, float] | None:
+    """Return the widest run of good coherence; a line alone that strays, as estimates do, ends none."""
+    from scipy.ndimage import median_filter  # deferred: 0.2 s
+
+    good = median_filter(estimate.coherence, SMOOTH, mode="nearest") > COHERENT
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+    runs = [(float(estimate.frequency_hz[a]), float(estimate.frequency_hz[b - 1])) for a, b in edges.reshape(-1, 2)]
+    return max(runs, key=lambda run: run[1] / run[0], default=None)
+
+
+def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak | None:
+    """Return the top of a cubic through the lines within 1 dB of the largest, in logarithms; or that line."""
+    if band is None:
+        return None
+    inside = np.flatnonzero((estimate.frequency_hz >= band[0]) & (estimate.frequency_hz <= band[1]))
+    size = np.abs(estimate.response[inside])
+    top = int(np.argmax(size))
+    if top in (0, size.size - 1):
+        return None
+    first = top - int(np.argmax(np.append(size[top::-1] < NEAR_PEAK * size[top], True)))
+    last = top + int(np.argmax(np.append(size[top:] < NEAR_PEAK * size[top], True)))
+    near = inside[max(first + 1, 0) : last]
+    f, std = estimate.frequency_hz, estimate.relative_std
+    at, height = float(f[inside[top]]), float(size[top])
+    if near.size >= LINES:
+        x = np.log(f[near] / at)
+        curve = np.polyfit(x, np.log(np.abs(estimate.response[near])), 3, w=1.0 / np.maximum(std[near], 1e-9))
+        dense = np.linspace(x[0], x[-1], 401)
+        best = int(np.argmax(np.polyval(curve, dense)))
+        at, height = at * float(np.exp(dense[best])), float(np.exp(np.polyval(curve, dense[best])))
+    return Peak(frequency_hz=at, magnitude=height, std=float(std[inside[top]]) * height)
+
+
+def _is_form(plant: Plant, values: ParameterSet, pair: Pair) -> bool:
+    """Tell whether the plant at rest has two poles, no zero from input to output, and b = k/m_k."""
+    derived = plant.derived_values()
+    if len(plant.states) != 2 or "m_k" not in derived:
+        return False
+    point = [item.value for item in values.values()]
+    m_k: Any = ca.Function("m_k", [plant.p], [derived["m_k"][0]])(point)
+    model = linearised(make_model(plant, values, (), (pair.output,)))
+    g, _ = model.matrices(np.zeros(0))
+    a, b, source = g[:2, :2], g[:2, 2 + list(plant.inputs).index(pair.source)], g[2]
+    through = source[2 + list(plant.inputs).index(pair.source)]
+    stiff = values["k"].value / float(m_k)
+    if not np.isclose(np.linalg.det(a), stiff, rtol=1e-6):
+        return False
+    static = float(source[:2] @ np.linalg.solve(a, b))
+    return bool(through == 0.0 and abs(source[:2] @ b) <= 1e-9 * abs(static) * np.sqrt(stiff))
+
+
+def _pair_dict(found: Survey, pair: Pair, params: ParameterSet) -> dict[str, Any]:
+    estimate, drive = pair.estimate, found.drive(pair, params)
+    return {
+        "input": pair.source,
+        "output": pair.output,
+        "unit": pair.unit,
+        "averages": estimate.averages,
+        "good_band_hz": pair.good_band_hz,
+        "peak": _fields(pair.peak) if pair.peak is not None else None,
+        "second_order": _form_dict(pair.second_order) if pair.second_order is not None else None,
+        "actuator": {name: _fields(item) for name, item in _fields(drive).items()} if drive is not None else None,
+        "model_misfit": pair.misfit(found.model(pair, params)),
+        "frequency_hz": estimate.frequency_hz,
+        "real": np.real(estimate.response),
+        "imag": np.imag(estimate.response),
+        "relative_std": estimate.relative_std,
+        "coherence": estimate.coherence,
+    }
+
+
+def _form_dict(form: SecondOrder) -> dict[str, Any]:
+    names = ("K", "a", "b", "delay_s", "static_gain", "natural_frequency_hz", "damping_ratio")
+    return {
+        **{name: _fields(getattr(form, name)) for name in names},
+        "band_hz": form.band_hz,
+        "lines": form.lines,
+        "misfit": form.misfit,
+    }
+
+
+def _fields(item: Any) -> dict[str, Any]:
+    return {name: getattr(item, name) for name in item.__dataclass_fields__}

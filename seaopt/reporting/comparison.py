@@ -1,0 +1,159 @@
+"""The frequency responses of a fit's experiments beside the fit: what the one says of the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seaopt.errors import LogError
+from seaopt.estimation import Experiment, Fit
+from seaopt.estimation.result import Derived
+from seaopt.frequency import Drive, Pair, Survey, Uncertain, survey
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.reporting.bode import Curve, Panel, bode_figure
+from seaopt.simulation import Clock
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GIVEN, FITTED, FORM = "#d55e00", "#0072b2", "#009e73"
+FAR = 3.0  # standard deviations: what lies farther is said to differ
+
+
+def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s: float | None = None) -> Survey:
+    """Return the frequency responses of an experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        With its log.
+    fit : Fit, optional
+        Its delay and gains take the place of the experiment's own.
+    stretch_s : float, optional
+        Length of a stretch, as of `seaopt.h1`.
+
+    Raises
+    ------
+    LogError
+        The log does not allow an estimate.
+
+    """
+    own = fit.nuisance.get(experiment.name) if fit is not None else None
+    delay = experiment.delay_s
+    free = isinstance(delay, Parameter) and delay.free and own is None
+    known = own.delay_s if own is not None else _value(delay)
+    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known, delay_free=free)
+    gain = own.gain if own is not None else {name: _value(item) for name, item in experiment.gain.items()}
+    return survey(
+        experiment.plant, experiment.log, outputs=experiment.outputs, clock=clock, gain=gain, stretch_s=stretch_s
+    )
+
+
+def _value(item: float | Parameter) -> float:
+    return item.value if isinstance(item, Parameter) else item
+
+
+def fit_surveys(fit: Fit) -> dict[str, Survey]:
+    """Return the frequency responses of a fit's experiments, without those whose log does not allow one."""
+    found: dict[str, Survey] = {}
+    for experiment in fit.experiments:
+        try:
+            found[experiment.name] = experiment_survey(experiment, fit)
+        except LogError:
+            continue
+    return found
+
+
+def survey_figure(
+    surveys: Mapping[str, Survey],
+    given: ParameterSet | None = None,
+    fitted: Mapping[str, tuple[Survey, Fit]] | None = None,
+) -> Figure:
+    """Draw every pair of the surveys with its second-order fit, and the plant with given values and as fitted.
+
+    Parameters
+    ----------
+    surveys : mapping of experiment to Survey
+        What to draw.
+    given : ParameterSet, optional
+        Values before a fit.
+    fitted : mapping of experiment to (Survey, Fit), optional
+        The survey under the fit's delay and gains, and the fit.
+
+    """
+    panels: list[Panel] = []
+    for name, found in surveys.items():
+        for pair in found.pairs:
+            curves: list[Curve] = []
+            if fitted is not None and name in fitted:
+                own, fit = fitted[name]
+                curves.append(Curve(label="model, fitted", response=own.model(pair, fit.parameters), colour=FITTED))
+            if given is not None:
+                model = found.model(pair, given)
+                curves.append(Curve(label="model, the file's values", response=model, colour=GIVEN, style="-."))
+            if pair.second_order is not None:
+                form = pair.second_order.response
+                curves.append(Curve(label="second-order fit", response=form, colour=FORM, style="--"))
+            title = f"{name}: {pair.name} [{pair.unit}]"
+            panels.append(Panel(title=title, pair=pair, curves=tuple(curves)))
+    return bode_figure(panels)
+
+
+def sentence(found: Survey, fit: Fit) -> str:
+    """Say in plain words how the frequency responses of one experiment compare with the fit."""
+    usable = [pair for pair in found.pairs if pair.second_order is not None]
+    if not usable:
+        return "The log is not coherent enough for a comparison in frequency."
+    away = [pair.misfit(found.model(pair, fit.parameters)) for pair in usable]
+    names = [pair.name for pair in usable]
+    parts = [f"The fitted model lies {_each(away, names)} standard deviations from H1 (rms over its coherent lines)"]
+    forms = [pair.second_order.misfit for pair in usable if pair.second_order is not None]
+    parts.append(f", the second-order fit {_each(forms, names)}. ")
+    if max(away) > FAR:
+        parts.append("The model lacks something that the log shows. ")
+    odd = [name for name, form, model in zip(names, forms, away, strict=True) if form > FAR * max(model, 1.0)]
+    if odd:
+        parts.append(f"{_listed(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
+    parts += [_reading(pair, drive, fit) for pair, drive in _drives(found, fit)[:1]]
+    return "".join(parts).strip()
+
+
+def _drives(found: Survey, fit: Fit) -> list[tuple[Pair, Drive]]:
+    pairs = [(pair, found.drive(pair, fit.parameters)) for pair in found.pairs]
+    return [(pair, drive) for pair, drive in pairs if drive is not None]
+
+
+def _reading(pair: Pair, drive: Drive, fit: Fit) -> str:
+    """Say what (16) gives for the sprung mass and the damping, and what the fit gives."""
+    mass, damping = fit.derived["m_k"], fit.derived["b_m"]
+    words = f"{_gap('m_k', drive.m_k, mass)} and {_gap('b_m', drive.b_m, damping)}"
+    averaged = ""
+    if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:
+        averaged = (
+            f" The form's static gain is {drive.efficiency.value:.3f} of the motor force, not 1: averaging K and b, as "
+            f"the paper does, would give m_k = {drive.m_k_averaged.value:.4g} kg and "
+            f"b_m = {drive.b_m_averaged.value:.5g} N s/m."
+        )
+    return (
+        f"Read as (16) with k known, {pair.name} gives m_k = {drive.m_k} and b_m = {drive.b_m}; the fit in time "
+        f"gives {mass.value:.5g} ± {mass.std:.2g} {mass.unit} and {damping.value:.5g} ± {damping.std:.2g} "
+        f"{damping.unit}. So (16) has {words}.{averaged}"
+    )
+
+
+def _gap(name: str, form: Uncertain, fitted: Derived) -> str:
+    away, std = form.value - fitted.value, float(np.hypot(form.std, fitted.std))
+    side = "above" if away > 0.0 else "below"
+    return f"{name} {abs(away / fitted.value):.2%} {side} it ({abs(away) / max(std, 1e-300):.1f} combined std)"
+
+
+def _each(values: list[float], names: list[str]) -> str:
+    if len(values) == 1:
+        return f"{values[0]:.3g}"
+    return _listed([f"{value:.3g} ({name})" for value, name in zip(values, names, strict=True)])
+
+
+def _listed(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
