@@ -13,6 +13,7 @@ loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on them,
 :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter, in the
 frequency domain (overlap-save), chunk by chunk: memory does not grow with the log but for the residuals themselves.
+Long sums are NumPy's own, not the linear-algebra library's, whose threads cost more than such sums on a busy machine.
 """
 
 from __future__ import annotations
@@ -164,7 +165,8 @@ def coloured(
                 influence = np.empty((len(columns), pull.shape[1], inverse.shape[1]))
                 for o, places in enumerate(problem.columns(e, s)):
                     used = np.flatnonzero(places >= 0)
-                    influence[:, o] = columns[:, o, 1 + used] @ (inverse[places[used]] / problem.sigma[e][o])
+                    weights = inverse[places[used]] / problem.sigma[e][o]
+                    np.einsum("tc,cp->tp", columns[:, o, 1 + used], weights, out=influence[:, o])
                 influence *= _counts(pull[rows])[:, :, None]
                 total += _coloured_part(influence, tail, density)
                 tail = np.concatenate([tail, influence])[-len(tail) :] if len(tail) else tail
@@ -221,8 +223,9 @@ def _coloured_part(
     for a in range(ny):
         for b in range(ny):
             weighted = spectrum[:, b] * (kernel[:, a, b] * half)[:, None]
-            later += (own[:, a].conj().T @ weighted).real
-    here = np.einsum("tap,ab,tbq->pq", now, r[0], now, optimize=True)
+            later += np.einsum("fp,fq->pq", own[:, a].conj(), weighted).real
+    here = np.einsum("tap,tbq->abpq", now, now)
+    here = np.einsum("ab,abpq->pq", r[0], here)
     return here + later + later.T
 
 
@@ -235,8 +238,7 @@ def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:
     centred = r - r.mean()
     if lags < 1 or not np.any(centred):
         return 1.0
-    power = float(centred @ centred)
-    rho = np.array([centred[k:] @ centred[:-k] for k in range(1, lags + 1)]) / power
+    rho = np.array([np.sum(centred[k:] * centred[:-k]) for k in range(1, lags + 1)]) / np.sum(centred**2)
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
     return float(gammaincc(lags / 2, statistic / 2))
 

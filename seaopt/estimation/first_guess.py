@@ -1,8 +1,9 @@
 """A first guess from frequency responses: where time-domain least squares starts when the given values are far off.
 
 The H1 estimate of each input-output pair is compared with the linearised plant, in log magnitude and phase, which has
-no local minima to speak of in inertias, stiffnesses and dampings. Candidates are drawn over two decades around the
-given values, screened, and the best are refined by Gauss-Newton with CasADi's derivatives.
+no local minima to speak of in inertias, stiffnesses and dampings. The given values are refined by Gauss-Newton with CasADi's
+derivatives; where that leaves the responses unexplained, candidates are drawn over two decades around the given values,
+screened, and the best are refined.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from seaopt.simulation import Model, linearised
 CANDIDATES = 128
 REFINED = 4
 POINTS = 60
+EXPLAINED = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
+LONGEST = 1 << 14  # samples a stretch: resolution enough for a guess
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,19 +58,21 @@ def first_guess(
     low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
     prior = unknowns.prior_std[: unknowns.shared]
     spread = np.isinf(prior) & (start != 0.0)
-    best: tuple[float, Float[np.ndarray, " p"]] = (np.inf, start)
-    candidates = [start]
-    for _ in range(CANDIDATES):
-        factor = np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0)
-        candidates.append(np.clip(start * factor, low, high))
-    ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
-    for theta in ranked[:REFINED]:
-        cost, refined = _refine(targets, theta, low, high, spread)
-        if cost < best[0]:
-            best = (cost, refined)
+    best = _refine(targets, start, low, high, spread)
+    if best[0] > 0.5 * EXPLAINED**2 * 2 * sum(target.s.size for target in targets):
+        candidates = [
+            np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
+            for _ in range(CANDIDATES)
+        ]
+        ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
+        best = min((best, *(_refine(targets, theta, low, high, spread) for theta in ranked[:REFINED])), key=_first)
     guess = unknowns.start.copy()
     guess[: unknowns.shared] = best[1]
     return guess
+
+
+def _first(pair: tuple[float, Any]) -> float:
+    return pair[0]
 
 
 def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> list[_Target]:
@@ -81,7 +86,7 @@ def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[
         if not np.all(np.isfinite(log[output])):
             continue
         try:
-            estimate = h1(log[active[0]], log[output], log.period)
+            estimate = h1(log[active[0]], log[output], log.period, stretch_s=_stretch(len(log)) * log.period)
         except LogError:
             continue
         low, high = band_hz if band_hz is not None else (0.0, np.inf)
@@ -105,6 +110,13 @@ def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[
             )
         )
     return found
+
+
+def _stretch(n: int) -> int:
+    """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
+    length = min(n // 16, LONGEST)
+    fast = [2**a * 3**b for a in range(15) for b in range(9) if 2**a * 3**b <= length]
+    return max(fast, default=16)
 
 
 def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:

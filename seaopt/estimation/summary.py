@@ -251,5 +251,5 @@ def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, "
 
 
 def _fit_percent(measured: Float[np.ndarray, " n"], residual: Float[np.ndarray, " n"]) -> float:
-    spread = float(np.linalg.norm(measured - np.mean(measured)))
-    return 100.0 * (1.0 - float(np.linalg.norm(residual)) / max(spread, 1e-300))
+    spread = float(np.sum((measured - np.mean(measured)) ** 2))
+    return 100.0 * (1.0 - float(np.sqrt(np.sum(residual**2) / max(spread, 1e-300))))

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError
+
+BATCH = 1 << 20  # samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,16 +102,13 @@ def h1(
     if np.ptp(u) == 0.0:
         raise LogError("the input is constant; a frequency response needs excitation")
     starts = np.arange(0, n - length + 1, length // 2)
-    index = starts[:, None] + np.arange(length)
     window = np.hanning(length)
-
-    def spectra(values: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
-        pieces = values[index]
-        return np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:]
-
-    uf, yf = spectra(u), spectra(y)
-    suu, syy = np.mean(np.abs(uf) ** 2, axis=0), np.mean(np.abs(yf) ** 2, axis=0)
-    suy = np.mean(np.conj(uf) * yf, axis=0)
+    suu, syy, suy = np.zeros(length // 2), np.zeros(length // 2), np.zeros(length // 2, dtype=complex)
+    for batch in np.array_split(starts, -(-starts.size * length // BATCH)):  # long logs in the memory of a batch
+        uf, yf = (_spectra(values, batch, window) for values in (u, y))
+        suu += np.sum(np.abs(uf) ** 2, axis=0) / starts.size
+        syy += np.sum(np.abs(yf) ** 2, axis=0) / starts.size
+        suy += np.sum(np.conj(uf) * yf, axis=0) / starts.size
     floor = 1e-300
     return FrequencyResponse(
         frequency_hz=np.fft.rfftfreq(length, period)[1:],
@@ -117,3 +116,11 @@ def h1(
         coherence=np.abs(suy) ** 2 / np.maximum(suu * syy, floor),
         averages=int(starts.size),
     )
+
+
+def _spectra(
+    values: Float[np.ndarray, " n"], starts: Int[np.ndarray, " d"], window: Float[np.ndarray, " length"]
+) -> Complex[np.ndarray, "d m"]:
+    """Return the spectra above zero of windowed stretches without their means."""
+    pieces = np.stack([values[start : start + window.size] for start in starts])
+    return np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:]
