@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from seaopt.estimation import Experiment as Experiment
     from seaopt.estimation import Fit as Fit
     from seaopt.estimation import Huber as Huber
+    from seaopt.estimation import MultipleShooting as MultipleShooting
     from seaopt.estimation import OutputError as OutputError
+    from seaopt.estimation import PredictionError as PredictionError
+    from seaopt.estimation import SoftL1 as SoftL1
     from seaopt.estimation import fit as fit
     from seaopt.frequency import h1 as h1
     from seaopt.logs import Column as Column
@@ -55,7 +58,10 @@ _HOME = {
     "h1": "seaopt.frequency",
     "Experiment": "seaopt.estimation",
     "Huber": "seaopt.estimation",
+    "SoftL1": "seaopt.estimation",
     "OutputError": "seaopt.estimation",
+    "MultipleShooting": "seaopt.estimation",
+    "PredictionError": "seaopt.estimation",
     "Fit": "seaopt.estimation",
     "fit": "seaopt.estimation",
     "ControllerSpec": "seaopt.control",
@@ -71,8 +77,8 @@ _HOME = {
 }
 __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "read_log", "write_log", "simulate", "Sensors",
-    "virtual_log", "h1", "Experiment", "Huber", "OutputError", "Fit", "fit", "ControllerSpec", "Controller", "tune",
-    "Certificate", "certify", "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
+    "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting", "PredictionError", "Fit",
+    "fit", "ControllerSpec", "Controller", "tune", "Certificate", "certify", "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
 ]  # fmt: skip
 
 

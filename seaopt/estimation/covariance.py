@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from seaopt.estimation.residuals import Huber, Linear, Residuals
 from seaopt.simulation import Segment, stream
@@ -97,7 +97,7 @@ def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]):  # noqa: A
     return values
 
 
-def counted(piece: Segment, settle: int) -> Float[np.ndarray, "n ny"]:
+def counted(piece: Segment, settle: int) -> Bool[np.ndarray, "n ny"]:
     """Return which samples take part in the cost."""
     present = np.column_stack([np.isfinite(channel) for channel in piece.y])
     if piece.keep:
