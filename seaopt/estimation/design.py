@@ -30,6 +30,7 @@ from seaopt.estimation.search import (
     best_chirp,
     best_multisine,
     measure_of,
+    with_fine_steps,
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -179,7 +180,8 @@ def design_experiment(
         "A": the sum of the relative variances; "D": the determinant of the covariance; or the name of one free
         parameter, whose variance alone counts.
     signal : Multisines or Chirps, optional
-        What is looked for; multisines if left out.
+        What is looked for. If left out, multisines; and where a peak limits the one that is found, chirps as well,
+        whose peaks are low: the better is returned.
     offset : bool
         Whether the fit estimates an offset of each output.
     initial_state : {"estimate", "rest"}
@@ -212,15 +214,20 @@ def design_experiment(
     (1.7, True)
 
     """
-    chosen = signal if signal is not None else Multisines()
     bench = make_bench(
         plant, params, sigma, duration_s=limits.duration_s, rate_hz=limits.rate_hz, offset=offset,
         initial_state=initial_state, input_name=input_name, watched=_watched(plant, limits),
     )  # fmt: skip
     measure = measure_of(bench, criterion)
     search = Search(bench=bench, limits=limits, measure=measure)
-    band = _band(chosen.band_hz, limits)
-    found = best_chirp(search, band) if isinstance(chosen, Chirps) else best_multisine(search, band, chosen)
+    band = _band(None if signal is None else signal.band_hz, limits)
+    search = with_fine_steps(search, band)
+    if isinstance(signal, Chirps):
+        found = best_chirp(search, band)
+    else:
+        found = best_multisine(search, band, signal if signal is not None else Multisines())
+    if signal is None and search.peaked(found.trial):
+        found = min(found, best_chirp(search, band), key=lambda item: item.value)
     return _design(search, found, criterion)
 
 

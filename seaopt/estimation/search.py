@@ -161,6 +161,10 @@ class Search:
     limits: Limits
     measure: Measure
 
+    def peaked(self, trial: Trial) -> bool:
+        """Tell whether a peak, not the rms, limits the excitation."""
+        return self.limits.rms is None or bool(trial.rms < 0.99 * self.limits.rms)
+
     def use(self, trial: Trial) -> float:
         """Return the largest of all limited quantities over their limits."""
         own = [0.0 if self.limits.rms is None else trial.rms / self.limits.rms]
@@ -264,7 +268,9 @@ def _convex(search: Search, lines: Spectrum, spread: float) -> Found:
         )
         kept = powers > FAINT * np.max(powers)
         found = search.within(_low_peaks(search, _chosen(lines, kept), powers[kept], caps))
-        best = found if best is None or found.value < best.value else best
+        if best is not None and found.value >= best.value:
+            break
+        best = found
         part = found.excitation[0]
         assert isinstance(part, Multisine)
         rms = np.sqrt(np.abs(lines.gains[:, kept]) ** 2 @ (np.array(part.amplitudes) ** 2 / 2))
@@ -343,6 +349,14 @@ def _descend(cost: Callable[[Float[np.ndarray, " m"]], float], x0: Float[np.ndar
 
     found = minimize(cost, x0, method="L-BFGS-B", jac="2-point", options={"maxiter": 15, "eps": 1e-4, "maxfun": 300})
     return np.asarray(found.x)
+
+
+def with_fine_steps(search: Search, band: tuple[float, float]) -> Search:
+    """Return the search with integration steps that are fine enough for a chirp over the whole band."""
+    if search.bench.model.linear:
+        return search
+    found = search.within(_chirp(np.log(band[0]), np.log(band[1])))
+    return replace(search, bench=search.bench.refined(search.bench.samples(found.excitation)))
 
 
 def best_chirp(search: Search, band: tuple[float, float]) -> Found:

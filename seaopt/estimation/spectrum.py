@@ -256,7 +256,7 @@ def low_peak_phases(
     for order in ORDERS:
         found = minimize(
             lambda x, q: _norm(x, lines, places, n, q), phases, args=(order,), jac=True, method="L-BFGS-B",
-            options={"maxiter": 60},
+            options={"maxiter": 40},
         )  # fmt: skip
         phases = np.asarray(found.x)
     return phases

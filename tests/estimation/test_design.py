@@ -202,6 +202,17 @@ def test_peaks_are_kept_to(stand, thor):
     assert "of 500" in repr(found)
 
 
+def test_where_peaks_bind_the_better_of_multisine_and_chirp_is_returned(stand, thor):
+    """At 400 N a chirp, whose peak is 1.4 times its rms, may be larger than two lines, whose peak is twice theirs."""
+    limits = Limits(duration_s=10, rate_hz=400, rms=np.sqrt(3.0), peaks={"F1": 400.0})
+    kinds = (None, Multisines(), Chirps())
+    cost = lambda found: sum((std / thor[name].value) ** 2 for name, std in found.std.items())  # noqa: E731
+    either, multisine, chirp = (
+        cost(design_experiment(stand, thor.free("J", "b_r", "eta"), limits, sigma=NOISE, signal=kind)) for kind in kinds
+    )
+    assert either == pytest.approx(min(multisine, chirp), rel=1e-9)
+
+
 def test_the_best_chirp_lies_between(stand, thor):
     """Better than the paper's excitation, and no better than the multisine but for the grid of its lines."""
     limits, params = Limits(duration_s=20, rate_hz=400, rms=np.sqrt(3.0)), thor.free("J", "b_r", "eta")
