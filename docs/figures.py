@@ -1,4 +1,4 @@
-"""Draw the figures of docs/plants.md: python docs/figures.py"""
+"""Draw the figures of the documentation: python docs/figures.py"""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import seaopt as so
+from seaopt.bench import PAPER_STAND
+from seaopt.estimation import Limits, design_experiment
 
 FOLDER = Path(__file__).resolve().parent / "figures"
 COLOURS = {"unlumped": "#0072b2", "lumped": "#d55e00"}
@@ -88,9 +90,56 @@ def parts() -> None:
     save(figure, "parts")
 
 
+def estimates(excitation, covariance, axis, colour: str, label: str) -> None:
+    """Fit 40 logs that differ in noise; draw the estimates and the expected 95 % ellipse, in 1e-6 of the truth."""
+    plant, truth, noise = so.plants.high_impedance(), so.plants.thor().free("J", "b_r", "eta"), {"F1": 2.0, "F2": 2.0}
+    found = []
+    for seed in range(40):
+        log = so.virtual_log(
+            plant, truth, excitation, duration_s=10, rate_hz=400, seed=seed, sensors=so.Sensors(noise_std=noise)
+        )
+        experiment = so.Experiment(plant=plant, log=log, outputs=("F1", "F2"), sigma=noise)
+        fit = so.fit([experiment], truth, method=so.OutputError(search=False))
+        found.append([1e6 * (fit.parameters[name].value / truth[name].value - 1) for name in ("J", "b_r")])
+    size = np.array([truth["J"].value, truth["b_r"].value])
+    root = np.linalg.cholesky(covariance.matrix[:2, :2] / np.outer(size, size))
+    turn = np.linspace(0, 2 * np.pi, 200)
+    ellipse = 1e6 * np.sqrt(5.991) * root @ np.array([np.cos(turn), np.sin(turn)])
+    axis.plot(*np.array(found).T, ".", color=colour, markersize=4, label=label)
+    axis.plot(*ellipse, color=colour, linewidth=1.0)
+
+
+def experiment_design() -> None:
+    plant, truth, noise = so.plants.high_impedance(), so.plants.thor().free("J", "b_r", "eta"), {"F1": 2.0, "F2": 2.0}
+    limits = Limits(duration_s=10, rate_hz=400, rms=np.sqrt(3.0))
+    design = design_experiment(plant, truth, limits, sigma=noise)
+    paper = design.against(PAPER_STAND)
+    figure, axes = new(["what one line tells", "40 fits each, and the expected 95 %"], "information, largest = 1")
+    for name, colour in zip(("J", "b_r", "eta"), ("#0072b2", "#009e73", "#cc79a7"), strict=True):
+        step = 1e-4 * truth[name].value
+        up, down = (
+            plant.linearize(truth.update(**{name: truth[name].value + d}))(2j * np.pi * F) for d in (step, -step)
+        )
+        told = np.sum(np.abs(up[:2, 0] - down[:2, 0]) ** 2, axis=0)
+        axes[0].semilogx(F, told / np.max(told), color=colour, linewidth=1.3, label=name)
+    (part,) = design.excitation
+    power = np.array(part.amplitudes) ** 2 / np.sum(np.array(part.amplitudes) ** 2)
+    axes[0].vlines(part.frequencies_hz, 0, power, color="k", linewidth=2.0, label="power, share")
+    axes[0].set_xlim(0.1, 100)
+    axes[0].legend(frameon=False, fontsize="x-small", loc="upper right")
+    estimates(paper.excitation, paper.covariance, axes[1], "#d55e00", "paper's excitation")
+    estimates(design.excitation, design.covariance, axes[1], "#0072b2", "design")
+    axes[1].set_xlabel("error of J [1e-6 of its value]")
+    axes[1].set_ylabel("error of b_r [1e-6 of its value]")
+    axes[1].legend(frameon=False, fontsize="x-small", loc="upper left")
+    axes[1].set_ylim(-500, 650)
+    save(figure, "experiment_design")
+
+
 if __name__ == "__main__":
     force_responses(so.plants.high_impedance, "high_impedance")
     force_responses(so.plants.moving_output, "moving_output")
     impulse()
     rotary()
     parts()
+    experiment_design()

@@ -39,6 +39,14 @@ def test_the_plant_of_the_how_to_works():
     assert list(space["pendulum"].states) == ["theta", "omega"]
 
 
+def test_the_design_of_the_how_to_works():
+    code = blocks("howto_experiment_design.md", "python")[0]
+    space: dict = {}
+    exec(re.sub(r"print\(.*", "", code), space)
+    ratio = space["design"].against(space["PAPER_STAND"]).ratio
+    assert ratio["J"] > 2.5 and ratio["b_r"] > 2.0
+
+
 def test_every_figure_of_the_docs_is_there():
     for page in DOCS.glob("*.md"):
         for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):

@@ -1,8 +1,8 @@
-"""Excitations: the paper's logarithmic chirp and band-limited noise (Orekhov et al. 2015, Sec. III-A)."""
+"""Excitations: the paper's chirp and band-limited noise (Orekhov et al. 2015, Sec. III-A), and multisines."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -64,12 +64,82 @@ class Noise:
         return self.std * noise / np.sqrt(np.mean(inside))
 
 
-Excitation = tuple[Chirp | Noise, ...]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Multisine:
+    """A sum of sines, sum_k a_k sin(2 pi f_k t + phi_k).
+
+    Parameters
+    ----------
+    amplitudes : tuple of float
+        In the input's unit (A).
+    frequencies_hz : tuple of float
+        Positive, below half the sample rate; multiples of 1/duration make the whole log one period.
+    phases_rad : tuple of float
+        Zero for each where left out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> sine = Multisine(amplitudes=(2.0,), frequencies_hz=(1.0,))
+    >>> sine.samples(np.array([0.0, 0.25, 0.5]), np.random.default_rng(0)).round(6)
+    array([0., 2., 0.])
+
+    """
+
+    amplitudes: tuple[float, ...]
+    frequencies_hz: tuple[float, ...]
+    phases_rad: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        count = len(self.amplitudes)
+        if not count or len(self.frequencies_hz) != count or len(self.phases_rad) not in (0, count):
+            raise SimulationError(
+                f"multisine: {count} amplitudes, {len(self.frequencies_hz)} frequencies, "
+                f"{len(self.phases_rad)} phases; give as many of each, phases_rad may be left out"
+            )
+
+    def samples(self, time: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+        """Return the excitation at `time`."""
+        nyquist = 0.5 / (time[1] - time[0])
+        for frequency in self.frequencies_hz:
+            if not 0.0 < frequency < nyquist:
+                raise SimulationError(
+                    f"multisine: frequencies_hz has {frequency:g}, outside 0 to half the sample rate ({nyquist:g} Hz); "
+                    "leave it out or raise the rate"
+                )
+        out = np.zeros(time.size)
+        phases = self.phases_rad or (0.0,) * len(self.amplitudes)
+        for a, f, phase in zip(self.amplitudes, self.frequencies_hz, phases, strict=True):
+            out += a * np.sin(2 * np.pi * f * time + phase)
+        return out
+
+
+Excitation = tuple[Chirp | Noise | Multisine, ...]
 
 # The paper's two experiments: chirp of 480.6 N (2 A) with noise of 240.3 N (1 A); noise of 841 N, which is 3.5 A
 # (printed as 3 A).
 PAPER_STAND: Excitation = (Chirp(amplitude=2.0, f0_hz=0.01, f1_hz=150.0), Noise(std=1.0, band_hz=150.0))
 PAPER_SWING: Excitation = (Noise(std=3.5, band_hz=150.0),)
+
+
+def scaled(parts: Excitation, factor: float) -> Excitation:
+    """Return the excitation `factor` times as large.
+
+    Examples
+    --------
+    >>> scaled(PAPER_STAND, 0.5)[1]
+    Noise(std=0.5, band_hz=150.0)
+
+    """
+    out: list[Chirp | Noise | Multisine] = []
+    for part in parts:
+        if isinstance(part, Chirp):
+            out.append(replace(part, amplitude=part.amplitude * factor))
+        elif isinstance(part, Noise):
+            out.append(replace(part, std=part.std * factor))
+        else:
+            out.append(replace(part, amplitudes=tuple(a * factor for a in part.amplitudes)))
+    return tuple(out)
 
 
 def excite(
@@ -88,6 +158,6 @@ def excite(
     if n < 2:
         raise SimulationError(f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g} gives {n} samples; lengthen it")
     if not parts:
-        raise SimulationError("excitation is empty; give a chirp, a noise, or both")
+        raise SimulationError("excitation is empty; give a chirp, a noise, a multisine, or several")
     time = np.arange(n) / rate_hz
     return time, np.sum([part.samples(time, rng) for part in parts], axis=0)

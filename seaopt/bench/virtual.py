@@ -66,7 +66,7 @@ def virtual_log(
     ----------
     plant, params
         The actuator on the bench and its true parameters.
-    excitation : tuple of Chirp, Noise
+    excitation : tuple of Chirp, Noise, Multisine
         Summed, held between samples, fed to one input.
     duration_s, rate_hz : float
         Length and sample rate.

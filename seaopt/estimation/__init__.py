@@ -1,6 +1,15 @@
-"""Least squares on the time-domain logs: parameters, their uncertainty, and what the data cannot tell."""
+"""Least squares on the time-domain logs: parameters, their uncertainty, what the data cannot tell, what to measure."""
 
 from seaopt.estimation.covariance import Covariance
+from seaopt.estimation.design import (
+    Chirps,
+    Comparison,
+    Design,
+    Limits,
+    Multisines,
+    design_experiment,
+    expected_covariance,
+)
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.fit import fit
 from seaopt.estimation.identifiability import Identifiability
@@ -9,6 +18,7 @@ from seaopt.estimation.residuals import Huber, Linear, SoftL1
 from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit, Prediction
 
 __all__ = [
-    "Covariance", "Derived", "Experiment", "Fit", "Huber", "Identifiability", "Linear", "Method", "MultipleShooting",
-    "Nuisance", "OutputError", "OutputFit", "Prediction", "PredictionError", "SoftL1", "fit",
+    "Chirps", "Comparison", "Covariance", "Derived", "Design", "Experiment", "Fit", "Huber", "Identifiability",
+    "Limits", "Linear", "Method", "MultipleShooting", "Multisines", "Nuisance", "OutputError", "OutputFit",
+    "Prediction", "PredictionError", "SoftL1", "design_experiment", "expected_covariance", "fit",
 ]  # fmt: skip

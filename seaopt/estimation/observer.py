@@ -21,6 +21,7 @@ from seaopt.simulation.discretisation import expm_with_derivatives
 
 DOUBLINGS = 60
 DISTRUST = float(np.log(0.1))  # process noise, over each state's size, of a filter that hardly trusts the plant
+RATE_LIMIT = 0.3  # a sample: dry friction at rest looks like a damping that would forget the speed within a sample
 NEIGHBOUR = 1e-6  # relative step of the differences
 
 
@@ -80,6 +81,8 @@ class Observer:
                 a[i], c[i] = block[:nx, :nx], block[nx:, :nx]
                 continue
             f, h = self._mean_derivatives(model, theta)
+            limit = RATE_LIMIT / clock.period
+            f[np.diag_indices(nx)] = np.clip(np.diag(f), -limit, limit)
             a[i], _ = expm_with_derivatives(f * clock.period, np.zeros((0, nx, nx)))
             c[i] = h
         return a, c

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from seaopt.bench import Chirp, Excitation, Noise, Sensors, virtual_log
+from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import Experiment, Huber, Linear
@@ -152,11 +152,14 @@ class Problem:
         return read_log(path, time=_column(table.time), channels=columns)
 
     def _virtual(self, plant: Plant, table: VirtualTable) -> Log:
-        parts: list[Chirp | Noise] = []
+        parts: list[Chirp | Noise | Multisine] = []
         if table.excitation.chirp:
             parts.append(Chirp(**table.excitation.chirp.model_dump()))
         if table.excitation.noise:
             parts.append(Noise(**table.excitation.noise.model_dump()))
+        if table.excitation.multisine:
+            lines = table.excitation.multisine.model_dump()
+            parts.append(Multisine(**{name: tuple(values) for name, values in lines.items()}))
         excitation: Excitation = tuple(parts)
         truth = {**plant.complete(self.parameters)}
         for name, value in table.truth.items():

@@ -69,11 +69,20 @@ class NoiseTable(_Strict):
     band_hz: Number
 
 
+class MultisineTable(_Strict):
+    """A sum of sines; phases are zero where left out."""
+
+    amplitudes: list[Number]
+    frequencies_hz: list[Number]
+    phases_rad: list[Number] = []
+
+
 class ExcitationTable(_Strict):
     """What drives a virtual experiment; the parts are summed."""
 
     chirp: ChirpTable | None = None
     noise: NoiseTable | None = None
+    multisine: MultisineTable | None = None
 
 
 class VirtualTable(_Strict):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Noise, excite
+from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Multisine, Noise, excite, scaled
 from seaopt.errors import SimulationError
 
 
@@ -26,6 +26,28 @@ def test_the_chirp_sweeps_exponentially():
     crossings = time[1:][np.diff(np.sign(signal)) > 0]
     middle, frequency = 0.5 * (crossings[1:] + crossings[:-1]), 1 / np.diff(crossings)
     np.testing.assert_allclose(frequency[20:-50], 100 ** (middle[20:-50] / 10), rtol=0.02)
+
+
+def test_the_lines_of_a_multisine_are_where_and_as_large_as_asked():
+    """A discrete Fourier transform over one period gives a_k exp(i (phi_k - pi/2)) at f_k, nothing elsewhere."""
+    lines = Multisine(amplitudes=(1.0, 0.5), frequencies_hz=(0.2, 7.0), phases_rad=(0.3, -1.1))
+    _, current = excite((lines,), duration_s=10, rate_hz=100, rng=np.random.default_rng(0))
+    spectrum = np.fft.rfft(current) * 2 / current.size
+    np.testing.assert_allclose(
+        spectrum[[2, 70]], np.array([1.0, 0.5]) * np.exp(1j * (np.array([0.3, -1.1]) - np.pi / 2))
+    )
+    assert np.max(np.abs(np.delete(spectrum, [2, 70]))) < 1e-12
+
+
+def test_a_scaled_excitation_is_so_many_times_as_large():
+    parts = (*PAPER_STAND, Multisine(amplitudes=(1.0,), frequencies_hz=(3.0,)))
+    drive = lambda what: excite(what, duration_s=2, rate_hz=400, rng=np.random.default_rng(5))[1]  # noqa: E731
+    np.testing.assert_allclose(drive(scaled(parts, 0.25)), 0.25 * drive(parts), atol=1e-12)
+
+
+def test_a_multisine_needs_as_many_phases_as_lines():
+    with pytest.raises(SimulationError, match="2 amplitudes, 1 frequencies"):
+        Multisine(amplitudes=(1.0, 2.0), frequencies_hz=(3.0,))
 
 
 def test_841_newtons_are_3_5_amperes(thor):
@@ -65,6 +87,7 @@ def test_swing_angles_stay_small(swing, thor):
         ((), {}, "excitation is empty"),
         ((Chirp(amplitude=1, f0_hz=5, f1_hz=1),), {}, "f0_hz"),
         ((Noise(std=-1, band_hz=10),), {}, "noise"),
+        ((Multisine(amplitudes=(1.0,), frequencies_hz=(200.0,)),), {}, "half the sample rate"),
         (PAPER_STAND, {"sensors": so.Sensors(noise_std={"F9": 1})}, "F9"),
         (PAPER_STAND, {"sensors": so.Sensors(noise_std={"F1": -1})}, "negative"),
         (PAPER_STAND, {"input_name": "V"}, '"V"'),

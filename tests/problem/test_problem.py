@@ -28,6 +28,26 @@ def test_the_packaged_problem_is_the_one_in_problems():
     assert (ROOT / "problems" / "thor.toml").read_text(encoding="utf-8") == TEXT
 
 
+def test_a_multisine_in_a_problem_file_drives_the_virtual_log(write):
+    """One line of 2 A at 8 Hz for 2 s at 400 Hz: 16 whole periods, an rms of sqrt(2) A."""
+    lines = "multisine = { amplitudes = [2.0], frequencies_hz = [8.0] }"
+    path = write(
+        f"""
+schema = 1
+[plant.stand]
+kind = "high_impedance"
+[[experiment]]
+name = "line"
+plant = "stand"
+virtual = {{ seed = 1, duration_s = 2, rate_hz = 400, excitation = {{ {lines} }} }}
+"""
+    )
+    (experiment,) = so.read_problem(path).experiments()
+    current = experiment.log["I"]
+    assert float((current**2).mean()) == pytest.approx(2.0)
+    assert current[100] == pytest.approx(0.0, abs=1e-9)  # a quarter of a second is two periods
+
+
 def test_values_units_bounds_and_priors(write):
     path = write(
         """
