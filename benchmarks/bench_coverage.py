@@ -18,8 +18,9 @@ truth in 95 % of the logs; so does the ellipsoid of all three, whose squared rad
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
-import sys
 import time
 from collections.abc import Callable
 
@@ -113,13 +114,6 @@ def errors(case: Callable[[int], so.Fit], seeds: range) -> tuple[np.ndarray, np.
     return error, std, radius
 
 
-def coverage(case: Callable[[int], so.Fit], seeds: range) -> dict[str, float]:
-    """Return the part of the logs whose 95 % intervals hold the truth, parameter by parameter and together."""
-    error, std, radius = errors(case, seeds)
-    inside = np.mean(np.abs(error) <= 1.959964 * std, axis=0)
-    return {**dict(zip(FREE, inside.tolist(), strict=True)), "together": float(np.mean(radius <= RADIUS_95))}
-
-
 CASES: dict[str, Callable[[int], so.Fit]] = {
     "white noise": white,
     "coloured noise": coloured,
@@ -129,22 +123,50 @@ CASES: dict[str, Callable[[int], so.Fit]] = {
 }
 
 
-def report(name: str, seeds: range) -> None:
-    """Print coverage, bias and scatter of one case."""
-    started = time.perf_counter()
+def figures(name: str, seeds: range) -> dict[str, dict[str, float]]:
+    """Return coverage, bias, std and scatter, a parameter each, and the coverage of the ellipsoid."""
     error, std, radius = errors(CASES[name], seeds)
-    truth = np.array([THOR[item].value for item in FREE])
+    mean_std = np.mean(std, axis=0)
+    inside = np.mean(np.abs(error) <= 1.959964 * std, axis=0)
+    out = {
+        item: {
+            "covered": float(inside[i]),
+            "std_percent": float(100 * mean_std[i] / THOR[item].value),
+            "bias_in_std": float(np.mean(error[:, i]) / mean_std[i]),
+            "scatter_in_std": float(np.std(error[:, i]) / mean_std[i]),
+        }
+        for i, item in enumerate(FREE)
+    }
+    return {**out, "together": {"covered": float(np.mean(radius <= RADIUS_95))}}
+
+
+def report(name: str, seeds: range) -> None:
+    """Print the figures of one case."""
+    started = time.perf_counter()
+    found = figures(name, seeds)
     print(f"\n{name}: {len(seeds)} logs, {time.perf_counter() - started:.0f} s")
-    print("            covered   bias/%  std/%   bias/std  scatter/std")
-    for i, item in enumerate(FREE):
-        inside, mean_std = np.mean(np.abs(error[:, i]) <= 1.959964 * std[:, i]), np.mean(std[:, i])
-        bias, scatter = np.mean(error[:, i]), np.std(error[:, i])
-        print(f"  {item:9s} {100 * inside:6.2f} %  {100 * bias / truth[i]:+7.3f}  {100 * mean_std / truth[i]:6.3f}"
-              f"  {bias / mean_std:+7.2f}   {scatter / mean_std:7.3f}")  # fmt: skip
-    print(f"  together  {100 * np.mean(radius <= RADIUS_95):6.2f} %")
+    print("            covered    std/%   bias/std  scatter/std")
+    for item in FREE:
+        row = found[item]
+        print(f"  {item:9s} {100 * row['covered']:6.2f} %  {row['std_percent']:6.3f}    {row['bias_in_std']:+6.2f}"
+              f"     {row['scatter_in_std']:6.3f}")  # fmt: skip
+    print(f"  together  {100 * found['together']['covered']:6.2f} %")
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description="How often the 95 % intervals of a fit hold the truth.")
+    parser.add_argument("seeds", type=int, nargs="?", default=2000)
+    parser.add_argument("--case", choices=list(CASES), action="append", help="every case if left out")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    names = given.case or list(CASES)
+    if given.json:
+        print(json.dumps({name: figures(name, range(given.seeds)) for name in names}))
+        return
+    for name in names:
+        report(name, range(given.seeds))
 
 
 if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
-    for case_name in CASES:
-        report(case_name, range(count))
+    main()
