@@ -6,7 +6,8 @@ white
     What the plant says, and white noise.
 coloured
     The noise is an autoregression of order one with a correlation time of 25 ms; once with a broad excitation, once
-    with the chirp, which spends half of its six seconds below 1.2 Hz, where eta is told from a few correlated samples.
+    with the chirp, which spends half of its six seconds below 1.2 Hz: there the intervals of eta
+    are some 10 % too narrow.
 mode
     The true screw has a mode at 80 Hz (`parts=("screw_mode",)`) that the fitted plant lacks; the noise is white. The
     fitted plant's k is the stiffness of spring and screw in series, which a static test of the stand measures. Once
