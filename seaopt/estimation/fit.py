@@ -143,9 +143,10 @@ def _problem(
     for e, experiment in enumerate(experiments):
         settle = problem.weights(e).settle
         longest = max(segment.n for segment in segments[e])
-        if longest <= settle + 8:
+        if longest <= settle + 2:
             raise EstimationError(
-                f"experiment {experiment.name}: its longest segment has {longest} samples and the band filter takes "
-                f"{settle} to settle; widen band_hz or use a longer log"
+                f"experiment {experiment.name}: its longest segment has {longest} samples"
+                + (f" and the band filter takes {settle} to settle; widen band_hz or" if settle else ";")
+                + " use a longer log"
             )
     return problem

@@ -1,14 +1,16 @@
-r"""Nonlinear least squares from normal equations: Levenberg-Marquardt with bounds.
+r"""Nonlinear least squares from normal equations: Levenberg-Marquardt as a trust region, with bounds.
 
-At each iterate the step solves
+At each iterate the step is the one with the least
 
-.. math:: (H + \lambda\,\mathrm{diag}(H))\, d = -g
+.. math:: g^T d + \tfrac12 d^T H d \quad\text{subject to}\quad |D d| \le \Delta,
+          \qquad\text{which solves}\qquad (H + \lambda D^2)\, d = -g
 
-over the unknowns that are not held by a bound, with :math:`H = J^T J` and Marquardt's scaling (SIAM J. 11(2), 1963),
-is clipped to the bounds, and is taken if the cost falls; :math:`\lambda` follows Nielsen's rule (IMM-REP-1999-05).
+over the unknowns that are not held by a bound, with :math:`H = J^T J` and D the largest norms yet of J's columns (Moré,
+Lecture Notes in Mathematics 630, 1978): a parameter that the data hardly show at a far point is not thrown out of the world.
+The step is clipped to the bounds and is taken if the cost falls; :math:`\Delta` follows from how well the fall was predicted.
 Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance to the minimum
 in standard deviations: the search ends when that distance is negligible. An evaluation may move the point (to the best
-linear unknowns, see `residuals`); those unknowns are not damped.
+linear unknowns, see `residuals`); the region does not bound those.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ Evaluate = Callable[[Any, "Evaluation | None", float], Evaluation]
 
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE = 1e-12  # of the cost
+REACH = 0.3  # first radius, over the size of the first point
+TINY = 1e-15  # of the size of the point: a radius that is rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,7 +51,6 @@ def minimise(
     low: Float[np.ndarray, " n"],
     high: Float[np.ndarray, " n"],
     *,
-    reach: Float[np.ndarray, " n"] | None = None,
     max_iterations: int = 50,
     callback: Callback | None = None,
 ) -> Solution:
@@ -61,9 +64,6 @@ def minimise(
         First point, or what was found there.
     low, high : array, shape (n,)
         Bounds.
-    reach : array, shape (n,), optional
-        No step is longer than twice the larger of this and the present value, unknown by unknown: a far start must not
-        be thrown out of the world. Infinite entries are free.
     max_iterations : int
         Evaluations after the first.
     callback : callable, optional
@@ -71,72 +71,104 @@ def minimise(
 
     """
     here = start if isinstance(start, Evaluation) else evaluate(np.clip(start, low, high), None, 0.0)
-    z = here.z
     if not np.isfinite(here.cost):
         message = "the simulation overflows at the first guess; start closer or check units"
-        return Solution(z=z, evaluation=here, status="stalled", message=message, iterations=0)
-    damping, growth = 1e-4, 2.0
+        return Solution(z=here.z, evaluation=here, status="stalled", message=message, iterations=0)
+    scale = _norms(here)
+    radius = REACH * max(float(np.linalg.norm(scale * here.z)), 1.0)
     for iteration in range(1, max_iterations + 1):
-        held = _held(z, here, low, high)
+        held = _held(here, low, high)
         distance = _decrement(here, held) + 2.0 * here.pending
         if distance <= DECREMENT + RELATIVE * here.cost:
             return Solution(
-                z=z, evaluation=here, status="converged", iterations=iteration - 1,
+                z=here.z, evaluation=here, status="converged", iterations=iteration - 1,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
             )  # fmt: skip
-        step = _step(here, held, damping)
-        if reach is not None:
-            size = np.abs(step) / (2.0 * np.maximum(reach, np.abs(z)))
-            step = step / max(1.0, float(np.max(size)))
-        trial = np.clip(z + step, low, high)
-        moved = trial - z
-        if not np.any(np.abs(moved) > 1e-15 * np.abs(z)) and damping > 1.0:
+        step, damping = _step(here, held, scale, radius)
+        trial = np.clip(here.z + step, low, high)
+        moved = trial - here.z
+        length = float(np.linalg.norm(np.where(here.undamped, 0.0, scale * moved)))
+        if radius < TINY * max(float(np.linalg.norm(scale * here.z)), 1e-300):
             return Solution(
-                z=z, evaluation=here, status="stalled", iterations=iteration,
+                z=here.z, evaluation=here, status="stalled", iterations=iteration,
                 message="no smaller step can be told from rounding, and the gradient is not zero",
             )  # fmt: skip
         predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved) + here.pending
         there = evaluate(trial, here, damping)
-        ratio = (here.cost - there.cost) / predicted if predicted > 0.0 else -1.0
-        if np.isfinite(there.cost) and ratio > 1e-4:
-            z, here = there.z, there
-            damping = max(damping * max(1.0 / 9.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-12)
-            growth = 2.0
-        else:
-            damping, growth = damping * growth * 2.0, growth * 2.0
+        ratio = (here.cost - there.cost) / predicted if predicted > 0.0 and np.isfinite(there.cost) else -1.0
+        if ratio < 0.25:
+            radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
+        elif ratio > 0.75 or damping == 0.0:
+            radius = max(radius, 2.0 * length)
+        if ratio > 1e-4:
+            here = there
+            scale = np.maximum(scale, _norms(here))
         if callback is not None:
             callback(iteration, here.cost)
     return Solution(
-        z=z, evaluation=here, status="max_iterations", iterations=max_iterations,
+        z=here.z, evaluation=here, status="max_iterations", iterations=max_iterations,
         message=f"still moving after {max_iterations} iterations; raise max_iterations or start closer",
     )  # fmt: skip
 
 
-def _held(
-    z: Float[np.ndarray, " n"], here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def _norms(here: Evaluation) -> Float[np.ndarray, " n"]:
+    """Return the norms of the Jacobian's columns."""
+    return np.sqrt(np.maximum(np.diag(here.hessian), 1e-300))
+
+
+def _held(here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Tell which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
-    near = 1e-4 / np.sqrt(np.maximum(np.diag(here.hessian), 1e-300))
-    return ((z - low <= near) & (here.gradient > 0.0)) | ((high - z <= near) & (here.gradient < 0.0))
-
-
-def _scaled(here: Evaluation, held: Bool[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, " m"]]:
-    free = ~held
-    scale = np.sqrt(np.maximum(np.diag(here.hessian)[free], 1e-300))
-    return here.hessian[np.ix_(free, free)] / np.outer(scale, scale), scale
+    near = 1e-4 / _norms(here)
+    return ((here.z - low <= near) & (here.gradient > 0.0)) | ((high - here.z <= near) & (here.gradient < 0.0))
 
 
 def _decrement(here: Evaluation, held: Bool[np.ndarray, " n"]) -> float:
-    matrix, scale = _scaled(here, held)
-    g = here.gradient[~held] / scale
-    values, vectors = np.linalg.eigh(matrix)
+    free = ~held
+    size = _norms(here)[free]
+    values, vectors = np.linalg.eigh(here.hessian[np.ix_(free, free)] / np.outer(size, size))
     seen = values > 1e-12 * max(values[-1], 1e-300) if values.size else np.zeros(0, dtype=bool)
-    return float(np.sum((vectors.T @ g)[seen] ** 2 / values[seen]))
+    return float(np.sum((vectors.T @ (here.gradient[free] / size))[seen] ** 2 / values[seen]))
 
 
-def _step(here: Evaluation, held: Bool[np.ndarray, " n"], damping: float) -> Float[np.ndarray, " n"]:
-    matrix, scale = _scaled(here, held)
-    damped = matrix + np.diag(np.where(here.undamped[~held], 1e-12, damping))
+def _step(
+    here: Evaluation, held: Bool[np.ndarray, " n"], scale: Float[np.ndarray, " n"], radius: float
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return the step within the radius and its lambda; the undamped unknowns follow the others."""
+    bound, follow = ~held & ~here.undamped, ~held & here.undamped
+    h, g = here.hessian, here.gradient
+    matrix, gradient, response = h[np.ix_(bound, bound)], g[bound], np.zeros((0, 0))
+    if np.any(follow):
+        own = h[np.ix_(follow, follow)]
+        size = np.sqrt(np.maximum(np.diag(own), 1e-300))
+        back = np.linalg.pinv(own / np.outer(size, size), rcond=1e-13, hermitian=True) / np.outer(size, size)
+        response = back @ np.column_stack([g[follow], h[np.ix_(follow, bound)]])
+        matrix = matrix - h[np.ix_(bound, follow)] @ response[:, 1:]
+        gradient = gradient - h[np.ix_(bound, follow)] @ response[:, 0]
     step = np.zeros(held.size)
-    step[~held] = -np.linalg.solve(damped, here.gradient[~held] / scale) / scale
-    return step
+    d = scale[bound]
+    values, vectors = np.linalg.eigh(matrix / np.outer(d, d))
+    along, damping = _within(np.maximum(values, 0.0), vectors.T @ (gradient / d), radius)
+    step[bound] = vectors @ along / d
+    if np.any(follow):
+        step[follow] = -response[:, 0] - response[:, 1:] @ step[bound]
+    return step, damping
+
+
+def _within(
+    values: Float[np.ndarray, " n"], g: Float[np.ndarray, " n"], radius: float
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return the step -g / (values + lambda), no longer than the radius, with the smallest such lambda >= 0."""
+    floor = 1e-14 * max(float(np.max(values, initial=0.0)), 1e-300)
+    seen = values > floor
+    newton = np.where(seen, -g / np.where(seen, values, 1.0), 0.0)
+    if float(np.linalg.norm(newton)) <= radius:
+        return newton, 0.0
+    damping = max(float(np.linalg.norm(g)) / radius - float(np.max(values)), floor)
+    for _ in range(50):  # Newton's method on 1 / |step|, which is nearly straight in lambda
+        step = -g / (values + damping)
+        size = float(np.linalg.norm(step))
+        if abs(size - radius) <= 1e-3 * radius:
+            break
+        slope = float(np.sum(step**2 / (values + damping))) / size
+        damping = max(damping + (size / slope) * (size - radius) / radius, 1e-3 * damping)
+    return -g / (values + damping), damping

@@ -189,6 +189,7 @@ class Residuals:
         del here, damping  # all unknowns are in z
         return self.assemble(z, self.passes(z))
 
+    @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which is said there
     def assemble(self, z: Float[np.ndarray, " n"], passes: tuple[tuple[Pass, ...], ...]) -> Evaluation:
         """Return the evaluation that passes at `z` give: other sigmas need no other passes."""
         n, unknowns = z.size, self.unknowns

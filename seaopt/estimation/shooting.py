@@ -25,7 +25,15 @@ from jaxtyping import Float, Int
 from seaopt.estimation.least_squares import Callback, minimise
 from seaopt.estimation.methods import MultipleShooting
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
-from seaopt.estimation.solve import Solved, best_start, estimated_sigma, reach_of, settle, with_observers
+from seaopt.estimation.solve import (
+    Solved,
+    best_start,
+    estimated_sigma,
+    explains_little,
+    held_start,
+    settle,
+    with_observers,
+)
 from seaopt.estimation.unknowns import collect
 from seaopt.parameters import ParameterSet
 from seaopt.simulation import Pass, run_passes
@@ -67,6 +75,7 @@ class Shooting:
     problem: Residuals
     shots: tuple[tuple[Shots, ...], ...]
 
+    @np.errstate(all="ignore")
     def evaluate(
         self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0
     ) -> ShotEvaluation:
@@ -201,7 +210,10 @@ def multiple_shooting(
     """Join the shots step by step; then settle by single shooting, or on shots of their own if the plant runs away."""
     start, _ = best_start(problem, method, band_hz)
     plain = replace(problem, band_hz=None, loss=Linear())
-    z = start.z if np.isfinite(start.cost) else problem.unknowns.start
+    z = start.z
+    if method.search and (not np.isfinite(start.cost) or explains_little(problem, start)):
+        held = held_start(problem, z, method.max_iterations)
+        z = z if held is None else held
     z, ends = _joined(plain, z, method, callback)
     single = problem.evaluate(_with_initial(problem, z, ends))
     if np.isfinite(single.cost):
@@ -230,7 +242,7 @@ def _joined(
 ) -> tuple[Float[np.ndarray, " n"], tuple[tuple[Shots, ...], ...]]:
     """Return unknowns and shots after the joints have closed, as far as they do."""
     shots = _first_shots(problem, z, method.segments)
-    low, high, reach = problem.unknowns.low, problem.unknowns.high, reach_of(problem.unknowns)
+    low, high = problem.unknowns.low, problem.unknowns.high
     scale = _weights(Shooting(problem=problem, shots=shots), z)
     for number in range(len(STIFFNESS) + MULTIPLIER_ROUNDS):
         stiff = STIFFNESS[min(number, len(STIFFNESS) - 1)]
@@ -240,7 +252,7 @@ def _joined(
         )
         shooting = Shooting(problem=problem, shots=shots)
         found = minimise(
-            shooting.evaluate, z, low, high, reach=reach, max_iterations=method.max_iterations, callback=callback
+            shooting.evaluate, z, low, high, max_iterations=method.max_iterations, callback=callback
         )
         last = found.evaluation
         if not isinstance(last, ShotEvaluation) or not np.isfinite(last.cost):
@@ -262,6 +274,7 @@ def _joined(
     return z, shots
 
 
+@np.errstate(all="ignore")
 def _weights(shooting: Shooting, z: Float[np.ndarray, " n"]) -> list[list[Float[np.ndarray, " nx"]]]:
     """Return, for each segment, what the log says of a node: the median diagonal of its information."""
     found = shooting.evaluate(z)

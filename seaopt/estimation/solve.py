@@ -52,32 +52,33 @@ def output_error(
 ) -> Solved:
     """Single shooting from the best start that can be found."""
     best, guessed = best_start(problem, method, band_hz)
-    found = settle(problem, best, method.max_iterations, callback)
-    if not method.search or not _doubtful(found, guessed):
+    found = settle(problem, best, method.max_iterations, callback) if np.isfinite(best.cost) else None
+    if found is not None and not (method.search and _doubtful(found, guessed)):
         return found
-    for start in {id(z): z for z in (problem.unknowns.start, best.z)}.values():
-        predicted = held_start(found.problem, start, method.max_iterations)
+    for start in (problem.unknowns.start, best.z) if method.search else ():
+        predicted = held_start(problem, start, method.max_iterations)
         if predicted is None:
             continue
         other = settle(problem, problem.evaluate(predicted), method.max_iterations, callback)
-        found = min(found, other, key=_misfit)
+        found = other if found is None else min(found, other, key=_misfit)
         if not _doubtful(found, guessed):
             break
-    return found
+    return found if found is not None else settle(problem, best, method.max_iterations, callback)
 
 
 def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
     """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
     unknowns, here, iterations = problem.unknowns, start, 0
-    reach = reach_of(unknowns)
+    if not np.isfinite(here.cost):
+        solution = minimise(problem.evaluate, here, unknowns.low, unknowns.high)
+        return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
     refined, _ = _refined(problem, here.z, 0.1)
     if refined.substeps != problem.substeps:
         problem, here = refined, refined.evaluate(here.z)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem.evaluate, here, unknowns.low, unknowns.high, reach=reach, max_iterations=max_iterations,
-            callback=callback,
-        )  # fmt: skip
+            problem.evaluate, here, unknowns.low, unknowns.high, max_iterations=max_iterations, callback=callback
+        )
         here, iterations = solution.evaluation, iterations + solution.iterations
         solution = replace(solution, iterations=iterations)
         if not np.isfinite(here.cost):
@@ -85,20 +86,15 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
         sigma = estimated_sigma(problem, here)
         settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(sigma, problem.sigma, strict=True))
         finer, error = _refined(problem.with_sigma(sigma), here.z, STEP_ERROR_SIGMA)
+        same = finer.substeps == problem.substeps and isinstance(problem.loss, Linear)
         if (settled and finer.substeps == problem.substeps) or attempt == MAX_ROUNDS - 1:
+            if same:
+                problem = finer
+                solution = replace(solution, evaluation=problem.assemble(here.origin, here.passes))
             return Solved(problem=problem, solution=solution, step_error=error)
-        same = finer.substeps == problem.substeps and isinstance(problem.loss, Linear) and problem.observers is None
         problem = finer
         here = problem.assemble(here.origin, here.passes) if same else problem.evaluate(here.z)
     raise AssertionError  # the last attempt returns
-
-
-def reach_of(unknowns: Unknowns) -> Float[np.ndarray, " n"]:
-    """Return the size of the plants' parameters, and infinity for what starts at zero and the experiments' own."""
-    reach = np.full(unknowns.start.size, np.inf)
-    shared = np.abs(unknowns.start[: unknowns.shared])
-    reach[: unknowns.shared] = np.where(shared > 0.0, shared, np.inf)
-    return reach
 
 
 def best_start(problem: Residuals, method: Method, band_hz: tuple[float, float] | None) -> tuple[Evaluation, bool]:
@@ -119,12 +115,16 @@ def _doubtful(found: Solved, guessed: bool) -> bool:
         return True
     if guessed and all(model.linear for model in found.problem.unknowns.models):
         return False
-    evaluation = found.solution.evaluation
-    for e, experiment in enumerate(found.problem.experiments):
+    return explains_little(found.problem, found.solution.evaluation)
+
+
+def explains_little(problem: Residuals, evaluation: Evaluation) -> bool:
+    """Tell whether the residual of some output is a large part of its spread."""
+    for e, experiment in enumerate(problem.experiments):
         for o, name in enumerate(experiment.outputs):
             spread = float(np.nanstd(experiment.log[name]))
             rms = float(np.sqrt(evaluation.squares[e][o] / max(evaluation.counts[e][o], 1.0)))
-            if rms > UNEXPLAINED * spread:
+            if not rms <= UNEXPLAINED * spread:
                 return True
     return False
 
@@ -151,11 +151,13 @@ def held_start(problem: Residuals, start: Float[np.ndarray, " n"], iterations: i
         if watched is None:
             return None
         low, high = problem.unknowns.low, problem.unknowns.high
-        solution = minimise(watched.evaluate, z, low, high, reach=reach_of(problem.unknowns), max_iterations=iterations)
+        solution = minimise(watched.evaluate, z, low, high, max_iterations=iterations)
         if not np.isfinite(solution.evaluation.cost):
             return None
-        z = solution.z
+        last, z = z, solution.z
         problem = problem.with_sigma(estimated_sigma(watched, solution.evaluation))
+        if np.allclose(z, last, rtol=1e-3, atol=0.0):
+            break
     return z
 
 
@@ -179,6 +181,7 @@ def noise_of(y: Float[np.ndarray, " n"], spread: float) -> float:
     return max(noise, EXACT * spread, 1e-300)
 
 
+@np.errstate(all="ignore")
 def _observer(
     problem: Residuals, e: int, z: Float[np.ndarray, " n"], sensors: Float[np.ndarray, " ny"],
     spread: Float[np.ndarray, " ny"],
@@ -266,6 +269,7 @@ def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> 
     return replace(problem, substeps=tuple(substeps)), worst
 
 
+@np.errstate(all="ignore")
 def step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> StepError:
     """Return the integration error of experiment e, from steps of half the length (order four: 16/15 of the change).
 
@@ -281,8 +285,7 @@ def step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> StepEr
     for s in range(len(problem.segments[e])):
         coarse, fine = problem.run(e, s, z, outputs=True), halved.run(e, s, z, outputs=True)
         assert coarse.outputs is not None and fine.outputs is not None
-        with np.errstate(invalid="ignore", over="ignore"):
-            change = float(np.max(np.abs(gain * (coarse.outputs - fine.outputs)) / sigma)) * 16.0 / 15.0
+        change = float(np.max(np.abs(gain * (coarse.outputs - fine.outputs)) / sigma)) * 16.0 / 15.0
         worst = max(worst, change if np.isfinite(change) else np.inf)
         for o, places in enumerate(problem.columns(e, s)):
             used = np.flatnonzero(places >= 0)

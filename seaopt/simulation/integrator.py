@@ -79,7 +79,7 @@ def rate_functions(model: Model) -> Rates:
         parts = [part for e in (model.f, model.h) for part in (e, ca.jacobian(e, model.x), ca.jacobian(e, model.theta))]
         dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)]
         sizes = [part.nnz() for part in dense]
-        flat = ca.cse(ca.vertcat(*(part.nz[:] for part in dense)))
+        flat = ca.cse(ca.vertcat(*(entry for part in dense for entry in part.nonzeros())))
         flat, symbols, values = ca.extract_parametric(flat, model.p, {"extract_trivial": True})
         c, columns = ca.vertcat(*symbols), []
         for size in sizes:
