@@ -31,6 +31,7 @@ Evaluate = Callable[[Any, "Evaluation | None", float], Evaluation]
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE = 1e-12  # of the cost
 REACH = 0.3  # first radius, over the size of the first point
+NEAR = 1e-4  # squared standard deviations that rounding may leave, where the residuals themselves are rounding
 TINY = 1e-15  # of the size of the point: a radius that is rounding
 
 
@@ -51,6 +52,7 @@ def minimise(
     low: Float[np.ndarray, " n"],
     high: Float[np.ndarray, " n"],
     *,
+    reach: float = REACH,
     max_iterations: int = 50,
     callback: Callback | None = None,
 ) -> Solution:
@@ -64,6 +66,8 @@ def minimise(
         First point, or what was found there.
     low, high : array, shape (n,)
         Bounds.
+    reach : float
+        First radius of the region, over the size of the first point.
     max_iterations : int
         Evaluations after the first.
     callback : callable, optional
@@ -75,7 +79,7 @@ def minimise(
         message = "the simulation overflows at the first guess; start closer or check units"
         return Solution(z=here.z, evaluation=here, status="stalled", message=message, iterations=0)
     scale = _norms(here)
-    radius = REACH * max(float(np.linalg.norm(scale * here.z)), 1.0)
+    radius = reach * max(float(np.linalg.norm(scale * here.z)), 1.0)
     for iteration in range(1, max_iterations + 1):
         held = _held(here, low, high)
         distance = _decrement(here, held) + 2.0 * here.pending
@@ -89,9 +93,11 @@ def minimise(
         moved = trial - here.z
         length = float(np.linalg.norm(np.where(here.undamped, 0.0, scale * moved)))
         if radius < TINY * max(float(np.linalg.norm(scale * here.z)), 1e-300):
+            near = distance < NEAR
+            left = f"{np.sqrt(distance):.1g} standard deviations are left" if near else "the gradient is not zero"
             return Solution(
-                z=here.z, evaluation=here, status="stalled", iterations=iteration,
-                message="no smaller step can be told from rounding, and the gradient is not zero",
+                z=here.z, evaluation=here, status="converged" if near else "stalled", iterations=iteration,
+                message=f"no smaller step can be told from rounding, and {left}",
             )  # fmt: skip
         predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved) + here.pending
         there = evaluate(trial, here, damping)

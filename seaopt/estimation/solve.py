@@ -22,6 +22,7 @@ EXACT = 1e-6  # noise below this part of an output's spread asks no more of the 
 MAX_SUBSTEPS = 256
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
+HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
 
 
@@ -151,7 +152,7 @@ def held_start(problem: Residuals, start: Float[np.ndarray, " n"], iterations: i
         if watched is None:
             return None
         low, high = problem.unknowns.low, problem.unknowns.high
-        solution = minimise(watched.evaluate, z, low, high, max_iterations=iterations)
+        solution = minimise(watched.evaluate, z, low, high, reach=HELD_REACH, max_iterations=iterations)
         if not np.isfinite(solution.evaluation.cost):
             return None
         last, z = z, solution.z
@@ -262,7 +263,7 @@ def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> 
         while True:
             error = step_error(replace(problem, substeps=tuple(substeps)), e, z)
             fine = error.output <= allowed and error.parameter <= STEP_ERROR_PARAMETER * allowed / STEP_ERROR_SIGMA
-            if fine or substeps[e] >= MAX_SUBSTEPS:
+            if fine or substeps[e] >= MAX_SUBSTEPS or not np.isfinite(error.output):
                 break
             substeps[e] *= 2
         worst = StepError(output=max(worst.output, error.output), parameter=max(worst.parameter, error.parameter))
