@@ -21,13 +21,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from seaopt.estimation.residuals import Huber, Linear, Residuals
 from seaopt.simulation import Segment, stream
 
 RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
 CHUNK = 1 << 17
+CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
+LEAST, WIDER = 8, 1.5  # shortest window, and its reach over the last lag that is told from chance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,16 +162,16 @@ def coloured(
         for s, pull in enumerate(pulls):
             if len(pull) < 8:
                 continue
-            tail = np.zeros((density.shape[0] - 1, pull.shape[1], inverse.shape[1]))
+            tail = np.zeros((pull.shape[1], inverse.shape[1], density.shape[0] - 1))
             for rows, columns in _columns(problem, e, s, z):
-                influence = np.empty((len(columns), pull.shape[1], inverse.shape[1]))
+                influence = np.empty((pull.shape[1], inverse.shape[1], len(columns)))
                 for o, places in enumerate(problem.columns(e, s)):
                     used = np.flatnonzero(places >= 0)
                     weights = inverse[places[used]] / problem.sigma[e][o]
-                    np.einsum("tc,cp->tp", columns[:, o, 1 + used], weights, out=influence[:, o])
-                influence *= _counts(pull[rows])[:, :, None]
+                    np.einsum("tc,cp->pt", columns[:, o, 1 + used], weights, out=influence[o])
+                influence *= _counts(pull[rows]).T[:, None, :]
                 total += _coloured_part(influence, tail, density)
-                tail = np.concatenate([tail, influence])[-len(tail) :] if len(tail) else tail
+                tail = np.concatenate([tail, influence], axis=2)[:, :, -tail.shape[2] :]
     return total
 
 
@@ -179,54 +181,75 @@ def _counts(pull: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
 
 
 def correlations(pulls: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "lags1 ny ny"]:
-    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window."""
+    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window.
+
+    The window reaches as far as correlation can be told from chance, and half as far again (after Politis, J.
+    Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
+    """
     from scipy.fft import irfft, next_fast_len, rfft  # deferred: 0.1 s
 
     longest, ny = max(len(pull) for pull in pulls), pulls[0].shape[1]
     lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
-    found, counts = np.zeros((lags + 1, ny, ny)), np.zeros(ny)
+    found, counts = np.zeros((ny, ny, lags + 1)), np.zeros(ny)
     for pull in pulls:
         counts += np.count_nonzero(pull, axis=0)
         for start in range(0, len(pull), CHUNK):
-            now = pull[start : start + CHUNK]
-            before = pull[max(start - lags, 0) : start + CHUNK]
-            shift = len(before) - len(now)
-            size = next_fast_len(len(before) + lags, real=True)
-            spectrum = rfft(before, size, axis=0)
-            own = spectrum if shift == 0 else rfft(np.vstack([np.zeros((shift, ny)), now]), size, axis=0)
+            now = np.ascontiguousarray(pull[start : start + CHUNK].T)
+            before = np.ascontiguousarray(pull[max(start - lags, 0) : start + CHUNK].T)
+            shift = before.shape[1] - now.shape[1]
+            size = next_fast_len(before.shape[1] + lags, real=True)
+            spectrum = rfft(before, size)
+            own = spectrum if shift == 0 else rfft(np.hstack([np.zeros((ny, shift)), now]), size)
             for a in range(ny):
                 for b in range(ny):
-                    found[:, a, b] += irfft(own[:, a] * np.conj(spectrum[:, b]), size)[: lags + 1]
-    x = np.arange(lags + 1) / max(lags, 1)
+                    found[a, b] += irfft(own[a] * np.conj(spectrum[b]), size)[: lags + 1]
+    found /= np.sqrt(np.outer(np.maximum(counts, 1.0), np.maximum(counts, 1.0)))[:, :, None]
+    reach = _reach(found, float(np.max(counts)))
+    x = np.arange(reach + 1) / max(reach, 1)
     parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
-    scale = np.sqrt(np.outer(np.maximum(counts, 1.0), np.maximum(counts, 1.0)))
-    return found * parzen[:, None, None] / scale
+    return (found[:, :, : reach + 1] * parzen).transpose(2, 0, 1)
+
+
+def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
+    """Return the last lag of the window."""
+    power = np.sqrt(np.maximum(np.diagonal(r[:, :, 0]), 1e-300))
+    size = np.max(np.abs(r) / np.outer(power, power)[:, :, None], axis=(0, 1))[1:]
+    seen = np.flatnonzero(size > CHANCE * np.sqrt(np.log10(max(count, 10.0)) / max(count, 1.0)))
+    last = int(seen[-1]) + 1 if seen.size else 0
+    return min(max(LEAST, int(WIDER * last)), size.size)
 
 
 def _coloured_part(
-    now: Float[np.ndarray, "n ny p"], before: Float[np.ndarray, "lags ny p"], r: Float[np.ndarray, "lags1 ny ny"]
+    now: Float[np.ndarray, "ny p n"], before: Float[np.ndarray, "ny p lags"], r: Float[np.ndarray, "lags1 ny ny"]
 ) -> Float[np.ndarray, "p p"]:
     """Return the terms of the double sum in which t is now, and s is now or before (twice, for their mirror image)."""
     from scipy.fft import next_fast_len, rfft
 
-    n, ny, p = now.shape
-    past = before if np.any(before) else before[:0]
-    size = next_fast_len(len(past) + n + len(r), real=True)
-    spectrum = rfft(np.concatenate([past, now]), size, axis=0)
-    own = spectrum if not len(past) else rfft(np.concatenate([np.zeros_like(past), now]), size, axis=0)
-    kernel = rfft(np.concatenate([np.zeros((1, ny, ny)), r[1:]]), size, axis=0)
-    half = np.full(len(spectrum), 2.0 / size)
-    half[0] = 1.0 / size
+    ny, p, n = now.shape
+    past = before if np.any(before) else before[:, :, :0]
+    size = next_fast_len(past.shape[2] + n + len(r), real=True)
+    spectrum = rfft(np.concatenate([past, now], axis=2), size)
+    own = spectrum if not past.shape[2] else rfft(np.concatenate([np.zeros_like(past), now], axis=2), size)
+    lagged = np.array(r.transpose(1, 2, 0))
+    lagged[:, :, 0] = 0.0
+    kernel = rfft(lagged, size) * (2.0 / size)
+    kernel[:, :, 0] *= 0.5
     if size % 2 == 0:
-        half[-1] = 1.0 / size
-    later = np.zeros((p, p))
+        kernel[:, :, -1] *= 0.5
+    later, here = np.zeros((p, p)), np.zeros((p, p))
     for a in range(ny):
         for b in range(ny):
-            weighted = spectrum[:, b] * (kernel[:, a, b] * half)[:, None]
-            later += np.einsum("fp,fq->pq", own[:, a].conj(), weighted).real
-    here = np.einsum("tap,tbq->abpq", now, now)
-    here = np.einsum("ab,abpq->pq", r[0], here)
+            weighted = spectrum[b] * kernel[a, b]
+            for i in range(p):
+                for j in range(p):
+                    later[i, j] += _real_sum(own[a, i], weighted[j])
+                    here[i, j] += r[0, a, b] * float(np.sum(now[a, i] * now[b, j]))
     return here + later + later.T
+
+
+def _real_sum(x: Complex[np.ndarray, " m"], y: Complex[np.ndarray, " m"]) -> float:
+    """Return the real part of sum conj(x) y."""
+    return float(np.sum(x.real * y.real) + np.sum(x.imag * y.imag))
 
 
 def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:

@@ -122,7 +122,7 @@ def kalman_gain(
         for _ in range(DOUBLINGS):
             if not np.all(np.isfinite(h)) or not np.all(np.isfinite(g)):
                 return np.full((len(a), nx, c.shape[1]), np.nan)
-            w = np.linalg.inv(one + g @ h)
+            w = _inverse(one + g @ h)
             after = h + x.transpose(0, 2, 1) @ h @ w @ x
             g = g + x @ w @ g @ x.transpose(0, 2, 1)
             x = x @ w @ x
@@ -131,4 +131,12 @@ def kalman_gain(
             if done:
                 break
         cross = a @ h @ c.transpose(0, 2, 1)
-        return cross @ np.linalg.inv(c @ h @ c.transpose(0, 2, 1) + np.diag(r))
+        return cross @ _inverse(c @ h @ c.transpose(0, 2, 1) + np.diag(r))
+
+
+def _inverse(matrices: Float[np.ndarray, "t n n"]) -> Float[np.ndarray, "t n n"]:
+    """Return the inverses; not finite if one of them has none."""
+    try:
+        return np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrices, np.nan)
