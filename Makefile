@@ -7,7 +7,7 @@ export MPLCONFIGDIR := $(CURDIR)/$(CACHE)/matplotlib
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test check lint types contract notebooks bench nocompiler clean setup
+.PHONY: demo test check lint types contract notebooks bench bench-peers nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 setup: $(READY)
@@ -43,6 +43,10 @@ check: test nocompiler lint types contract notebooks
 
 bench: $(READY)
 	$(PYTEST) benchmarks -q -s --benchmark-only -p no:xdist -o python_files='bench_*.py' -o filterwarnings=default
+
+# Other estimators on one problem, each in an environment of its own; ARGS="--only jax,seaopt" for some of them.
+bench-peers: $(READY)
+	$(BIN)/python benchmarks/peers/run.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) out
