@@ -1,9 +1,10 @@
-"""How often each method finds the truth from a random start: every built-in plant, factors of 0.1 to 10 in each unknown.
+"""How often each method finds the truth from a random start: every built-in plant, factors of 0.1 to 10.
 
     python benchmarks/bench_starts.py [starts] [--plant NAME] [--method NAME]
 
-A log of 12 s at 400 Hz (noise over 0 to 60 Hz, sensors with 0.5 % of each output's spread as noise), one draw of starts a
-plant, log-uniform and independent. Recovered: every free parameter within 5 standard deviations or 2 % of the truth.
+A log of 12 s at 400 Hz (noise over 0 to 60 Hz, sensors with 0.5 % of each output's spread as noise), one draw of
+starts a plant, log-uniform and independent. Recovered: every free parameter within 5 standard deviations or 2 % of the
+truth.
 """
 
 from __future__ import annotations

@@ -2,11 +2,12 @@
 
     M q'' = F - F_v q' - F_c tanh(10000 q' / F_c) - O
 
-with the truth of the published benchmark (A. Janot, M. Gautier, M. Brunot, Data Set and Reference Models of EMPS, Workshop on
-Nonlinear System Identification Benchmarks, 2019), 10,000 noise-free samples of q at 1 kHz from a random-phase multisine of
-1 to 4 Hz (5,000 samples, twice, 60 N rms) and a start, (0.2, -10, 0.2, 10), whose simulation runs away: mass a
-five-hundredth, friction that drives. Published (Retzler, Swevers, Gillis, Kollar, IEEE AMC 2022): of 100 multisines single
-shooting and nlgreyest recover none, multiple shooting about 64. Success is an output error below 0.1 %.
+with the truth of the published benchmark (A. Janot, M. Gautier, M. Brunot, Data Set and Reference Models of EMPS,
+Workshop on Nonlinear System Identification Benchmarks, 2019), 10,000 noise-free samples of q at 1 kHz from a
+random-phase multisine of 1 to 4 Hz (5,000 samples, twice, 60 N rms) and a start, (0.2, -10, 0.2, 10), whose simulation
+runs away: mass a five-hundredth, friction that drives. Published (Retzler, Swevers, Gillis, Kollar, IEEE AMC 2022): of
+100 multisines single shooting and nlgreyest recover none, multiple shooting about 64. Success is an output error below
+0.1 %.
 
     python problems/emps.py [number of multisines]
 """

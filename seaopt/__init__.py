@@ -78,7 +78,8 @@ _HOME = {
 __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "read_log", "write_log", "simulate", "Sensors",
     "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting", "PredictionError", "Fit",
-    "fit", "ControllerSpec", "Controller", "tune", "Certificate", "certify", "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
+    "fit", "ControllerSpec", "Controller", "tune", "Certificate", "certify", "demo_path", "read_problem",
+    "write_report", "testing", "SeaoptError",
 ]  # fmt: skip
 
 

@@ -10,7 +10,8 @@ Newey and West 1987). R is estimated from the residuals under a Parzen window, w
 indefinite. With a robust loss the residuals in B are what the loss makes of them, and J^T J counts each sample with the
 loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 
-Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on them,
+Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
+them,
 :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter, in the
 frequency domain (overlap-save), chunk by chunk: memory does not grow with the log but for the residuals themselves.
 Long sums are NumPy's own, not the linear-algebra library's, whose threads cost more than such sums on a busy machine.
@@ -18,10 +19,12 @@ Long sums are NumPy's own, not the linear-algebra library's, whose threads cost 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 from seaopt.estimation.residuals import Huber, Linear, Residuals
 from seaopt.simulation import Segment, stream
@@ -29,7 +32,7 @@ from seaopt.simulation import Segment, stream
 RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
 CHUNK = 1 << 17
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
-LEAST, WIDER = 8, 1.5  # shortest window, and its reach over the last lag that is told from chance
+LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +91,7 @@ def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]
     return found
 
 
-def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]):  # noqa: ANN202
+def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]) -> Callable[[slice], Any]:
     """Return the function from rows to drift."""
     legendre = np.hstack([np.zeros((len(coefficients), 1)), coefficients])
 
@@ -108,9 +111,7 @@ def counted(piece: Segment, settle: int) -> Bool[np.ndarray, "n ny"]:
     return present
 
 
-def robust_bread(
-    problem: Residuals, z: Float[np.ndarray, " n"], left: list[list[Errors]]
-) -> Float[np.ndarray, "n n"]:
+def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"], left: list[list[Errors]]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
     bread = np.zeros((z.size, z.size))
     for e, row in enumerate(left):
@@ -140,7 +141,7 @@ def _pull(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray,
     return r if isinstance(problem.loss, Linear) else r / np.sqrt(1.0 + (r / problem.loss.threshold) ** 2)
 
 
-def _columns(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]):  # noqa: ANN202
+def _columns(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[slice, Any]]:
     """Yield rows and their columns, chunk by chunk."""
     first = 0
     arguments = problem.unknowns.models[e], problem.segments[e][s], problem.point(e, z), problem.start(e, s, z)
@@ -180,14 +181,19 @@ def _counts(pull: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
     return (pull != 0.0).astype(float)
 
 
+def _transforms() -> tuple[Any, Any, Any]:
+    from scipy import fft  # deferred: 0.1 s
+
+    return fft.irfft, fft.next_fast_len, fft.rfft
+
+
 def correlations(pulls: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "lags1 ny ny"]:
     """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window.
 
     The window reaches as far as correlation can be told from chance, and half as far again (after Politis, J.
     Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
-    from scipy.fft import irfft, next_fast_len, rfft  # deferred: 0.1 s
-
+    irfft, next_fast_len, rfft = _transforms()
     longest, ny = max(len(pull) for pull in pulls), pulls[0].shape[1]
     lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
     found, counts = np.zeros((ny, ny, lags + 1)), np.zeros(ny)
@@ -211,11 +217,14 @@ def correlations(pulls: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "l
 
 
 def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
-    """Return the last lag of the window."""
+    """Return the last lag of the window: after a run of lags at which no correlation can be told from chance."""
     power = np.sqrt(np.maximum(np.diagonal(r[:, :, 0]), 1e-300))
     size = np.max(np.abs(r) / np.outer(power, power)[:, :, None], axis=(0, 1))[1:]
     seen = np.flatnonzero(size > CHANCE * np.sqrt(np.log10(max(count, 10.0)) / max(count, 1.0)))
-    last = int(seen[-1]) + 1 if seen.size else 0
+    run = max(20, int(np.sqrt(count) / 2))
+    before = np.concatenate([[-1], seen])
+    quiet = np.flatnonzero(np.diff(np.append(before, size.size + run)) > run)
+    last = int(before[quiet[0]]) + 1
     return min(max(LEAST, int(WIDER * last)), size.size)
 
 
@@ -223,8 +232,7 @@ def _coloured_part(
     now: Float[np.ndarray, "ny p n"], before: Float[np.ndarray, "ny p lags"], r: Float[np.ndarray, "lags1 ny ny"]
 ) -> Float[np.ndarray, "p p"]:
     """Return the terms of the double sum in which t is now, and s is now or before (twice, for their mirror image)."""
-    from scipy.fft import next_fast_len, rfft
-
+    _, next_fast_len, rfft = _transforms()
     ny, p, n = now.shape
     past = before if np.any(before) else before[:, :, :0]
     size = next_fast_len(past.shape[2] + n + len(r), real=True)
@@ -247,7 +255,7 @@ def _coloured_part(
     return here + later + later.T
 
 
-def _real_sum(x: Complex[np.ndarray, " m"], y: Complex[np.ndarray, " m"]) -> float:
+def _real_sum(x: Any, y: Any) -> float:
     """Return the real part of sum conj(x) y."""
     return float(np.sum(x.real * y.real) + np.sum(x.imag * y.imag))
 
@@ -275,9 +283,7 @@ def inverse(hessian: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"]
     return found, np.sum(vectors[:, ~seen] ** 2, axis=1)
 
 
-def with_infinities(
-    matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]
-) -> Float[np.ndarray, "p p"]:
+def with_infinities(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
     """Return a covariance in which what is not seen has infinite variance."""
     lost = unseen > 1e-6
     found = 0.5 * (matrix + matrix.T)

@@ -48,8 +48,8 @@ class Experiment:
     offset : bool or mapping
         One unknown offset an output; none; or known ones.
     drift : int
-        Slow drift of the sensors: order, up to 5, of a polynomial over the log that is added to each output (Legendre's,
-        so that the offset stays the mean). 0: none.
+        Slow drift of the sensors: order, up to 5, of a polynomial over the log that is added to each output
+        (Legendre's, so that the offset stays the mean). 0: none.
     gain : mapping of output to float or Parameter
         measured = gain * output + offset + drift; 1 where left out. A free Parameter is estimated.
     delay_s : float or Parameter

@@ -1,9 +1,9 @@
 """A first guess from frequency responses: where time-domain least squares starts when the given values are far off.
 
 The H1 estimate of each input-output pair is compared with the linearised plant, in log magnitude and phase, which has
-no local minima to speak of in inertias, stiffnesses and dampings. The given values are refined by Gauss-Newton with CasADi's
-derivatives; where that leaves the responses unexplained, candidates are drawn over two decades around the given values,
-screened, and the best are refined.
+no local minima to speak of in inertias, stiffnesses and dampings. The given values are refined by Gauss-Newton with
+CasADi's derivatives; where that leaves the responses unexplained, candidates are drawn over two decades around the
+given values, screened, and the best are refined.
 """
 
 from __future__ import annotations

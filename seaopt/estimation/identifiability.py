@@ -3,8 +3,8 @@ r"""What the data tell of the parameters, and what they cannot: rank, condition,
 The Hessian of the parameters, everything else an experiment has of its own eliminated, is scaled to a unit diagonal. An
 eigenvalue that is zero to rounding is a direction in which the parameters can change together without any effect on
 any output (a null direction of the sensitivities); a small one is a direction that only the parameters' different
-shares in the noise tell apart. Whether a null direction belongs to the plant or to the log is told by a second look: the
-sensitivities to a rich made-up input. What that does not show, no log of these outputs can show.
+shares in the noise tell apart. Whether a null direction belongs to the plant or to the log is told by a second look:
+the sensitivities to a rich made-up input. What that does not show, no log of these outputs can show.
 """
 
 from __future__ import annotations

@@ -6,11 +6,11 @@ At each iterate the step is the one with the least
           \qquad\text{which solves}\qquad (H + \lambda D^2)\, d = -g
 
 over the unknowns that are not held by a bound, with :math:`H = J^T J` and D the largest norms yet of J's columns (Moré,
-Lecture Notes in Mathematics 630, 1978): a parameter that the data hardly show at a far point is not thrown out of the world.
-The step is clipped to the bounds and is taken if the cost falls; :math:`\Delta` follows from how well the fall was predicted.
-Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance to the minimum
-in standard deviations: the search ends when that distance is negligible. An evaluation may move the point (to the best
-linear unknowns, see `residuals`); the region does not bound those.
+Lecture Notes in Mathematics 630, 1978): a parameter that the data hardly show at a far point is not thrown out of the
+world. The step is clipped to the bounds and is taken if the cost falls; :math:`\Delta` follows from how well the fall
+was predicted. Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance
+to the minimum in standard deviations: the search ends when that distance is negligible. An evaluation may move the
+point (to the best linear unknowns, see `residuals`); the region does not bound those.
 """
 
 from __future__ import annotations

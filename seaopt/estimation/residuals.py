@@ -4,9 +4,9 @@ Residuals are in units of sigma: the cost is half their squared norm plus half t
 gives each output's Gram matrix of [residual, derivatives]; weighting by 1/sigma^2 and adding up gives the cost, its
 gradient and the Gauss-Newton Hessian.
 
-Residuals are affine in some unknowns :math:`\nu` (offsets, drifts, initial states of linear plants). With squares as the
-loss each evaluation moves to the best of them, which the same Gram matrices give exactly (variable projection, Golub
-and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
+Residuals are affine in some unknowns :math:`\nu` (offsets, drifts, initial states of linear plants). With squares as
+the loss each evaluation moves to the best of them, which the same Gram matrices give exactly (variable projection,
+Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
 
 .. math:: \nu^* = \nu - H_{\nu\nu}^{-1} g_\nu, \qquad
           c^* = c - \tfrac12 g_\nu^T H_{\nu\nu}^{-1} g_\nu, \qquad
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -163,7 +163,7 @@ class Residuals:
         """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""
         return self.unknowns.columns(e, s, self.observers is not None)
 
-    def run(self, e: int, s: int, z: Float[np.ndarray, " n"], **keep: bool) -> Pass:
+    def run(self, e: int, s: int, z: Float[np.ndarray, " n"], **keep: Any) -> Pass:
         """Run the pass of experiment e, segment s."""
         model, start = self.unknowns.models[e], self.start(e, s, z)[None]
         return run_passes(model, self.segments[e][s], self.point(e, z), start, self.weights(e), **keep)
@@ -182,10 +182,8 @@ class Residuals:
             return tuple(self._passes_of(e, z) for e in range(count))
         return tuple(threads().map(lambda e: self._passes_of(e, z), range(count)))
 
-    def evaluate(
-        self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0
-    ) -> Evaluation:
-        """Return cost, gradient and Hessian at the best linear unknowns; the cost is infinite if the plant overflows."""
+    def evaluate(self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0) -> Evaluation:
+        """Return cost, gradient and Hessian at the best linear unknowns; infinite if the plant overflows."""
         del here, damping  # all unknowns are in z
         return self.assemble(z, self.passes(z))
 

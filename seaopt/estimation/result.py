@@ -61,9 +61,9 @@ class OutputFit:
 class Nuisance:
     """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment.
 
-    `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise over
-    each state's size (of a prediction-error fit), `substeps` how many integration steps a sample took (a linear plant
-    needs one).
+    `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise
+    over each state's size (of a prediction-error fit), `substeps` how many integration steps a sample took (a linear
+    plant needs one).
     """
 
     delay_s: float
@@ -125,8 +125,8 @@ class Fit:
     wall_s : float
         Seconds from call to result.
     step_error_sigma, step_error_parameter : float
-        Largest integration error in an output, in sigma, and in a parameter, in its standard deviations; zero for linear
-        plants, which are discretised exactly.
+        Largest integration error in an output, in sigma, and in a parameter, in its standard deviations; zero for
+        linear plants, which are discretised exactly.
     log_likelihood : float
         Gaussian, with each output's sigma at its best value.
     unknowns : int

@@ -4,14 +4,14 @@ With :math:`x^-_i` the state in which shot i ends, the joints are residuals too,
 
 .. math:: \rho\, S^{-1} (x^-_i - x_{i+1} + \mu_i), \qquad \mu_i \leftarrow \mu_i + (x^-_i - x_{i+1}),
 
-S the size of the states: at first weak, so that no simulation can run away from the log, then stiffer and stiffer, and at
-the end exact by the method of multipliers (Hestenes 1969; Bock, 1983, for the shooting). A Gauss-Newton step in the
+S the size of the states: at first weak, so that no simulation can run away from the log, then stiffer and stiffer, and
+at the end exact by the method of multipliers (Hestenes 1969; Bock, 1983, for the shooting). A Gauss-Newton step in the
 parameters :math:`z` and the nodes :math:`n` has a Hessian
 
 .. math:: \begin{pmatrix} H & F^T \\ F & M \end{pmatrix}
 
-with M block tridiagonal: M is factored in time linear in the shots, and what is left, :math:`H - F^T M^{-1} F`, is no larger
-than the parameters. `least_squares` sees that; the nodes follow, :math:`dn = -M^{-1} (g_n + F dz)`.
+with M block tridiagonal: M is factored in time linear in the shots, and what is left, :math:`H - F^T M^{-1} F`, is no
+larger than the parameters. `least_squares` sees that; the nodes follow, :math:`dn = -M^{-1} (g_n + F dz)`.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Shooting:
         """Return cost and reduced gradient and Hessian at z, with the nodes moved along."""
         shots = self._followed(z, here, damping)
         n = z.size
-        problem, unknowns = self.problem, self.problem.unknowns
+        unknowns = self.problem.unknowns
         cost, gradient, hessian, pending = 0.0, np.zeros(n), np.zeros((n, n)), 0.0
         own: list[tuple[Any, ...]] = []
         slope: list[tuple[Any, ...]] = []
@@ -101,7 +101,9 @@ class Shooting:
         cost += 0.5 * float(prior @ prior)
         gradient = gradient + prior / unknowns.prior_std
         hessian[np.diag_indices(n)] += unknowns.prior_std**-2.0
-        initial = [slot.index for places in unknowns.locals_of for r in places.initial for slot in r if slot.index is not None]
+        initial = [
+            slot.index for places in unknowns.locals_of for r in places.initial for slot in r if slot.index is not None
+        ]
         hessian[initial, initial] += 1.0  # an initial state is the first node, not an unknown of its own
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         squares = tuple(np.sum([p.gram[:, :, 0, 0].sum(axis=0) for p in row], axis=0) for row in passes)
@@ -198,8 +200,8 @@ def _eliminated(
     gradient = normal[:, 0, z].sum(axis=0) - flat[:, 1:].T @ solved[:, 0]
     hessian = normal[:, z, z].sum(axis=0) - flat[:, 1:].T @ solved[:, 1:]
     return _Segment(
-        cost=cost, gradient=gradient, hessian=0.5 * (hessian + hessian.T), pending=0.5 * float(flat[:, 0] @ solved[:, 0]),
-        own=own, slope=slope, gaps=gaps, found=found,
+        cost=cost, gradient=gradient, hessian=0.5 * (hessian + hessian.T),
+        pending=0.5 * float(flat[:, 0] @ solved[:, 0]), own=own, slope=slope, gaps=gaps, found=found,
     )  # fmt: skip
 
 
@@ -251,9 +253,7 @@ def _joined(
             for row, rows in zip(shots, scale, strict=True)
         )
         shooting = Shooting(problem=problem, shots=shots)
-        found = minimise(
-            shooting.evaluate, z, low, high, max_iterations=method.max_iterations, callback=callback
-        )
+        found = minimise(shooting.evaluate, z, low, high, max_iterations=method.max_iterations, callback=callback)
         last = found.evaluation
         if not isinstance(last, ShotEvaluation) or not np.isfinite(last.cost):
             break

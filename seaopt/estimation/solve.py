@@ -13,7 +13,6 @@ from seaopt.estimation.least_squares import Callback, Solution, minimise
 from seaopt.estimation.methods import Method
 from seaopt.estimation.observer import Observer
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
-from seaopt.estimation.unknowns import Unknowns
 from seaopt.simulation import Point, Segment, run_passes
 
 STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
@@ -23,6 +22,7 @@ MAX_SUBSTEPS = 256
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
+WATCHED = 20_000  # samples that are looked at for them
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
 
 
@@ -99,7 +99,7 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
 
 
 def best_start(problem: Residuals, method: Method, band_hz: tuple[float, float] | None) -> tuple[Evaluation, bool]:
-    """Return the better of the given values and those that match the frequency responses, and whether there are such."""
+    """Return the better of the given values and those of the frequency responses, and whether there are such."""
     given = problem.evaluate(problem.unknowns.start)
     if not method.search:
         return given, False
@@ -192,10 +192,13 @@ def _observer(
     places = np.zeros((PLACES, model.nx + model.nu))
     size = _first_size(problem, e, point, spread)
     observer = Observer(size=size, sensors=sensors, places=places, follows=False)
-    rows = np.linspace(0, min(piece.n, 20_000) - 1, PLACES).astype(int)
-    short = Segment(u=tuple(c[:20_000] for c in piece.u), y=tuple(c[:20_000] for c in piece.y), start_s=piece.start_s)
+    rows = np.linspace(0, min(piece.n, WATCHED) - 1, PLACES).astype(int)
+    u, y = (tuple(channel[:WATCHED] for channel in channels) for channels in (piece.u, piece.y))
+    short = Segment(u=u, y=y, start_s=piece.start_s)
     for _ in range(3):
-        correction = observer.correction(model, replace(point, clock=replace(point.clock, delay_free=False)), np.zeros(0))
+        correction = observer.correction(
+            model, replace(point, clock=replace(point.clock, delay_free=False)), np.zeros(0)
+        )
         if not np.all(np.isfinite(correction)):
             return None
         settings = replace(point, clock=replace(point.clock, delay_free=False), correction=correction)
@@ -209,9 +212,7 @@ def _observer(
     return observer
 
 
-def _first_size(
-    problem: Residuals, e: int, point: Point, spread: Float[np.ndarray, " ny"]
-) -> Float[np.ndarray, " nx"]:
+def _first_size(problem: Residuals, e: int, point: Point, spread: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " nx"]:
     """Return the size of each state that would show as the outputs' spread within ten samples."""
     model = problem.unknowns.models[e]
     observer = Observer(size=np.ones(model.nx), sensors=np.ones(model.ny), places=np.zeros((1, model.nx + model.nu)))

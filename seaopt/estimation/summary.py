@@ -150,8 +150,7 @@ def _nuisance(
         gain={name: slot.at(z) for name, slot in zip(experiment.outputs, places.gain, strict=True)},
         offset={name: slot.at(z) for name, slot in zip(experiment.outputs, places.offset, strict=True)},
         drift={
-            name: tuple(slot.at(z) for slot in row)
-            for name, row in zip(experiment.outputs, places.drift, strict=True)
+            name: tuple(slot.at(z) for slot in row) for name, row in zip(experiment.outputs, places.drift, strict=True)
         },
         initial_state=tuple(
             {name: slot.at(z) for name, slot in zip(experiment.plant.states, row, strict=True)}
@@ -197,9 +196,7 @@ def _outputs(
         measured = [np.concatenate(channels) for channels in zip(*(piece.y for piece in pieces), strict=True)]
         used = np.concatenate([counted(piece, 0) for piece in pieces])
         # A segment that lies wholly in the part held out has no initial state: it says nothing of the model.
-        started = np.concatenate(
-            [np.full(piece.n, not piece.keep or bool(np.any(piece.keep[0]))) for piece in pieces]
-        )
+        started = np.concatenate([np.full(piece.n, not piece.keep or bool(np.any(piece.keep[0]))) for piece in pieces])
         raw = np.concatenate([error.raw for error in free[e]])
         predicted = np.concatenate([error.raw for error in left[e]])
         found[experiment.name] = {}

@@ -14,7 +14,6 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.linear import point
 from seaopt.simulation import Model, make_model
 
-
 NOISE_START, NOISE_PRIOR = math.log(1e-2), 3.0  # of the logarithm of process noise over the state's size
 
 
@@ -87,11 +86,10 @@ class Unknowns:
         return [self.names.index(name) for name in model.free]
 
     def columns(self, e: int, s: int, corrected: bool = False) -> list[Int[np.ndarray, " nc"]]:
-        """Return, for each output of experiment e, which unknown each derivative column of segment s is; -1 for none."""
+        """Return, for each output, which unknown each derivative column of segment s is; -1 for none."""
         places, model = self.locals_of[e], self.models[e]
         own = [
-            [offset, *drift, gain]
-            for offset, drift, gain in zip(places.offset, places.drift, places.gain, strict=True)
+            [offset, *drift, gain] for offset, drift, gain in zip(places.offset, places.drift, places.gain, strict=True)
         ]
         shared = self.theta_index(model)
         shared += [] if places.delay.index is None else [places.delay.index]

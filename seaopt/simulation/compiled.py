@@ -9,6 +9,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from importlib.resources import files
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -94,8 +95,11 @@ def _generated(rates: Rates) -> str:
 def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
     """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives a row."""
     a, b = pattern
-    lines = [f"static inline void seaopt_{name}_chain(const double *a, const double *b, const double (*restrict z)[NJP],",
-             "        double (*restrict out)[NJP]) {", "    const vec zero = {0.0, 0.0, 0.0, 0.0}; (void)zero;"]  # fmt: skip
+    lines = [
+        f"static inline void seaopt_{name}_chain(const double *a, const double *b,",
+        "        const double (*restrict z)[NJP], double (*restrict out)[NJP]) {",
+        "    const vec zero = {0.0, 0.0, 0.0, 0.0}; (void)zero;",
+    ]
     for row in range(rows):
         terms = " + ".join(f"a[{k}] * ((const vec *)z[{j}])[j]" for k, (i, j) in enumerate(a) if i == row)
         lines.append(f"    for (int j = 0; j < NJP / 4; j++) ((vec *)out[{row}])[j] = {terms or 'zero'};")
@@ -109,7 +113,10 @@ def kernel(model: Model, layout: Layout, delayed: bool) -> Any:
     if key not in model.functions:
         library = load_library(kernel_source(model, layout, delayed))
         if library is not None:
-            library.seaopt_passes.argtypes, library.seaopt_passes.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
+            library.seaopt_passes.argtypes, library.seaopt_passes.restype = (
+                [ctypes.c_void_p, ctypes.c_long],
+                ctypes.c_int,
+            )
             library.carry_size.restype = ctypes.c_long
         model.functions[key] = library
     return model.functions[key]
@@ -163,7 +170,9 @@ class Program:
         self.model, self.segment, self.library = model, segment, library
         self.layout = layout_of(model.nx, model.ny, model.np, point)
         self.memory = memory = _Memory()
-        data = _linear_data(model, point, self.layout, _delayed(model, point)) if model.linear else _settings(model, point)
+        data = (
+            _linear_data(model, point, self.layout, _delayed(model, point)) if model.linear else _settings(model, point)
+        )
         ny = model.ny
         base = np.zeros(1, dtype=_arguments(model.nu, ny))
         base["length"] = segment.n
@@ -219,7 +228,12 @@ class Program:
         arguments["from"], arguments["to"] = edges[:-1], edges[1:]
         arguments["start"] = edges[:-1] if resume is None else 0
         arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
-        for name, array in (("gram", result.gram), ("rho", result.loss), ("count", result.count), ("last", result.last)):
+        for name, array in (
+            ("gram", result.gram),
+            ("rho", result.loss),
+            ("count", result.count),
+            ("last", result.last),
+        ):
             arguments[name] = array.ctypes.data + array.strides[0] * np.arange(shots)
         for name, array in (("outputs", outputs), ("columns", columns), ("states", states)):
             if array:
@@ -244,9 +258,7 @@ class Program:
         bounds = np.linspace(0, count, workers() + 1).astype(int)
         size = arguments.dtype.itemsize
         jobs = [
-            pool.submit(call, arguments.ctypes.data + int(a) * size, int(b - a))
-            for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-            if b > a
+            pool.submit(call, arguments.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds) if b > a
         ]
         for job in jobs:
             job.result()

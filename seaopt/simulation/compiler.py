@@ -20,7 +20,11 @@ from functools import lru_cache
 from pathlib import Path
 
 FLAGS = ("-O3", "-std=gnu99", "-fPIC", "-shared", "-fno-math-errno", "-fvisibility=hidden")
-NATIVE = ("-march=native", "-mprefer-vector-width=256", "-mno-avx512f",)
+NATIVE = (
+    "-march=native",
+    "-mprefer-vector-width=256",
+    "-mno-avx512f",
+)
 
 
 def find_compiler() -> list[str] | None:

@@ -71,6 +71,7 @@ class Clock:
         return (self.whole, self.whole - 1) if self.hold == "first" else (self.whole, self.whole + 1)
 
 
+@np.errstate(all="ignore")  # a plant far off may overflow: the result is then not finite
 def expm_with_derivatives(
     n: Float[np.ndarray, "m m"], dn: Float[np.ndarray, "np m m"]
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "np m m"]]:

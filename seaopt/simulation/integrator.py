@@ -1,13 +1,13 @@
 r"""The step of a nonlinear plant: classical Runge-Kutta of order four, as a CasADi function with its derivatives.
 
 One step of length :math:`h` from :math:`x` at :math:`t`, with the input a straight line from :math:`u_0` to
-:math:`u_1` over the step. `step_function` lets CasADi differentiate the step itself. `rate_functions` gives what compiled
-code needs to do the same faster: differentiating the four stages gives the same method applied to
+:math:`u_1` over the step. `step_function` lets CasADi differentiate the step itself. `rate_functions` gives what
+compiled code needs to do the same faster: differentiating the four stages gives the same method applied to
 
 .. math:: \dot S = f_x S + f_p,
 
-so that one evaluation of :math:`f, f_x, f_p` a stage serves every derivative, and the sensitivities are again those of the
-numbers that the step computes.
+so that one evaluation of :math:`f, f_x, f_p` a stage serves every derivative, and the sensitivities are again those of
+the numbers that the step computes.
 """
 
 from __future__ import annotations

@@ -21,7 +21,9 @@ from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layo
 BLOCK = 32
 CHUNK = 4096
 
-Trace = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n1 nx"], Float[np.ndarray, "nx nj"]]
+Trace = tuple[
+    Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n1 nx"], Float[np.ndarray, "nx nj"]
+]
 
 
 def interpreted_passes(
@@ -80,7 +82,9 @@ def _shot(
     return found
 
 
-def _robust(r: Float[np.ndarray, " n"], loss: str, knee: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _robust(
+    r: Float[np.ndarray, " n"], loss: str, knee: float
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the loss of each residual and the weight that makes its square's gradient the loss's."""
     size = np.abs(r)
     if loss == "soft_l1":
@@ -89,7 +93,9 @@ def _robust(r: Float[np.ndarray, " n"], loss: str, knee: float) -> tuple[Float[n
     if loss == "square" or not np.isfinite(knee):
         return 0.5 * r**2, np.ones_like(r)
     inside = size <= knee
-    return np.where(inside, 0.5 * r**2, knee * (size - 0.5 * knee)), np.where(inside, 1.0, knee / np.maximum(size, 1e-300))
+    return np.where(inside, 0.5 * r**2, knee * (size - 0.5 * knee)), np.where(
+        inside, 1.0, knee / np.maximum(size, 1e-300)
+    )
 
 
 def _held_inputs(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
@@ -118,9 +124,7 @@ def _augmented(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any
     return f, b, h, d
 
 
-def _linear_trace(
-    model: Model, point: Point, held: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
-) -> Trace:
+def _linear_trace(model: Model, point: Point, held: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]) -> Trace:
     nx, ny = model.nx, model.ny
     f, b, h, d = _augmented(model, transition(model, point.theta, point.clock))
     n, width = held.shape

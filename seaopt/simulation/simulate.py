@@ -124,7 +124,9 @@ def simulate(
         )
     signals: dict[str, Signal] = {}
     for names, values in ((plant.inputs, u), (plant.states, states.T), (plant.outputs, outputs.T)):
-        for (name, unit), channel in zip(names.items(), values, strict=False):  # a plant without inputs has one of zeros
+        for (name, unit), channel in zip(
+            names.items(), values, strict=False
+        ):  # a plant without inputs has one of zeros
             signals[name] = Signal(name=name, values=channel.copy(), unit=unit)
     return Log(time=log.time.copy(), signals=signals, source=f"simulation of {plant.name}")
 

@@ -110,12 +110,7 @@ def sets(*but):
     return [pytest.param(name, start, marks=marks.get((name, start), [])) for name in MODELS for start in STARTS]
 
 
-LOST = (
-    ("MGH17", "far", "a step of b5 from 2 to 6 leaves it without effect on any sample; the search stays there"),
-    ("MGH10", "far", "still moving along a narrow valley when the iterations are used up; 3,000 a round arrive"),
-    ("Rat43", "far", "b4 changes sign, and the search follows a valley to b3 < 0, b4 < 0 with 29 times the squares"),
-)
-EARLY = ("Lanczos3", "far", "sigma is taken as settled within 0.5 %: the standard errors are 0.47 % off")
+LOST = (("MGH17", "far", "a step of b5 from 2 to 6 leaves it without effect on any sample; the search stays there"),)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -139,7 +134,7 @@ def test_values_are_nists(name, start):
     assert np.max(np.abs(found - table.values) / allowed) <= 1.0, f"{fit.status}: {fit.message}"
 
 
-@pytest.mark.parametrize(("name", "start"), sets(*LOST, EARLY))
+@pytest.mark.parametrize(("name", "start"), sets(*LOST))
 def test_standard_errors_are_nists(name, start):
     table, fit = fitted(name, start)
     n, p = table.x.size, len(table.names)

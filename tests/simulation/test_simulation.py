@@ -133,7 +133,9 @@ def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "
     y[7, 1] = np.nan
     keep = np.ones((n, 2), dtype=np.uint8)
     keep[100:120] = 0
-    segment = Segment(u=(rng.normal(size=n),), y=tuple(y.T.copy()), keep=tuple(keep.T.copy()), drift_span=(-1.0, 2.0 / n))
+    segment = Segment(
+        u=(rng.normal(size=n),), y=tuple(y.T.copy()), keep=tuple(keep.T.copy()), drift_span=(-1.0, 2.0 / n)
+    )
     clock = clock or Clock(period=1 / RATE)
     correction = None
     if corrected:  # weak enough to be stable, with made-up derivatives
@@ -182,7 +184,7 @@ def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
 @pytest.mark.parametrize("case", ["stand", "swing friction"])
 @pytest.mark.parametrize("options", SETTINGS)
 def test_derivatives_are_finite_differences(case, options, thor):
-    """Every column of v: shared, initial state, then each output's own. The correction's gain moves as it says it does."""
+    """Every column of v: shared, initial state, each output's own. The correction moves as it says it does."""
     model, segment, point, weights, x0 = passes(case, thor, n=250, **options)
     weights = replace(weights, loss="square")
     layout = layout_of(model.nx, model.ny, model.np, point)
