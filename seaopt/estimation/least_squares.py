@@ -53,6 +53,7 @@ def minimise(
     high: Float[np.ndarray, " n"],
     *,
     reach: float = REACH,
+    decrement: float = DECREMENT,
     max_iterations: int = 50,
     callback: Callback | None = None,
 ) -> Solution:
@@ -68,6 +69,8 @@ def minimise(
         Bounds.
     reach : float
         First radius of the region, over the size of the first point.
+    decrement : float
+        Squared standard deviations to the minimum at which to stop.
     max_iterations : int
         Evaluations after the first.
     callback : callable, optional
@@ -83,7 +86,7 @@ def minimise(
     for iteration in range(1, max_iterations + 1):
         held = _held(here, low, high)
         distance = _decrement(here, held) + 2.0 * here.pending
-        if distance <= DECREMENT + RELATIVE * here.cost:
+        if distance <= decrement + RELATIVE * here.cost:
             return Solution(
                 z=here.z, evaluation=here, status="converged", iterations=iteration - 1,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",

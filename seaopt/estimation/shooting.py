@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.estimation.covariance import errors
 from seaopt.estimation.least_squares import Callback, minimise
 from seaopt.estimation.methods import MultipleShooting
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
@@ -41,6 +42,7 @@ from seaopt.simulation import Pass, run_passes
 STIFFNESS = (1e-4, 1e-2, 1.0, 1e2, 1e4)  # of the joints, over what the log says of a node
 JOINED = 1e-7  # of the size of the states
 MULTIPLIER_ROUNDS = 8
+WORSE = 2.0  # residual power of single shooting, over that of the joined shots, that is no longer the same fit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -216,11 +218,11 @@ def multiple_shooting(
     if method.search and (not np.isfinite(start.cost) or explains_little(problem, start)):
         held = held_start(problem, z, method.max_iterations)
         z = z if held is None else held
-    z, ends = _joined(plain, z, method, callback)
+    z, ends, sigma = _joined(plain, z, method, callback)
     single = problem.evaluate(_with_initial(problem, z, ends))
     if np.isfinite(single.cost):
         settled = settle(problem, single, method.max_iterations, callback)
-        if settled.solution.status == "converged":
+        if settled.solution.status == "converged" and _explains(settled, sigma):
             return settled
     experiments = tuple(replace(e, shots=e.shots * method.segments) for e in problem.experiments)
     unknowns = collect(experiments, params)
@@ -241,8 +243,8 @@ def multiple_shooting(
 
 def _joined(
     problem: Residuals, z: Float[np.ndarray, " n"], method: MultipleShooting, callback: Callback | None
-) -> tuple[Float[np.ndarray, " n"], tuple[tuple[Shots, ...], ...]]:
-    """Return unknowns and shots after the joints have closed, as far as they do."""
+) -> tuple[Float[np.ndarray, " n"], tuple[tuple[Shots, ...], ...], tuple[Float[np.ndarray, " ny"], ...]]:
+    """Return unknowns, shots and sigmas after the joints have closed, as far as they do."""
     shots = _first_shots(problem, z, method.segments)
     low, high = problem.unknowns.low, problem.unknowns.high
     scale = _weights(Shooting(problem=problem, shots=shots), z)
@@ -271,7 +273,19 @@ def _joined(
                 tuple(replace(shot, shift=shot.shift + gap) for shot, gap in zip(row, gaps, strict=True))
                 for row, gaps in zip(shots, last.gaps, strict=True)
             )
-    return z, shots
+    return z, shots, problem.sigma
+
+
+def _explains(settled: Solved, sigma: tuple[Float[np.ndarray, " ny"], ...]) -> bool:
+    """Tell whether single shooting leaves no more than the joined shots do; where the plant runs away it does not."""
+    if settled.problem.band_hz is not None or not isinstance(settled.problem.loss, Linear):
+        return True  # the joined shots were neither filtered nor robust
+    for row in errors(settled.problem.with_sigma(sigma), settled.solution.z):
+        weighted = np.concatenate([error.weighted for error in row])
+        power = np.sum(weighted**2, axis=0) / np.maximum(np.count_nonzero(weighted, axis=0), 1)
+        if not np.all(power < WORSE):
+            return False
+    return True
 
 
 @np.errstate(all="ignore")

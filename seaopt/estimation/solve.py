@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from seaopt.estimation.covariance import errors, inverse
 from seaopt.estimation.first_guess import first_guess
-from seaopt.estimation.least_squares import Callback, Solution, minimise
+from seaopt.estimation.least_squares import DECREMENT, Callback, Solution, minimise
 from seaopt.estimation.methods import Method
 from seaopt.estimation.observer import Observer
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
@@ -21,6 +21,7 @@ EXACT = 1e-6  # noise below this part of an output's spread asks no more of the 
 MAX_SUBSTEPS = 256
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
+NOISE_DECREMENT = 1e-6  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 WATCHED = 20_000  # samples that are looked at for them
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
@@ -76,10 +77,12 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     refined, _ = _refined(problem, here.z, 0.1)
     if refined.substeps != problem.substeps:
         problem, here = refined, refined.evaluate(here.z)
+    decrement = DECREMENT if problem.observers is None else NOISE_DECREMENT
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem.evaluate, here, unknowns.low, unknowns.high, max_iterations=max_iterations, callback=callback
-        )
+            problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement, max_iterations=max_iterations,
+            callback=callback,
+        )  # fmt: skip
         here, iterations = solution.evaluation, iterations + solution.iterations
         solution = replace(solution, iterations=iterations)
         if not np.isfinite(here.cost):

@@ -132,7 +132,11 @@ def _status(
         if not step.small:
             found = f"{step.output:.2g} sigma in an output and {step.parameter:.2g} std in a parameter"
             return "stalled", f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {found}"
-        weak = "; ".join(f"{listed(sorted(direction))} are hardly told apart" for direction in seen.weak)
+        weak = "; ".join(
+            f"{listed(sorted(direction))} are only weakly told apart (condition {seen.condition:.2g}): "
+            "each would be known far better if the others were"
+            for direction in seen.weak
+        )
         return solution.status, f"{solution.message}; {weak}" if weak else solution.message
     seen_alone = {name: bool(hessian[i, i] > 0.0) for i, name in enumerate(names)}
     words = "; ".join(told(direction, seen_alone.get(min(direction), True)) for direction in seen.unidentifiable)

@@ -14,7 +14,16 @@ from pydantic import BaseModel, ValidationError
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec
 from seaopt.errors import ProblemError, SeaoptError, suggestion
-from seaopt.estimation import Experiment, Huber, Linear
+from seaopt.estimation import (
+    Experiment,
+    Huber,
+    Linear,
+    Method,
+    MultipleShooting,
+    OutputError,
+    PredictionError,
+    SoftL1,
+)
 from seaopt.logs import Column, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
@@ -66,7 +75,8 @@ class Problem:
         """Keyword arguments for `seaopt.fit`."""
         table: FitTable = self.table.fit
         return {
-            "loss": Huber() if table.loss == "huber" else Linear(),
+            "method": _method(table),
+            "loss": {"linear": Linear(), "huber": Huber(), "soft_l1": SoftL1()}[table.loss],
             "band_hz": table.band_hz,
             "holdout": table.holdout,
         }
@@ -143,6 +153,7 @@ class Problem:
             plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
             offset=table.offset, gain={name: _unknown(name, "-", item) for name, item in table.gain.items()},
             delay_s=_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
+            drift=table.drift, shots=table.shots,
         )  # fmt: skip
 
     def _read(self, plant: Plant, table: ExperimentTable) -> Log:
@@ -176,6 +187,17 @@ class Problem:
             plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
             seed=table.seed, sensors=sensors,
         )  # fmt: skip
+
+
+def _method(table: FitTable) -> Method:
+    if table.segments is not None and table.method != "multiple_shooting":
+        raise ProblemError(
+            f'[fit] segments = {table.segments} belongs to method = "multiple_shooting", not "{table.method}"; '
+            "leave it out"
+        )
+    if table.method == "multiple_shooting":
+        return MultipleShooting() if table.segments is None else MultipleShooting(segments=table.segments)
+    return PredictionError() if table.method == "prediction_error" else OutputError()
 
 
 def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:

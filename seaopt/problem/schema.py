@@ -116,6 +116,8 @@ class ExperimentTable(_Strict):
     delay_s: Number | UnknownTable = 0.0
     gain: dict[str, Number | UnknownTable] = {}
     hold: Literal["zero", "first"] = "zero"
+    drift: Annotated[Whole, Field(ge=0, le=5)] = 0
+    shots: Annotated[Whole, Field(ge=1, le=100_000)] = 1
     slice_s: tuple[Number, Number] | None = None
     gaps: Literal["split", "error"] = "split"
 
@@ -123,8 +125,9 @@ class ExperimentTable(_Strict):
 class FitTable(_Strict):
     """How the fit is made."""
 
-    method: Literal["output_error"] = "output_error"
-    loss: Literal["linear", "huber"] = "linear"
+    method: Literal["output_error", "multiple_shooting", "prediction_error"] = "output_error"
+    segments: Annotated[Whole, Field(ge=1, le=100_000)] | None = None
+    loss: Literal["linear", "huber", "soft_l1"] = "linear"
     band_hz: tuple[Number, Number] | None = None
     holdout: Annotated[Number, Field(ge=0, lt=1)] = 0.0
 
