@@ -21,7 +21,7 @@ from seaopt.frequency import h1
 from seaopt.simulation import Model, linearised
 
 CANDIDATES = 128
-REFINED = 4
+REFINED = 8
 POINTS = 60
 EXPLAINED = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
 LONGEST = 1 << 14  # samples a stretch: resolution enough for a guess
@@ -46,29 +46,32 @@ def first_guess(
     unknowns: Unknowns,
     band_hz: tuple[float, float] | None,
     rng: np.random.Generator,
-) -> Float[np.ndarray, " n"] | None:
-    """Return the unknowns with shared parameters that match the frequency responses, or None.
+) -> list[Float[np.ndarray, " n"]]:
+    """Return unknowns with shared parameters that match the frequency responses, the best first.
 
-    None where no experiment has a usable response: several excited inputs, gaps, or no coherence.
+    None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
     """
     targets = [target for e in range(len(experiments)) for target in _targets(experiments[e], unknowns, e, band_hz)]
     if not targets:
-        return None
+        return []
     start = unknowns.start[: unknowns.shared]
     low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
     prior = unknowns.prior_std[: unknowns.shared]
     spread = np.isinf(prior) & (start != 0.0)
-    best = _refine(targets, start, low, high, spread)
-    if best[0] > 0.5 * EXPLAINED**2 * 2 * sum(target.s.size for target in targets):
+    found = [_refine(targets, start, low, high, spread)]
+    if found[0][0] > 0.5 * EXPLAINED**2 * 2 * sum(target.s.size for target in targets):
         candidates = [
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
             for _ in range(CANDIDATES)
         ]
         ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
-        best = min((best, *(_refine(targets, theta, low, high, spread) for theta in ranked[:REFINED])), key=_first)
-    guess = unknowns.start.copy()
-    guess[: unknowns.shared] = best[1]
-    return guess
+        found += [_refine(targets, theta, low, high, spread) for theta in ranked[:REFINED]]
+    guesses: list[Float[np.ndarray, " n"]] = []
+    for _, theta in sorted(found, key=_first):
+        guess = unknowns.start.copy()
+        guess[: unknowns.shared] = theta
+        guesses.append(guess)
+    return guesses
 
 
 def _first(pair: tuple[float, Any]) -> float:

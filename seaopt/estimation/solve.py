@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +22,9 @@ EXACT = 1e-6  # noise below this part of an output's spread asks no more of the 
 MAX_SUBSTEPS = 256
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
-NOISE_DECREMENT = 1e-6  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
+NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
+FURTHER = 5  # guesses of the frequency responses that are tried at most
 WATCHED = 20_000  # samples that are looked at for them
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
 
@@ -57,15 +59,23 @@ def output_error(
     found = settle(problem, best, method.max_iterations, callback) if np.isfinite(best.cost) else None
     if found is not None and not (method.search and _doubtful(found, guessed)):
         return found
-    for start in (problem.unknowns.start, best.z) if method.search else ():
-        predicted = held_start(problem, start, method.max_iterations)
-        if predicted is None:
-            continue
-        other = settle(problem, problem.evaluate(predicted), method.max_iterations, callback)
+    for start in _further(problem, best, guessed, method) if method.search else ():
+        other = settle(problem, problem.evaluate(start), method.max_iterations, callback)
         found = other if found is None else min(found, other, key=_misfit)
         if not _doubtful(found, guessed):
             break
     return found if found is not None else settle(problem, best, method.max_iterations, callback)
+
+
+def _further(
+    problem: Residuals, best: Evaluation, guessed: list[Float[np.ndarray, " n"]], method: Method
+) -> Iterator[Float[np.ndarray, " n"]]:
+    """Yield further starts: held to the log from the given values and from the best, then the other guesses."""
+    for start in (problem.unknowns.start, best.z):
+        predicted = held_start(problem, start, method.max_iterations)
+        if predicted is not None:
+            yield predicted
+    yield from guessed[1:FURTHER]
 
 
 def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
@@ -101,19 +111,21 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     raise AssertionError  # the last attempt returns
 
 
-def best_start(problem: Residuals, method: Method, band_hz: tuple[float, float] | None) -> tuple[Evaluation, bool]:
-    """Return the better of the given values and those of the frequency responses, and whether there are such."""
+def best_start(
+    problem: Residuals, method: Method, band_hz: tuple[float, float] | None
+) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
+    """Return the better of the given values and the best guess of the frequency responses, and all the guesses."""
     given = problem.evaluate(problem.unknowns.start)
     if not method.search:
-        return given, False
-    guess = first_guess(problem.experiments, problem.unknowns, band_hz, np.random.default_rng(method.seed))
-    if guess is None:
-        return given, False
-    guessed = problem.evaluate(guess)
-    return (guessed if guessed.cost <= given.cost else given), True
+        return given, []
+    guesses = first_guess(problem.experiments, problem.unknowns, band_hz, np.random.default_rng(method.seed))
+    if not guesses:
+        return given, []
+    guessed = problem.evaluate(guesses[0])
+    return (guessed if guessed.cost <= given.cost else given), guesses
 
 
-def _doubtful(found: Solved, guessed: bool) -> bool:
+def _doubtful(found: Solved, guessed: list[Float[np.ndarray, " n"]]) -> bool:
     """Tell whether another start is worth trying: it did not converge, or a nonlinear plant explains little."""
     if found.solution.status != "converged" or not np.isfinite(found.solution.evaluation.cost):
         return True

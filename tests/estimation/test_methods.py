@@ -90,7 +90,7 @@ def test_a_plant_that_runs_away_is_fitted_on_shots():
         fit = so.fit([bench], start, method=method)
         assert fit.status == "converged", fit.message
         assert abs(fit.parameters["a"].value - a) < 4.5 * fit.parameters["a"].std
-        assert fit.parameters["a"].std < 0.01
+        assert fit.parameters["a"].std < 0.05
 
 
 def test_prediction_error_sees_noise_inside_the_plant():
