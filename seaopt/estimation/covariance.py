@@ -13,7 +13,7 @@ loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
 them,
 :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter, in the
-frequency domain (overlap-save), chunk by chunk: memory does not grow with the log but for the residuals themselves.
+frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
 Long sums are NumPy's own, not the linear-algebra library's, whose threads cost more than such sums on a busy machine.
 """
 
@@ -69,26 +69,32 @@ def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]
     """Return the residuals of every experiment and segment."""
     found: list[list[Errors]] = []
     for e, pieces in enumerate(problem.segments):
-        model, point, weights = problem.unknowns.models[e], problem.point(e, z), problem.weights(e)
         row: list[Errors] = []
-        for s, piece in enumerate(pieces):
-            raw, first = np.empty((piece.n, model.ny)), 0
-            filtered = np.empty((piece.n, model.ny)) if len(weights.sections) else raw
-            drift = _drift(piece, point.drift)
-            for part in stream(
-                model, piece, point, problem.start(e, s, z), weights, chunk=CHUNK, columns=bool(len(weights.sections))
-            ):
-                assert part.outputs is not None
-                rows = slice(first, first + len(part.outputs))
-                measured = np.column_stack([channel[rows] for channel in piece.y])
-                raw[rows] = part.outputs * point.gain + point.offset + drift(rows) - measured
-                if part.columns is not None:
-                    filtered[rows] = part.columns[:, :, 0]
-                first = rows.stop
-            weighted = np.where(counted(piece, weights.settle), filtered / problem.sigma[e], 0.0)
-            row.append(Errors(weighted=weighted, raw=raw))
+        for s in range(len(pieces)):
+            parts = list(_leftovers(problem, e, s, z))
+            weighted = np.concatenate([np.where(used, part, 0.0) for _, _, part, used in parts])
+            row.append(Errors(weighted=weighted, raw=np.concatenate([raw for _, raw, _, _ in parts])))
         found.append(row)
     return found
+
+
+def _leftovers(
+    problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]
+) -> Iterator[tuple[slice, Float[np.ndarray, "m ny"], Float[np.ndarray, "m ny"], Bool[np.ndarray, "m ny"]]]:
+    """Yield rows, model minus measured, filtered residuals in sigma, and which count, chunk by chunk."""
+    model, point, weights, piece = (
+        problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
+    )  # fmt: skip
+    drift, filtered = _drift(piece, point.drift), bool(len(weights.sections))
+    first = 0
+    for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=CHUNK, columns=filtered):
+        assert part.outputs is not None
+        rows = slice(first, first + len(part.outputs))
+        first = rows.stop
+        measured = np.column_stack([channel[rows] for channel in piece.y])
+        raw = part.outputs * point.gain + point.offset + drift(rows) - measured
+        size = raw if part.columns is None else part.columns[:, :, 0]
+        yield rows, raw, size / problem.sigma[e], counted(piece, weights.settle, rows)
 
 
 def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]) -> Callable[[slice], Any]:
@@ -102,31 +108,133 @@ def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]) -> Callable
     return values
 
 
-def counted(piece: Segment, settle: int) -> Bool[np.ndarray, "n ny"]:
+def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.ndarray, "n ny"]:
     """Return which samples take part in the cost."""
-    present = np.column_stack([np.isfinite(channel) for channel in piece.y])
+    chosen = rows if rows is not None else slice(0, piece.n)
+    present = np.column_stack([np.isfinite(channel[chosen]) for channel in piece.y])
     if piece.keep:
-        present &= np.column_stack([mask > 0 for mask in piece.keep])
-    present[:settle] = False
+        present &= np.column_stack([mask[chosen] > 0 for mask in piece.keep])
+    present[: max(settle - chosen.start, 0)] = False
     return present
 
 
-def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"], left: list[list[Errors]]) -> Float[np.ndarray, "n n"]:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Part:
+    """Sums over samples of one output: how many, power of model minus measured, and spread of the measured."""
+
+    count: int
+    power: float
+    spread: float
+
+    @property
+    def fit_percent(self) -> float | None:
+        """100 (1 - |y - yhat| / |y - mean(y)|); None of no samples."""
+        return 100.0 * (1.0 - float(np.sqrt(self.power / max(self.spread, 1e-300)))) if self.count else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Leftover:
+    """What an experiment's residuals come to, in the memory of a chunk.
+
+    Parameters
+    ----------
+    correlation : array, shape (lags + 1, ny, ny)
+        Sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals.
+    mean, count : array, shape (ny,)
+        Of r, over the samples that count.
+    used, rest : tuple of Part
+        One an output: samples that count but for the filter's settling, and those held out.
+
+    """
+
+    correlation: Float[np.ndarray, "lags1 ny ny"]
+    mean: Float[np.ndarray, " ny"]
+    count: Float[np.ndarray, " ny"]
+    used: tuple[Part, ...]
+    rest: tuple[Part, ...]
+
+    def whiteness(self, o: int, lags: int = 20) -> float:
+        """Return the p-value of the Ljung-Box test that r is white (Biometrika 65, 1978)."""
+        from scipy.special import gammaincc  # deferred: scipy.stats takes a second
+
+        n = float(self.count[o])
+        lags = min(lags, len(self.correlation) - 1, int(n / 5))
+        power = self.correlation[0, o, o] - n * self.mean[o] ** 2
+        if lags < 1 or power <= 0.0:
+            return 1.0
+        rho = (self.correlation[1 : lags + 1, o, o] - n * self.mean[o] ** 2) / power
+        statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
+        return float(gammaincc(lags / 2, statistic / 2))
+
+
+def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover:
+    """Return what an experiment's residuals come to."""
+    pieces, ny = problem.segments[e], len(problem.sigma[e])
+    lags = _lags(max(piece.n for piece in pieces))
+    correlation, total, count = np.zeros((ny, ny, lags + 1)), np.zeros(ny), np.zeros(ny)
+    sums = np.zeros((2, ny, 4))  # used and rest: count, power, sum and sum of squares of the measured less its first
+    for s, piece in enumerate(pieces):
+        tail = np.zeros((ny, 0))
+        started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
+        origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
+        for rows, raw, weighted, used in _leftovers(problem, e, s, z):
+            pull = np.ascontiguousarray(np.where(used, _pull(problem, weighted), 0.0).T)
+            _correlate(correlation, pull, tail)
+            tail = np.concatenate([tail, pull], axis=1)[:, -lags:] if lags else tail
+            total += pull.sum(axis=1)
+            count += used.sum(axis=0)
+            kept = counted(piece, 0, rows)
+            for o, channel in enumerate(piece.y):
+                measured = channel[rows] - origin[o]
+                for k, chosen in enumerate((kept[:, o], ~kept[:, o] & np.isfinite(measured) & started)):
+                    values = measured if np.all(chosen) else measured[chosen]
+                    misses = raw[:, o] if np.all(chosen) else raw[chosen, o]
+                    sums[k, o] += values.size, np.sum(misses**2), np.sum(values), np.sum(values**2)
+    used, rest = (
+        tuple(
+            Part(count=int(n), power=power, spread=square - first**2 / max(n, 1.0)) for n, power, first, square in rows
+        )
+        for rows in sums.tolist()
+    )
+    return Leftover(
+        correlation=correlation.transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
+        rest=rest,
+    )  # fmt: skip
+
+
+def _lags(n: int) -> int:
+    return int(min(max(32, 4 * np.sqrt(n)), n // 4))
+
+
+def _correlate(
+    found: Float[np.ndarray, "ny ny lags1"], now: Float[np.ndarray, "ny n"], tail: Float[np.ndarray, "ny past"]
+) -> None:
+    """Add the sums of now_a(t) before_b(t - k), before being the tail and now."""
+    irfft, next_fast_len, rfft = _transforms()
+    lags, shift = found.shape[2] - 1, tail.shape[1]
+    size = next_fast_len(shift + now.shape[1] + lags, real=True)
+    spectrum = rfft(np.concatenate([tail, now], axis=1), size)
+    own = spectrum if shift == 0 else rfft(np.concatenate([np.zeros_like(tail), now], axis=1), size)
+    for a in range(len(now)):
+        for b in range(len(now)):
+            found[a, b] += irfft(own[a] * np.conj(spectrum[b]), size)[: lags + 1]
+
+
+def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
     bread = np.zeros((z.size, z.size))
-    for e, row in enumerate(left):
-        for s, error in enumerate(row):
-            curvature = _curvature(problem, error.weighted)
-            for rows, columns in _columns(problem, e, s, z):
+    for e, pieces in enumerate(problem.segments):
+        for s in range(len(pieces)):
+            for columns, used in _columns(problem, e, s, z):
                 for o, places in enumerate(problem.columns(e, s)):
-                    used = np.flatnonzero(places >= 0)
-                    j = columns[:, o, 1 + used] / problem.sigma[e][o]
-                    counts = (error.weighted[rows, o] != 0.0) * curvature[rows, o]
-                    bread[np.ix_(places[used], places[used])] += (j * counts[:, None]).T @ j
+                    chosen = np.flatnonzero(places >= 0)
+                    j = columns[:, o, 1 + chosen] / problem.sigma[e][o]
+                    weight = used[:, o] * _curvature(problem, columns[:, o, 0] / problem.sigma[e][o])
+                    bread[np.ix_(places[chosen], places[chosen])] += (j * weight[:, None]).T @ j
     return bread
 
 
-def _curvature(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+def _curvature(problem: Residuals, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     if isinstance(problem.loss, Huber):
         return (np.abs(r) <= problem.loss.threshold).astype(float)
     if isinstance(problem.loss, Linear):
@@ -141,44 +249,40 @@ def _pull(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray,
     return r if isinstance(problem.loss, Linear) else r / np.sqrt(1.0 + (r / problem.loss.threshold) ** 2)
 
 
-def _columns(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[slice, Any]]:
-    """Yield rows and their columns, chunk by chunk."""
-    first = 0
-    arguments = problem.unknowns.models[e], problem.segments[e][s], problem.point(e, z), problem.start(e, s, z)
-    for part in stream(*arguments, problem.weights(e), chunk=CHUNK, columns=True):
+def _columns(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[Any, Any]]:
+    """Yield the columns of a chunk, and which samples count."""
+    first, weights, piece = 0, problem.weights(e), problem.segments[e][s]
+    arguments = problem.unknowns.models[e], piece, problem.point(e, z), problem.start(e, s, z)
+    for part in stream(*arguments, weights, chunk=CHUNK, columns=True):
         assert part.columns is not None
         rows = slice(first, first + len(part.columns))
         first = rows.stop
-        yield rows, part.columns
+        yield part.columns, counted(piece, weights.settle, rows)
 
 
 def coloured(
-    problem: Residuals, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"], left: list[list[Errors]]
+    problem: Residuals, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"], left: list[Leftover]
 ) -> Float[np.ndarray, "p p"]:
     """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E."""
-    total = np.zeros((inverse.shape[1],) * 2)
-    for e, row in enumerate(left):
-        pulls = [_pull(problem, error.weighted) for error in row]
-        density = correlations(pulls)
-        for s, pull in enumerate(pulls):
-            if len(pull) < 8:
+    p = inverse.shape[1]
+    total = np.zeros((p, p))
+    for e, (pieces, sums) in enumerate(zip(problem.segments, left, strict=True)):
+        density, ny = correlations(sums), len(problem.sigma[e])
+        for s, piece in enumerate(pieces):
+            if piece.n < 8:
                 continue
-            tail = np.zeros((pull.shape[1], inverse.shape[1], density.shape[0] - 1))
-            for rows, columns in _columns(problem, e, s, z):
-                influence = np.empty((pull.shape[1], inverse.shape[1], len(columns)))
+            tail = np.zeros((ny, p, density.shape[0] - 1))
+            for columns, used in _columns(problem, e, s, z):
+                influence = np.empty((ny, p, len(columns)))
                 for o, places in enumerate(problem.columns(e, s)):
-                    used = np.flatnonzero(places >= 0)
-                    weights = inverse[places[used]] / problem.sigma[e][o]
-                    np.einsum("tc,cp->pt", columns[:, o, 1 + used], weights, out=influence[o])
-                influence *= _counts(pull[rows]).T[:, None, :]
+                    chosen = np.flatnonzero(places >= 0)
+                    weights = inverse[places[chosen]] / problem.sigma[e][o]
+                    np.einsum("tc,cp->pt", columns[:, o, 1 + chosen], weights, out=influence[o])
+                if not np.all(used):
+                    influence *= used.T[:, None, :]
                 total += _coloured_part(influence, tail, density)
-                tail = np.concatenate([tail, influence], axis=2)[:, :, -tail.shape[2] :]
+                tail = np.concatenate([tail, influence], axis=2)[:, :, influence.shape[2] :]
     return total
-
-
-def _counts(pull: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
-    """Return 1 where a sample counted: a residual of exactly zero is one that was left out."""
-    return (pull != 0.0).astype(float)
 
 
 def _transforms() -> tuple[Any, Any, Any]:
@@ -187,30 +291,15 @@ def _transforms() -> tuple[Any, Any, Any]:
     return fft.irfft, fft.next_fast_len, fft.rfft
 
 
-def correlations(pulls: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "lags1 ny ny"]:
+def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
     """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window.
 
-    The window reaches as far as correlation can be told from chance, and half as far again (after Politis, J.
-    Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
+    The window reaches three times as far as correlation can be told from chance (after Politis, J. Nonparametric
+    Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
-    irfft, next_fast_len, rfft = _transforms()
-    longest, ny = max(len(pull) for pull in pulls), pulls[0].shape[1]
-    lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
-    found, counts = np.zeros((ny, ny, lags + 1)), np.zeros(ny)
-    for pull in pulls:
-        counts += np.count_nonzero(pull, axis=0)
-        for start in range(0, len(pull), CHUNK):
-            now = np.ascontiguousarray(pull[start : start + CHUNK].T)
-            before = np.ascontiguousarray(pull[max(start - lags, 0) : start + CHUNK].T)
-            shift = before.shape[1] - now.shape[1]
-            size = next_fast_len(before.shape[1] + lags, real=True)
-            spectrum = rfft(before, size)
-            own = spectrum if shift == 0 else rfft(np.hstack([np.zeros((ny, shift)), now]), size)
-            for a in range(ny):
-                for b in range(ny):
-                    found[a, b] += irfft(own[a] * np.conj(spectrum[b]), size)[: lags + 1]
-    found /= np.sqrt(np.outer(np.maximum(counts, 1.0), np.maximum(counts, 1.0)))[:, :, None]
-    reach = _reach(found, float(np.max(counts)))
+    count = np.maximum(left.count, 1.0)
+    found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
+    reach = _reach(found, float(np.max(count)))
     x = np.arange(reach + 1) / max(reach, 1)
     parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
     return (found[:, :, : reach + 1] * parzen).transpose(2, 0, 1)
@@ -258,20 +347,6 @@ def _coloured_part(
 def _real_sum(x: Any, y: Any) -> float:
     """Return the real part of sum conj(x) y."""
     return float(np.sum(x.real * y.real) + np.sum(x.imag * y.imag))
-
-
-def ljung_box(r: Float[np.ndarray, " n"], lags: int = 20) -> float:
-    """Return the p-value of the Ljung-Box test that r is white (Biometrika 65, 1978)."""
-    from scipy.special import gammaincc  # deferred: scipy.stats takes a second
-
-    n = r.size
-    lags = min(lags, n // 5)
-    centred = r - r.mean()
-    if lags < 1 or not np.any(centred):
-        return 1.0
-    rho = np.array([np.sum(centred[k:] * centred[:-k]) for k in range(1, lags + 1)]) / np.sum(centred**2)
-    statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    return float(gammaincc(lags / 2, statistic / 2))
 
 
 def inverse(hessian: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:

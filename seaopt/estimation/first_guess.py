@@ -46,20 +46,21 @@ def first_guess(
     unknowns: Unknowns,
     band_hz: tuple[float, float] | None,
     rng: np.random.Generator,
-) -> list[Float[np.ndarray, " n"]]:
-    """Return unknowns with shared parameters that match the frequency responses, the best first.
+) -> tuple[list[Float[np.ndarray, " n"]], bool]:
+    """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
 
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
     """
     targets = [target for e in range(len(experiments)) for target in _targets(experiments[e], unknowns, e, band_hz)]
     if not targets:
-        return []
+        return [], False
     start = unknowns.start[: unknowns.shared]
     low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
     prior = unknowns.prior_std[: unknowns.shared]
     spread = np.isinf(prior) & (start != 0.0)
     found = [_refine(targets, start, low, high, spread)]
-    if found[0][0] > 0.5 * EXPLAINED**2 * 2 * sum(target.s.size for target in targets):
+    enough = 0.5 * EXPLAINED**2 * 2 * sum(target.s.size for target in targets)
+    if found[0][0] > enough:
         candidates = [
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
             for _ in range(CANDIDATES)
@@ -67,11 +68,12 @@ def first_guess(
         ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
         found += [_refine(targets, theta, low, high, spread) for theta in ranked[:REFINED]]
     guesses: list[Float[np.ndarray, " n"]] = []
-    for _, theta in sorted(found, key=_first):
+    ranked_guesses = sorted(found, key=_first)
+    for _, theta in ranked_guesses:
         guess = unknowns.start.copy()
         guess[: unknowns.shared] = theta
         guesses.append(guess)
-    return guesses
+    return guesses, ranked_guesses[0][0] <= enough
 
 
 def _first(pair: tuple[float, Any]) -> float:

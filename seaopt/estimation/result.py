@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import FileError
-from seaopt.estimation.covariance import Covariance, Errors
+from seaopt.estimation.covariance import Covariance, Errors, errors
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.identifiability import Identifiability
+from seaopt.estimation.residuals import Residuals
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.simulation import Clock, Point, make_model, run_passes
 
@@ -133,8 +134,8 @@ class Fit:
         All that was estimated, experiments' own included, sigmas not.
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
-    residuals : list of lists of Errors
-        Of each experiment and segment; empty when read from a file.
+    minimum : (Residuals, array), or None
+        The least-squares problem and its unknowns at the minimum; None when read from a file.
     experiments : tuple of Experiment
         The data; empty when read from a file.
 
@@ -158,13 +159,18 @@ class Fit:
     log_likelihood: float = math.nan
     unknowns: int = 0
     method: str = "output_error"
-    residuals: list[list[Errors]] = field(default_factory=list[list[Errors]], repr=False)
+    minimum: tuple[Residuals, Float[np.ndarray, " n"]] | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
 
     @property
     def ok(self) -> bool:
         """Whether the search converged and every free parameter can be told."""
         return self.status == "converged"
+
+    @property
+    def residuals(self) -> list[list[Errors]]:
+        """Residuals of each experiment and segment, made anew; empty when the fit was read from a file."""
+        return [] if self.minimum is None else errors(*self.minimum)
 
     @property
     def aic(self) -> float:
@@ -272,7 +278,7 @@ class Fit:
         lines += [f"  {name} = {item.value:.5g} ± {item.std:.2g} {item.unit}" for name, item in self.derived.items()]
         for name, own in self.nuisance.items():
             if len(own.initial_state) > 1:
-                lines.append(f"  {name}: gaps split the log into {len(own.initial_state)} segments")
+                lines.append(f"  {name}: {len(own.initial_state)} segments with initial states of their own")
         for name, row in self.outputs.items():
             for output, item in row.items():
                 held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"

@@ -115,14 +115,15 @@ def best_start(
     problem: Residuals, method: Method, band_hz: tuple[float, float] | None
 ) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses."""
-    given = problem.evaluate(problem.unknowns.start)
     if not method.search:
-        return given, []
-    guesses = first_guess(problem.experiments, problem.unknowns, band_hz, np.random.default_rng(method.seed))
-    if not guesses:
-        return given, []
-    guessed = problem.evaluate(guesses[0])
-    return (guessed if guessed.cost <= given.cost else given), guesses
+        return problem.evaluate(problem.unknowns.start), []
+    rng = np.random.default_rng(method.seed)
+    guesses, matched = first_guess(problem.experiments, problem.unknowns, band_hz, rng)
+    guessed = problem.evaluate(guesses[0]) if guesses else None
+    if guessed is not None and matched and not explains_little(problem, guessed):
+        return guessed, guesses
+    given = problem.evaluate(problem.unknowns.start)
+    return (given if guessed is None or guessed.cost > given.cost else guessed), guesses
 
 
 def _doubtful(found: Solved, guessed: list[Float[np.ndarray, " n"]]) -> bool:

@@ -13,12 +13,11 @@ from jaxtyping import Float
 from seaopt.errors import EstimationError
 from seaopt.estimation.covariance import (
     Covariance,
-    Errors,
+    Leftover,
     coloured,
     counted,
-    errors,
     inverse,
-    ljung_box,
+    leftover,
     robust_bread,
     with_infinities,
 )
@@ -42,7 +41,7 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
     found = solution.evaluation
     if not np.isfinite(found.cost):
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
-    left = errors(problem, z) if diagnostics else None
+    left = [leftover(problem, e, z) for e in range(len(problem.experiments))] if diagnostics else None
     white, robust = _covariances(problem, found, left)
     names = unknowns.names[:p]
     seen = identifiability(found.hessian, names, z[:p])
@@ -75,7 +74,7 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         log_likelihood=_log_likelihood(problem, found),
         unknowns=z.size,
         method=_method_name(method),
-        residuals=left or [],
+        minimum=(problem, z),
         experiments=problem.experiments,
     )
 
@@ -87,13 +86,13 @@ def _method_name(method: Method) -> str:
 
 
 def _covariances(
-    problem: Residuals, found: Evaluation, left: list[list[Errors]] | None
+    problem: Residuals, found: Evaluation, left: list[Leftover] | None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
     p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-2.0
     bread = found.hessian
     if left is not None and not isinstance(problem.loss, Linear):
-        bread = robust_bread(problem, found.z, left) + np.diag(prior)
+        bread = robust_bread(problem, found.z) + np.diag(prior)
     back, unseen = inverse(bread)
     white = with_infinities(back[:p, :p], unseen[:p])
     if left is None:
@@ -189,47 +188,28 @@ def _derived(experiments: tuple[Experiment, ...], fitted: ParameterSet, covarian
     return out
 
 
-def _outputs(
-    problem: Residuals, z: Float[np.ndarray, " n"], left: list[list[Errors]]
-) -> dict[str, dict[str, OutputFit]]:
+def _outputs(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover]) -> dict[str, dict[str, OutputFit]]:
     """Return how well each output is explained, on the samples used and on those held out."""
-    free = left if problem.observers is None else errors(replace(problem, observers=None), z)
+    simulated = left
+    if problem.observers is not None:
+        plain = replace(problem, observers=None)
+        simulated = [leftover(plain, e, z) for e in range(len(problem.experiments))]
     found: dict[str, dict[str, OutputFit]] = {}
     for e, experiment in enumerate(problem.experiments):
-        pieces = problem.segments[e]
-        measured = [np.concatenate(channels) for channels in zip(*(piece.y for piece in pieces), strict=True)]
-        used = np.concatenate([counted(piece, 0) for piece in pieces])
-        # A segment that lies wholly in the part held out has no initial state: it says nothing of the model.
-        started = np.concatenate([np.full(piece.n, not piece.keep or bool(np.any(piece.keep[0]))) for piece in pieces])
-        raw = np.concatenate([error.raw for error in free[e]])
-        predicted = np.concatenate([error.raw for error in left[e]])
         found[experiment.name] = {}
         for o, name in enumerate(experiment.outputs):
-            kept = used[:, o]
-            rest = ~kept & started & np.isfinite(measured[o])
+            used, rest = simulated[e].used[o], simulated[e].rest[o]
             found[experiment.name][name] = OutputFit(
-                fit_percent=_fit_percent(measured[o][kept], raw[kept, o]),
-                holdout_fit_percent=_fit_percent(measured[o][rest], raw[rest, o]) if np.any(rest) else None,
+                fit_percent=used.fit_percent if used.fit_percent is not None else np.nan,
+                holdout_fit_percent=rest.fit_percent,
                 band_fit_percent=_band_fit_percent(problem, e, o, z),
-                one_step_fit_percent=(
-                    None if problem.observers is None else _fit_percent(measured[o][kept], predicted[kept, o])
-                ),
-                rms_residual=float(np.sqrt(np.mean(raw[kept, o] ** 2))),
+                one_step_fit_percent=None if problem.observers is None else left[e].used[o].fit_percent,
+                rms_residual=float(np.sqrt(used.power / max(used.count, 1))),
                 sigma=float(problem.sigma[e][o]),
                 unit=experiment.plant.outputs[name],
-                whiteness_p=_whiteness(left[e], o),
+                whiteness_p=left[e].whiteness(o),
             )
     return found
-
-
-def _whiteness(row: list[Errors], o: int) -> float:
-    """Return the smallest p-value of the segments' weighted residuals."""
-    found = [1.0]
-    for error in row:
-        used = error.weighted[:, o] != 0.0
-        if np.count_nonzero(used) >= 8:
-            found.append(ljung_box(error.weighted[used, o]))
-    return min(found)
 
 
 def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float | None:
@@ -249,8 +229,3 @@ def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, "
         residual += float(np.sum(columns[present, o, 0] ** 2))
         signal += float(np.sum((measured - np.mean(measured)) ** 2))
     return 100.0 * (1.0 - float(np.sqrt(residual / max(signal, 1e-300))))
-
-
-def _fit_percent(measured: Float[np.ndarray, " n"], residual: Float[np.ndarray, " n"]) -> float:
-    spread = float(np.sum((measured - np.mean(measured)) ** 2))
-    return 100.0 * (1.0 - float(np.sqrt(np.sum(residual**2) / max(spread, 1e-300))))

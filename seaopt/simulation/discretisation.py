@@ -18,7 +18,7 @@ from seaopt.errors import SimulationError
 from seaopt.simulation.model import Model
 
 Hold = Literal["zero", "first"]
-REACH, DEGREE = 0.5, 16  # 0.5^17 / 17! = 2e-20
+REACH, DEGREE = 0.125, 10  # 0.125^11 / 11! = 3e-18
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

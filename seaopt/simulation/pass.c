@@ -48,9 +48,14 @@ typedef struct {
     double filter[NY][MAX_SECTIONS][2][NCP];
 } state;
 
-/* All that a sample touches stands close together: stores and loads 4096 bytes apart would wait for each other. */
+#define BLOCK 16
+
+/* All that a sample touches stands close together. */
 typedef struct {
-    double z[NX][NJP], next[NX][NJP], y[NY][NJP], v[NY][NCP], sum[NY][NC][NCP];
+    double z[NX][NJP], next[NX][NJP], y[NY][NJP];
+    double v[NY][BLOCK][NCP], weight[NY][BLOCK]; /* samples that wait to be summed */
+    double sum[NY][NCP][NCP];
+    long waiting[NY];
     double filter[NY][MAX_SECTIONS][2][NCP];
 #if LINEAR
     double model[(NX + NY) * (NX + (NX + NI) * NJP)];
@@ -237,16 +242,40 @@ static inline double robust(const seaopt_pass_args *a, int o, double r, double *
     return knee / size;
 }
 
+/* Four rows of the Gram matrix by one or two vectors of columns, summed in registers over the waiting samples. */
+#define TILE(WIDE)                                                                                             \
+    do {                                                                                                       \
+        vec sum[4][WIDE];                                                                                      \
+        for (int r = 0; r < 4; r++)                                                                            \
+            for (int c = 0; c < WIDE; c++) sum[r][c] = ((vec *)q->sum[o][4 * row + r])[column + c];            \
+        for (long k = 0; k < count; k++) {                                                                     \
+            const vec *v = (const vec *)q->v[o][k];                                                            \
+            for (int r = 0; r < 4; r++)                                                                        \
+                for (int c = 0; c < WIDE; c++) sum[r][c] += (q->weight[o][k] * q->v[o][k][4 * row + r]) * v[column + c]; \
+        }                                                                                                      \
+        for (int r = 0; r < 4; r++)                                                                            \
+            for (int c = 0; c < WIDE; c++) ((vec *)q->sum[o][4 * row + r])[column + c] = sum[r][c];            \
+    } while (0)
+
+static void sum_waiting(hot *q, int o) {
+    const long count = q->waiting[o];
+    for (int row = 0; row < NCP / 4; row++) {
+        int column = row;
+        for (; column + 1 < NCP / 4; column += 2) TILE(2);
+        if (column < NCP / 4) TILE(1);
+    }
+    q->waiting[o] = 0;
+}
+
+/* The sample in v waits for its block to fill. */
 static inline void accumulate(const seaopt_pass_args *a, hot *q, int o) {
-    const double *v = q->v[o];
-    double rho, weight = robust(a, o, v[0], &rho);
+    const long k = q->waiting[o];
+    double rho;
+    q->weight[o][k] = robust(a, o, q->v[o][k][0], &rho);
     q->rho[o] += rho;
     q->count[o] += 1.0;
-    for (int r = 0; r < NC; r++) {
-        const double wr = weight * v[r];
-        vec *sum = (vec *)q->sum[o][r];
-        for (int c = r / 4; c < NCP / 4; c++) sum[c] += wr * ((const vec *)v)[c];
-    }
+    q->waiting[o] = k + 1;
+    if (k + 1 == BLOCK) sum_waiting(q, o);
 }
 
 /* Denormal numbers, into which sensitivities to the initial state decay, cost a hundredfold: take them as zero. */
@@ -293,7 +322,8 @@ static void begin(hot *q, const seaopt_pass_args *a) {
     for (int i = 0; i < NX; i++) { q->z[i][0] = a->x0[i]; q->z[i][1 + NP + i] = 1.0; }
 }
 
-static void deliver(const hot *q, const seaopt_pass_args *a) {
+static void deliver(hot *q, const seaopt_pass_args *a) {
+    for (int o = 0; o < NY; o++) sum_waiting(q, o);
     if (a->carry) {
         state *after = (state *)a->carry;
         memcpy(after->z, q->z, sizeof q->z);
@@ -319,11 +349,13 @@ static void one_pass(const seaopt_pass_args *a) {
             for (int i = 0; i < NX; i++) a->states[(k - a->from) * NX + i] = q->z[i][0];
         if (a->outputs)
             for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = q->y[o][0];
+        double *v[NY];
         for (int o = 0; a->y[0] && o < NY; o++) {
             const double measured = a->y[o][k];
+            v[o] = q->v[o][q->waiting[o]];
             present[o] = isfinite(measured) && !(a->keep[o] && !a->keep[o][k]);
-            if (present[o]) residual(a, o, q->y[o], measured, a->tau0 + k * a->dtau, q->v[o]);
-            else memset(q->v[o], 0, sizeof q->v[o]);
+            if (present[o]) residual(a, o, q->y[o], measured, a->tau0 + k * a->dtau, v[o]);
+            else memset(v[o], 0, NCP * sizeof(double));
         }
         advance(q, a, k);
 #if CORRECT
@@ -331,13 +363,13 @@ static void one_pass(const seaopt_pass_args *a) {
             if (present[o])
                 for (int i = 0; i < NX; i++) {
                     const double *g = a->correction + (i * NY + o) * NJP;
-                    for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * q->v[o][j] + g[j] * q->v[o][0];
-                    q->z[i][0] -= g[0] * q->v[o][0];
+                    for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];
+                    q->z[i][0] -= g[0] * v[o][0];
                 }
 #endif
         for (int o = 0; a->y[0] && o < NY; o++) {
-            if (a->sections) filtered(a, q->v[o], q->filter[o]);
-            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, q->v[o], NC * sizeof(double));
+            if (a->sections) filtered(a, v[o], q->filter[o]);
+            if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
             if (present[o] && k >= a->start + a->settle) accumulate(a, q, o);
         }
     }
