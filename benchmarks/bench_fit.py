@@ -146,7 +146,8 @@ def joint() -> None:
     steps = [own.substeps for own in fit.nuisance.values()]
     print(
         f"stand and swing with friction, 2 x 24,000 x 2, six parameters: {took:.2f} s "
-        f"({bare:.2f} s without diagnostics), {fit.iterations} iterations, {steps} steps a sample, step error {fit.step_error_parameter:.2g} std"
+        f"({bare:.2f} s without diagnostics), {fit.iterations} iterations, "
+        f"{steps} steps a sample, step error {fit.step_error_parameter:.2g} std"
     )
 
 

@@ -26,11 +26,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.residuals import Huber, Linear, Residuals
+from seaopt.estimation.residuals import CHUNK, Huber, Linear, Residuals
 from seaopt.simulation import Segment, stream
 
 RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
-CHUNK = 1 << 17
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 

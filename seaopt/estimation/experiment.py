@@ -174,16 +174,16 @@ class Experiment:
         """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""
         u = input_samples(self.plant, self.log)
         y = tuple(self.log[name] for name in self.outputs)
-        clock = self.log.time - self.log.time[0]
-        used = (clock <= (1.0 - holdout) * clock[-1]).astype(np.uint8) if holdout else None
-        step = 2.0 * self.log.period / clock[-1]
+        time, first, whole = self.log.time, float(self.log.time[0]), self.log.duration_s
+        used = (time <= first + (1.0 - holdout) * whole).astype(np.uint8) if holdout else None
+        step = 2.0 * self.log.period / whole
         return [
             Segment(
                 u=tuple(channel[piece] for channel in u),
                 y=tuple(channel[piece] for channel in y),
                 keep=() if used is None else (used[piece],) * len(y),
-                start_s=float(self.log.time[piece.start]),
-                drift_span=(2.0 * float(clock[piece.start] / clock[-1]) - 1.0, step),
+                start_s=float(time[piece.start]),
+                drift_span=(2.0 * (float(time[piece.start]) - first) / whole - 1.0, step),
             )
             for piece in self.pieces
         ]

@@ -12,7 +12,7 @@ from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.least_squares import Callback
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
-from seaopt.estimation.residuals import Linear, Loss, Residuals
+from seaopt.estimation.residuals import Linear, Loss, Residuals, spread_of
 from seaopt.estimation.result import Fit
 from seaopt.estimation.shooting import multiple_shooting
 from seaopt.estimation.solve import Solved, output_error, prediction_error
@@ -132,13 +132,15 @@ def _problem(
 ) -> Residuals:  # fmt: skip
     segments = tuple(tuple(experiment.segments(holdout)) for experiment in experiments)
     sigma: list[Float[np.ndarray, " ny"]] = []
+    spreads: list[Float[np.ndarray, " ny"]] = []
     for experiment in experiments:
-        spread = [float(np.nanstd(experiment.log[name])) for name in experiment.outputs]
+        spread = [spread_of(experiment.log[name]) for name in experiment.outputs]
+        spreads.append(np.array(spread))
         known = [experiment.sigma.get(name, s or 1.0) for name, s in zip(experiment.outputs, spread, strict=True)]
         sigma.append(np.array(known))
     problem = Residuals(
         experiments=experiments, segments=segments, unknowns=unknowns, sigma=tuple(sigma), loss=loss, band_hz=band_hz,
-        substeps=(1,) * len(experiments), holdout=holdout,
+        substeps=(1,) * len(experiments), holdout=holdout, spread=tuple(spreads),
     )  # fmt: skip
     for e, experiment in enumerate(experiments):
         settle = problem.weights(e).settle

@@ -30,7 +30,8 @@ from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, 
 if TYPE_CHECKING:
     from seaopt.estimation.observer import Observer
 
-ALONE = 50_000  # samples below which experiments are not worth a thread each
+CHUNK = 80_000  # samples
+ALONE = 8_000  # samples below which experiments are not worth a thread each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,6 +114,8 @@ class Residuals:
         One an experiment: the residual is then the error of the prediction one sample ahead.
     holdout : float
         Last fraction of each log that gets no weight.
+    spread : tuple of arrays, shape (ny,)
+        Standard deviation of each measured output.
 
     """
 
@@ -125,6 +128,7 @@ class Residuals:
     substeps: tuple[int, ...] = ()
     observers: tuple[Observer, ...] | None = None
     holdout: float = 0.0
+    spread: tuple[Float[np.ndarray, " ny"], ...] = ()
 
     def point(self, e: int, z: Float[np.ndarray, " n"]) -> Point:
         """Return where the passes of experiment e are made."""
@@ -242,6 +246,17 @@ class Residuals:
     def with_sigma(self, sigma: tuple[Float[np.ndarray, " ny"], ...]) -> Residuals:
         """Return the problem with other sigmas."""
         return replace(self, sigma=sigma)
+
+
+def spread_of(values: Float[np.ndarray, " n"]) -> float:
+    """Return the standard deviation of the samples that are there, in the memory of a chunk."""
+    first = float(values[np.argmax(np.isfinite(values))])
+    count, total, square = 0, 0.0, 0.0
+    for start in range(0, values.size, CHUNK):
+        part = values[start : start + CHUNK] - first
+        part = part[np.isfinite(part)] if not np.all(np.isfinite(part)) else part
+        count, total, square = count + part.size, total + float(np.sum(part)), square + float(np.sum(part**2))
+    return float(np.sqrt(max(square / count - (total / count) ** 2, 0.0)))
 
 
 def _solved(matrix: Float[np.ndarray, "m m"], vector: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:

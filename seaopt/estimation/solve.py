@@ -88,6 +88,7 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     if refined.substeps != problem.substeps:
         problem, here = refined, refined.evaluate(here.z)
     decrement = DECREMENT if problem.observers is None else NOISE_DECREMENT
+    error, checked = StepError(), (here.z, ())
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
             problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement, max_iterations=max_iterations,
@@ -99,7 +100,11 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
             return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
         sigma = estimated_sigma(problem, here)
         settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(sigma, problem.sigma, strict=True))
-        finer, error = _refined(problem.with_sigma(sigma), here.z, STEP_ERROR_SIGMA)
+        finer = problem.with_sigma(sigma)
+        moved = here.z - checked[0]
+        if not (settled and checked[1] == problem.substeps and moved @ here.hessian @ moved < 1.0):
+            finer, error = _refined(finer, here.z, STEP_ERROR_SIGMA)
+            checked = here.z, finer.substeps
         same = finer.substeps == problem.substeps and isinstance(problem.loss, Linear)
         if (settled and finer.substeps == problem.substeps) or attempt == MAX_ROUNDS - 1:
             if same:
@@ -138,8 +143,8 @@ def _doubtful(found: Solved, guessed: list[Float[np.ndarray, " n"]]) -> bool:
 def explains_little(problem: Residuals, evaluation: Evaluation) -> bool:
     """Tell whether the residual of some output is a large part of its spread."""
     for e, experiment in enumerate(problem.experiments):
-        for o, name in enumerate(experiment.outputs):
-            spread = float(np.nanstd(experiment.log[name]))
+        for o in range(len(experiment.outputs)):
+            spread = float(problem.spread[e][o])
             rms = float(np.sqrt(evaluation.squares[e][o] / max(evaluation.counts[e][o], 1.0)))
             if not rms <= UNEXPLAINED * spread:
                 return True
@@ -182,9 +187,9 @@ def with_observers(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: b
     """Return the problem whose residuals are errors of prediction; None where the filter finds no finite state."""
     observers: list[Observer] = []
     for e, experiment in enumerate(problem.experiments):
-        spread = [float(np.nanstd(experiment.log[name])) for name in experiment.outputs]
-        sensors = [noise_of(experiment.log[name], s) for name, s in zip(experiment.outputs, spread, strict=True)]
-        observer = _observer(problem, e, z, np.array(sensors), np.array(spread))
+        spread = problem.spread[e]
+        sensors = [noise_of(experiment.log[name], float(s)) for name, s in zip(experiment.outputs, spread, strict=True)]
+        observer = _observer(problem, e, z, np.array(sensors), spread)
         if observer is None:
             return None
         observers.append(replace(observer, follows=follows))
@@ -193,7 +198,8 @@ def with_observers(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: b
 
 def noise_of(y: Float[np.ndarray, " n"], spread: float) -> float:
     """Return the standard deviation of white noise on a smooth signal: the median third difference, over sqrt(20)."""
-    third = np.abs(np.diff(y[np.isfinite(y)], 3))
+    seen = y[:WATCHED]
+    third = np.abs(np.diff(seen[np.isfinite(seen)], 3))
     noise = 1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0
     return max(noise, EXACT * spread, 1e-300)
 
@@ -251,7 +257,7 @@ def estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.nda
             rms = float(np.sqrt(found.squares[e][o] / max(found.counts[e][o], 1.0)))
             if robust is not None:
                 rms = robust[e][o]
-            floor = 1e-9 * float(np.nanmax(np.abs(experiment.log[name])))
+            floor = 1e-9 * float(problem.spread[e][o])
             row.append(experiment.sigma.get(name, max(rms, floor, 1e-300)))
         out.append(np.array(row))
     return tuple(out)
@@ -279,10 +285,11 @@ def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> 
             continue
         while True:
             error = step_error(replace(problem, substeps=tuple(substeps)), e, z)
-            fine = error.output <= allowed and error.parameter <= STEP_ERROR_PARAMETER * allowed / STEP_ERROR_SIGMA
-            if fine or substeps[e] >= MAX_SUBSTEPS or not np.isfinite(error.output):
+            over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
+            if over <= 1.0 or substeps[e] >= MAX_SUBSTEPS or not np.isfinite(over):
                 break
-            substeps[e] *= 2
+            finer = substeps[e] * min(1.1 * over**0.25, 4.0)  # order four says how much finer
+            substeps[e] = min(max(int(np.ceil(finer)), substeps[e] + 1), MAX_SUBSTEPS)
         worst = StepError(output=max(worst.output, error.output), parameter=max(worst.parameter, error.parameter))
     return replace(problem, substeps=tuple(substeps)), worst
 
@@ -298,8 +305,7 @@ def step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> StepEr
     n, worst = z.size, 0.0
     gradient, hessian = np.zeros(n), np.diag(problem.unknowns.prior_std**-2.0)
     gain = problem.point(e, z).gain
-    spread = np.array([float(np.nanstd(problem.experiments[e].log[name])) for name in problem.experiments[e].outputs])
-    sigma = np.maximum(problem.sigma[e], EXACT * spread)
+    sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
     for s in range(len(problem.segments[e])):
         coarse, fine = problem.run(e, s, z, outputs=True), halved.run(e, s, z, outputs=True)
         assert coarse.outputs is not None and fine.outputs is not None
