@@ -15,6 +15,7 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -177,14 +178,18 @@ class Residuals:
         pieces = enumerate(self.segments[e])
         return tuple(run_passes(model, piece, point, self.start(e, s, z)[None], weights) for s, piece in pieces)
 
-    def passes(self, z: Float[np.ndarray, " n"]) -> tuple[tuple[Pass, ...], ...]:
-        """Run every pass; experiments in threads of their own where they are long enough."""
+    def map(self, call: Callable[[int], Any]) -> list[Any]:
+        """Call for every experiment; in threads of their own where they are long enough."""
         from seaopt.simulation.compiled import threads
 
         count = len(self.experiments)
         if count < 2 or sum(piece.n for row in self.segments for piece in row) < ALONE:
-            return tuple(self._passes_of(e, z) for e in range(count))
-        return tuple(threads().map(lambda e: self._passes_of(e, z), range(count)))
+            return [call(e) for e in range(count)]
+        return list(threads().map(call, range(count)))
+
+    def passes(self, z: Float[np.ndarray, " n"]) -> tuple[tuple[Pass, ...], ...]:
+        """Run every pass."""
+        return tuple(self.map(lambda e: self._passes_of(e, z)))
 
     def evaluate(self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if the plant overflows."""

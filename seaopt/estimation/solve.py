@@ -277,21 +277,25 @@ def _median_scales(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[
 
 def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> tuple[Residuals, StepError]:
     """Return the problem with integration steps whose error is below `allowed` sigma, and that error."""
-    substeps, worst = list(problem.substeps), StepError()
-    if all(model.linear for model in problem.unknowns.models):
-        return problem, worst
-    for e, model in enumerate(problem.unknowns.models):
-        if model.linear:
-            continue
-        while True:
-            error = step_error(replace(problem, substeps=tuple(substeps)), e, z)
-            over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
-            if over <= 1.0 or substeps[e] >= MAX_SUBSTEPS or not np.isfinite(over):
-                break
-            finer = substeps[e] * min(1.1 * over**0.25, 4.0)  # order four says how much finer
-            substeps[e] = min(max(int(np.ceil(finer)), substeps[e] + 1), MAX_SUBSTEPS)
-        worst = StepError(output=max(worst.output, error.output), parameter=max(worst.parameter, error.parameter))
-    return replace(problem, substeps=tuple(substeps)), worst
+    found = problem.map(lambda e: _refined_steps(problem, e, z, allowed))
+    worst = StepError(
+        output=max(error.output for _, error in found), parameter=max(error.parameter for _, error in found)
+    )
+    return replace(problem, substeps=tuple(substeps for substeps, _ in found)), worst
+
+
+def _refined_steps(problem: Residuals, e: int, z: Float[np.ndarray, " n"], allowed: float) -> tuple[int, StepError]:
+    """Return the steps a sample of one experiment, and their error."""
+    steps = problem.substeps[e]
+    while not problem.unknowns.models[e].linear:
+        substeps = tuple(steps if i == e else m for i, m in enumerate(problem.substeps))
+        error = step_error(replace(problem, substeps=substeps), e, z)
+        over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
+        if over <= 1.0 or steps >= MAX_SUBSTEPS or not np.isfinite(over):
+            return steps, error
+        finer = steps * min(1.1 * over**0.25, 4.0)  # order four says how much finer
+        steps = min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
+    return steps, StepError()
 
 
 @np.errstate(all="ignore")
