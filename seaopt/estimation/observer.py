@@ -81,15 +81,13 @@ class Observer:
                 block = transition(model, theta, clock)[0]
                 a[i], c[i] = block[:nx, :nx], block[nx:, :nx]
                 continue
-            f, h = self._mean_derivatives(model, theta)
-            limit = RATE_LIMIT / clock.period
-            f[np.diag_indices(nx)] = np.clip(np.diag(f), -limit, limit)
+            f, h = self._mean_derivatives(model, theta, clock.period)
             a[i], _ = expm_with_derivatives(f * clock.period, np.zeros((0, nx, nx)))
             c[i] = h
         return a, c
 
     def _mean_derivatives(
-        self, model: Model, theta: Float[np.ndarray, " np"]
+        self, model: Model, theta: Float[np.ndarray, " np"], period: float
     ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "ny nx"]]:
         key = f"mean derivatives {len(self.places)}"
         if key not in model.functions:
@@ -99,7 +97,12 @@ class Observer:
         m, nx = self.places.shape[0], model.nx
         p = np.repeat(model.parameters(theta)[:, None], m, axis=1)
         f, h = model.functions[key](0.0, self.places[:, :nx].T, self.places[:, nx:].T, p)
-        return np.array(f).reshape(nx, m, nx).mean(axis=1), np.array(h).reshape(model.ny, m, nx).mean(axis=1)
+        rates, limit = np.array(f).reshape(nx, m, nx), RATE_LIMIT / period
+        mean = rates.mean(axis=1)
+        own = np.clip(rates[np.arange(nx), :, np.arange(nx)], -limit, limit)
+        # What is to hold the plant to the log wherever it is must do so where it is damped least.
+        mean[np.diag_indices(nx)] = own.mean(axis=1) if self.follows else own.max(axis=1)
+        return mean, np.array(h).reshape(model.ny, m, nx).mean(axis=1)
 
 
 def kalman_gain(
