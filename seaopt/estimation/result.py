@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import FileError
+from seaopt.errors import EstimationError, FileError
 from seaopt.estimation.covariance import Covariance, Errors
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.identifiability import Identifiability
+from seaopt.estimation.residuals import Residuals
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.simulation import Clock, Point, make_model, run_passes
 
@@ -100,6 +101,14 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Minimum:
+    """The problem that was solved, with its sigma and steps, and the unknowns where its cost is least."""
+
+    problem: Residuals
+    z: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
     """What `fit` returns; ``print(fit)`` is a report.
 
@@ -137,6 +146,8 @@ class Fit:
         Of each experiment and segment; empty when read from a file.
     experiments : tuple of Experiment
         The data; empty when read from a file.
+    minimum : Minimum or None
+        The problem and its unknowns, from which refits start; None when read from a file.
 
     """
 
@@ -160,6 +171,7 @@ class Fit:
     method: str = "output_error"
     residuals: list[list[Errors]] = field(default_factory=list[list[Errors]], repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
+    minimum: Minimum | None = field(default=None, repr=False)
 
     @property
     def ok(self) -> bool:
@@ -179,6 +191,19 @@ class Fit:
     @property
     def _count(self) -> int:
         return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
+
+    def at_minimum(self, what: str) -> Minimum:
+        """Return the minimum, for `what` needs it.
+
+        Raises
+        ------
+        EstimationError
+            The fit was read from a file.
+
+        """
+        if self.minimum is None:
+            raise EstimationError(f"{what} needs the fit itself, and this one was read from a file; call fit again")
+        return self.minimum
 
     def predict(self, experiment: Experiment) -> Prediction:
         """Return measured and model outputs of one of the fit's experiments."""

@@ -27,7 +27,7 @@ from seaopt.estimation.identifiability import Identifiability, identifiability, 
 from seaopt.estimation.least_squares import Solution
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
-from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit
+from seaopt.estimation.result import Derived, Fit, Minimum, Nuisance, OutputFit
 from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError
 from seaopt.estimation.unknowns import Unknowns
 from seaopt.parameters import ParameterSet
@@ -77,6 +77,7 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         method=_method_name(method),
         residuals=left or [],
         experiments=problem.experiments,
+        minimum=Minimum(problem=problem, z=z),
     )
 
 
