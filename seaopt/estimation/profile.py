@@ -29,6 +29,7 @@ from seaopt.estimation.result import Fit, Minimum
 
 CLOSE = 2e-3  # of tau: near enough for an end of the interval to be interpolated
 MOST = 40  # refits an end
+FAR = 1e4  # std from the estimate: an end beyond is nowhere
 BETTER = 1e-3  # fall of the cost below the fit's that is no rounding
 BEYOND = 0.15  # of the interval, that the curve shows on either side
 
@@ -214,7 +215,7 @@ class _Curve:
         estimate = self.values[0]
         limit = float((self.problem.unknowns.high if target > 0.0 else self.problem.unknowns.low)[self.index])
         taus, values = [0.0], [estimate]
-        trial, outer = estimate + target * self.step, limit
+        trial, outer = estimate + target * self.step, None
         for _ in range(MOST):
             trial = min(trial, limit) if target > 0.0 else max(trial, limit)
             rise = self.rise(trial)
@@ -226,17 +227,20 @@ class _Curve:
                 return _reached(taus, values, target), True
             if abs(tau) < abs(target) and trial == limit:
                 return limit, False
-            outer = trial if abs(tau) > abs(target) and abs(trial - estimate) < abs(outer - estimate) else outer
+            if abs(tau) > abs(target):
+                outer = trial if outer is None else min(outer, trial, key=lambda v: abs(v - estimate))
+            elif abs(trial - estimate) > FAR * self.step:
+                break
             trial = self._trial(taus, values, target, outer)
-        return (float(np.copysign(np.inf, target)), False) if outer == limit else (trial, True)
+        return (float(np.copysign(np.inf, target)), False) if outer is None else (trial, True)
 
-    def _trial(self, taus: list[float], values: list[float], target: float, outer: float) -> float:
-        """Return the next value to try, between the innermost that is too low and `outer`, or at most thrice as far."""
-        inner = max((abs(v - values[0]) for t, v in zip(taus, values, strict=True) if abs(t) < abs(target)))
-        far = min(abs(outer - values[0]), max(3.0 * inner, 0.1 * self.step))
-        wanted = abs(_reached(taus, values, target) - values[0]) if len(taus) > 1 else 0.5 * (inner + far)
+    def _trial(self, taus: list[float], values: list[float], target: float, outer: float | None) -> float:
+        """Return the next value to try: inside what brackets the target, or at most three times as far as yet."""
+        inner = max(abs(v - values[0]) for t, v in zip(taus, values, strict=True) if abs(t) < abs(target))
+        far = max(3.0 * inner, 0.1 * self.step) if outer is None else abs(outer - values[0])
+        wanted = abs(_reached(taus, values, target) - values[0]) if len(taus) > 1 else 0.5 * far
         if not inner < wanted < far:
-            wanted = far if far < abs(outer - values[0]) or not np.isfinite(far) else 0.5 * (inner + far)
+            wanted = far if outer is None else 0.5 * (inner + far)
         return values[0] + float(np.sign(target)) * wanted
 
     def fill(self, low: float, high: float, points: int) -> None:
