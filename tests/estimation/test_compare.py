@@ -36,7 +36,7 @@ def fits_of(kind, log, thor, outputs=("F1", "F2"), free=("J", "b_r", "eta"), **o
 
 
 def test_swing_logs_of_the_unlumped_plant_prefer_it_decisively(thor):
-    """The lumped fit is searched for as widely as the other: it ends at a resonance of 17 Hz, and F2 stays unexplained."""
+    """The lumped fit is searched for as widely: it ends at a resonance of 17 Hz, and leaves F2 unexplained."""
     log = log_of(so.plants.moving_output, "unlumped", PAPER_SWING, thor)
     ranking = compare(fits_of(so.plants.moving_output, log, thor, holdout=0.25))
     assert ranking.preferred == "unlumped"
