@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from seaopt.estimation import OutputError as OutputError
     from seaopt.estimation import PredictionError as PredictionError
     from seaopt.estimation import SoftL1 as SoftL1
+    from seaopt.estimation import compare as compare
     from seaopt.estimation import fit as fit
     from seaopt.frequency import h1 as h1
     from seaopt.logs import Column as Column
@@ -64,6 +65,7 @@ _HOME = {
     "PredictionError": "seaopt.estimation",
     "Fit": "seaopt.estimation",
     "fit": "seaopt.estimation",
+    "compare": "seaopt.estimation",
     "ControllerSpec": "seaopt.control",
     "Controller": "seaopt.control",
     "tune": "seaopt.control",
@@ -78,7 +80,7 @@ _HOME = {
 __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "read_log", "write_log", "simulate", "Sensors",
     "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting", "PredictionError", "Fit",
-    "fit", "ControllerSpec", "Controller", "tune", "Certificate", "certify", "demo_path", "read_problem",
+    "fit", "compare", "ControllerSpec", "Controller", "tune", "Certificate", "certify", "demo_path", "read_problem",
     "write_report", "testing", "SeaoptError",
 ]  # fmt: skip
 

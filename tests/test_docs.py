@@ -47,6 +47,19 @@ def test_the_design_of_the_how_to_works():
     assert ratio["J"] > 2.5 and ratio["b_r"] > 2.0
 
 
+def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (DOCS / "diagnostics.md").read_text(encoding="utf-8")
+    space: dict = {}
+    exec(re.sub(r"(?m)^(print|so.write_report)\(.*", "", blocks("diagnostics.md", "python")[0]), space)
+    assert space["ranking"].preferred == "unlumped" and space["ranking"].decisive
+    assert space["diagnose"](space["fits"]["unlumped"]).ok
+    said = [space["ranking"].sentences[0], *space["diagnose"](space["fits"]["lumped"]).sentences[:2]]
+    shown = " ".join(page.replace(">", " ").split())
+    for sentence in said:  # the numbers may move in their last digits
+        assert sentence.split(":")[0] in shown
+
+
 def test_every_figure_of_the_docs_is_there():
     for page in DOCS.glob("*.md"):
         for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):

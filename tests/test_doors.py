@@ -14,6 +14,7 @@ bench = so.Experiment(plant=stand, log=log)
 tries = {
     "sigma": lambda: so.Experiment(plant=stand, log=log, sigma=2.0),
     "list": lambda: so.fit(bench, thor.free("J")),
+    "one fit": lambda: so.compare(so.fit([bench], thor.free("J"), method=so.OutputError(search=False))),
     "text bandwidth": lambda: so.ControllerSpec(bandwidth_hz="30"),
     "float delay": lambda: so.ControllerSpec(delay_samples=1.0),
     "robust_to": lambda: so.tune(stand, thor, so.ControllerSpec(), ["swing"]),
@@ -35,6 +36,7 @@ def test_wrong_types_are_seaopt_errors():
     words = {
         "sigma": "sigma = 2.0",
         "list": "list of experiments",
+        "one fit": "put them in brackets",
         "text bandwidth": "bandwidth_hz = '30'",
         "float delay": "delay_samples = 1.0",
         "robust_to": "robust_to is a list",

@@ -1,5 +1,7 @@
 """Least squares on the time-domain logs: parameters, their uncertainty, what the data cannot tell, what to measure."""
 
+from seaopt.estimation.bootstrap import Bootstrap, bootstrap
+from seaopt.estimation.compare import Ranking, compare
 from seaopt.estimation.covariance import Covariance
 from seaopt.estimation.design import (
     Chirps,
@@ -10,15 +12,18 @@ from seaopt.estimation.design import (
     design_experiment,
     expected_covariance,
 )
+from seaopt.estimation.diagnostics import Diagnostics, diagnose
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.fit import fit
 from seaopt.estimation.identifiability import Identifiability
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
+from seaopt.estimation.profile import Profile, profile
 from seaopt.estimation.residuals import Huber, Linear, SoftL1
 from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit, Prediction
 
 __all__ = [
-    "Chirps", "Comparison", "Covariance", "Derived", "Design", "Experiment", "Fit", "Huber", "Identifiability",
-    "Limits", "Linear", "Method", "MultipleShooting", "Multisines", "Nuisance", "OutputError", "OutputFit",
-    "Prediction", "PredictionError", "SoftL1", "design_experiment", "expected_covariance", "fit",
+    "Bootstrap", "Chirps", "Comparison", "Covariance", "Derived", "Design", "Diagnostics", "Experiment", "Fit",
+    "Huber", "Identifiability", "Limits", "Linear", "Method", "MultipleShooting", "Multisines", "Nuisance",
+    "OutputError", "OutputFit", "Prediction", "PredictionError", "Profile", "Ranking", "SoftL1", "bootstrap",
+    "compare", "design_experiment", "diagnose", "expected_covariance", "fit", "profile",
 ]  # fmt: skip

@@ -177,7 +177,7 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
         started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
         origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
         for rows, raw, weighted, used in _leftovers(problem, e, s, z):
-            pull = np.ascontiguousarray(np.where(used, _pull(problem, weighted), 0.0).T)
+            pull = np.ascontiguousarray(np.where(used, pull_of(problem, weighted), 0.0).T)
             _correlate(correlation, pull, tail)
             tail = np.concatenate([tail, pull], axis=1)[:, -lags:] if lags else tail
             total += pull.sum(axis=1)
@@ -224,7 +224,7 @@ def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.nda
     bread = np.zeros((z.size, z.size))
     for e, pieces in enumerate(problem.segments):
         for s in range(len(pieces)):
-            for columns, used in _columns(problem, e, s, z):
+            for _, columns, used in column_chunks(problem, e, s, z):
                 for o, places in enumerate(problem.columns(e, s)):
                     chosen = np.flatnonzero(places >= 0)
                     j = columns[:, o, 1 + chosen] / problem.sigma[e][o]
@@ -241,22 +241,22 @@ def _curvature(problem: Residuals, r: Float[np.ndarray, " n"]) -> Float[np.ndarr
     return (1.0 + (r / problem.loss.threshold) ** 2) ** -1.5
 
 
-def _pull(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+def pull_of(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
     """Return the loss's derivative at each residual."""
     if isinstance(problem.loss, Huber):
         return np.clip(r, -problem.loss.threshold, problem.loss.threshold)
     return r if isinstance(problem.loss, Linear) else r / np.sqrt(1.0 + (r / problem.loss.threshold) ** 2)
 
 
-def _columns(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[Any, Any]]:
-    """Yield the columns of a chunk, and which samples count."""
+def column_chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[slice, Any, Any]]:
+    """Yield rows, their columns, and which samples count, chunk by chunk."""
     first, weights, piece = 0, problem.weights(e), problem.segments[e][s]
     arguments = problem.unknowns.models[e], piece, problem.point(e, z), problem.start(e, s, z)
     for part in stream(*arguments, weights, chunk=CHUNK, columns=True):
         assert part.columns is not None
         rows = slice(first, first + len(part.columns))
         first = rows.stop
-        yield part.columns, counted(piece, weights.settle, rows)
+        yield rows, part.columns, counted(piece, weights.settle, rows)
 
 
 def coloured(
@@ -271,7 +271,7 @@ def coloured(
             if piece.n < 8:
                 continue
             tail = np.zeros((ny, p, density.shape[0] - 1))
-            for columns, used in _columns(problem, e, s, z):
+            for _, columns, used in column_chunks(problem, e, s, z):
                 influence = np.empty((ny, p, len(columns)))
                 for o, places in enumerate(problem.columns(e, s)):
                     chosen = np.flatnonzero(places >= 0)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import FileError
+from seaopt.errors import EstimationError, FileError
 from seaopt.estimation.covariance import Covariance, Errors, errors
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.identifiability import Identifiability
@@ -101,6 +101,14 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Minimum:
+    """The problem that was solved, with its sigma and steps, and the unknowns where its cost is least."""
+
+    problem: Residuals
+    z: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
     """What `fit` returns; ``print(fit)`` is a report.
 
@@ -134,10 +142,10 @@ class Fit:
         All that was estimated, experiments' own included, sigmas not.
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
-    minimum : (Residuals, array), or None
-        The least-squares problem and its unknowns at the minimum; None when read from a file.
     experiments : tuple of Experiment
         The data; empty when read from a file.
+    minimum : Minimum or None
+        The problem and its unknowns, from which refits start; None when read from a file.
 
     """
 
@@ -159,8 +167,8 @@ class Fit:
     log_likelihood: float = math.nan
     unknowns: int = 0
     method: str = "output_error"
-    minimum: tuple[Residuals, Float[np.ndarray, " n"]] | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
+    minimum: Minimum | None = field(default=None, repr=False)
 
     @property
     def ok(self) -> bool:
@@ -170,7 +178,7 @@ class Fit:
     @property
     def residuals(self) -> list[list[Errors]]:
         """Residuals of each experiment and segment, made anew; empty when the fit was read from a file."""
-        return [] if self.minimum is None else errors(*self.minimum)
+        return [] if self.minimum is None else errors(self.minimum.problem, self.minimum.z)
 
     @property
     def aic(self) -> float:
@@ -185,6 +193,19 @@ class Fit:
     @property
     def _count(self) -> int:
         return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
+
+    def at_minimum(self, what: str) -> Minimum:
+        """Return the minimum, for `what` needs it.
+
+        Raises
+        ------
+        EstimationError
+            The fit was read from a file.
+
+        """
+        if self.minimum is None:
+            raise EstimationError(f"{what} needs the fit itself, and this one was read from a file; call fit again")
+        return self.minimum
 
     def predict(self, experiment: Experiment) -> Prediction:
         """Return measured and model outputs of one of the fit's experiments."""

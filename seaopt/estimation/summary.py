@@ -26,7 +26,7 @@ from seaopt.estimation.identifiability import Identifiability, identifiability, 
 from seaopt.estimation.least_squares import Solution
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
-from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit
+from seaopt.estimation.result import Derived, Fit, Minimum, Nuisance, OutputFit
 from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError
 from seaopt.estimation.unknowns import Unknowns
 from seaopt.parameters import ParameterSet
@@ -74,8 +74,8 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         log_likelihood=_log_likelihood(problem, found),
         unknowns=z.size,
         method=_method_name(method),
-        minimum=(problem, z),
         experiments=problem.experiments,
+        minimum=Minimum(problem=problem, z=z),
     )
 
 

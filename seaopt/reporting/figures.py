@@ -24,7 +24,8 @@ PLANT_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 WINDOW_S = 1.0
 
 
-def _figure(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
+def panels(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, Any]:
+    """Return a figure of the page's width and its axes, with the report's grid."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, height), layout="constrained")
@@ -39,7 +40,7 @@ def _figure(rows: int, columns: int, height: float, **options: Any) -> tuple[Fig
 def time_figure(prediction: Prediction, units: dict[str, str]) -> Figure:
     """Draw measured and model outputs over the second with the largest motion, and the residual of the whole log."""
     names = list(prediction.measured)
-    figure, axes = _figure(len(names), 2, 2.3 * len(names), sharex="col", width_ratios=(1, 1))
+    figure, axes = panels(len(names), 2, 2.3 * len(names), sharex="col", width_ratios=(1, 1))
     time = prediction.time - prediction.time[0]
     centre = _busiest(prediction.measured[names[0]], time)
     near = (time >= centre - WINDOW_S / 2) & (time <= centre + WINDOW_S / 2)
@@ -49,7 +50,7 @@ def time_figure(prediction: Prediction, units: dict[str, str]) -> Figure:
         left.plot(time[near], measured[near], color=MEASURED, linewidth=2.2, label="measured")
         left.plot(time[near], model[near], color=MODEL, linewidth=1.0, label="model")
         left.set_ylabel(f"{name} [{units[name]}]")
-        low, high, at = _envelope(measured - model, time)
+        low, high, at = envelope(measured - model, time)
         right.fill_between(at, low, high, color=MEASURED, linewidth=0.0)
         right.set_ylabel(f"residual [{units[name]}]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", frameon=False, ncols=2)
@@ -66,7 +67,8 @@ def _busiest(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"]) -> 
     return float(np.clip(centre, WINDOW_S / 2, max(time[-1] - WINDOW_S / 2, WINDOW_S / 2)))
 
 
-def _envelope(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], bins: int = 400) -> tuple[Any, Any, Any]:
+def envelope(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], bins: int = 400) -> tuple[Any, Any, Any]:
+    """Return the least and the largest value of each of `bins` stretches, and their times."""
     edges = np.linspace(0, values.size, min(bins, values.size) + 1).astype(int)[:-1]
     low = np.fmin.reduceat(values, edges)
     high = np.fmax.reduceat(values, edges)
@@ -81,7 +83,7 @@ def _bode(axes: Iterable[Axes], f: Any, response: Any, phase_deg: Any, style: di
 
 def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, ParameterSet]]) -> Figure:
     """Draw the open loop, the sensitivity and the tracking response on every plant."""
-    figure, axes = _figure(2, 2, 5.6, sharex=True)
+    figure, axes = panels(2, 2, 5.6, sharex=True)
     for (name, (plant, values)), colour in zip(plants.items(), PLANT_COLOURS * 9, strict=False):
         loop: Loop = controller.close(plant, values)
         grid = loop.grid()

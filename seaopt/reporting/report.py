@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML page of a fit, a controller and a certificate, and its figures as files."""
+"""The report: one self-contained HTML page of fits, a controller and a certificate, and its figures as files."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.errors import SeaoptError
-from seaopt.estimation import Fit
+from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
+from seaopt.estimation.forecasts import Percent
 from seaopt.files import write_bytes, write_text
 from seaopt.frequency import Survey
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.reporting.comparison import fit_surveys, sentence, survey_figure
 from seaopt.reporting.figures import all_figures
+from seaopt.reporting.residuals import ranking_figure, residual_figure
 from seaopt.robustness import Certificate
 
-Result = Fit | Controller | Certificate
+Result = Fit | Ranking | Controller | Certificate
 _CAPTIONS = {
     "time": "Measured and model outputs in the time domain",
     "response": "Frequency response: H1 estimate of the log, the fitted model and the second-order fit (16)",
+    "residual": "Residuals and their correlations; shaded: what one lag of a hundred exceeds by chance",
+    "ranking": "Residuals of the fits that are compared, octave by octave",
     "loop": "The closed loop on every plant",
 }
 
@@ -35,8 +39,9 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
 
     Parameters
     ----------
-    results : sequence of Fit, Controller, Certificate
-        At most one of each; sections of what is not there are left out.
+    results : sequence of Fit, Ranking, Controller, Certificate
+        At most one of each; sections of what is not there are left out. A fit that was not read from a file has a
+        section of diagnostics.
     path : path
         The page; figures go to the folder ``figures`` beside it.
     title : str
@@ -62,13 +67,16 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     'report.html'
 
     """
-    fit, controller, certificate = (_only(results, kind) for kind in (Fit, Controller, Certificate))
-    if fit is None and controller is None and certificate is None:
-        raise SeaoptError("write_report got no result; give a Fit, a Controller or a Certificate")
+    kinds = (Fit, Ranking, Controller, Certificate)
+    fit, ranking, controller, certificate = (_only(results, kind) for kind in kinds)
+    if all(item is None for item in (fit, ranking, controller, certificate)):
+        raise SeaoptError("write_report got no result; give a Fit, a Ranking, a Controller or a Certificate")
     if controller is None and certificate is not None:
         controller = certificate.controller
     surveys = fit_surveys(fit) if fit is not None else {}
+    diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None and fit.residuals else None
     figures = all_figures(fit, surveys, controller, _plants(controller, certificate))
+    figures |= _leftover_figures(fit, diagnostics, ranking)
     target = Path(path)
     drawn: list[dict[str, str]] = []
     for name, figure in figures.items():
@@ -84,7 +92,17 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
                 "note": _note(name, surveys, fit),
             }
         )
-    return write_text(target, _page(title, fit, controller, certificate, drawn))
+    return write_text(target, _page(title, fit, diagnostics, ranking, controller, certificate, drawn))
+
+
+def _leftover_figures(fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None) -> dict[str, Any]:
+    """Return the figures of residuals, by file name."""
+    found: dict[str, Any] = {}
+    if fit is not None and diagnostics is not None:
+        found |= {f"residual_{name}": residual_figure(fit, diagnostics, name) for name in diagnostics.outputs}
+    if ranking is not None:
+        found["ranking"] = ranking_figure(ranking)
+    return found
 
 
 def write_frequency_figure(
@@ -189,6 +207,11 @@ def _interval(value: tuple[float, float] | None) -> str:
     return f"{number(value[0], 6)} to {number(value[1], 6)}" if value and np.all(np.isfinite(value)) else "unknown"
 
 
+def _percent(value: Percent) -> str:
+    held = "" if value.held_out is None else f" ({number(value.held_out)})"
+    return number(value.used) + held
+
+
 def _swinging(certificate: Certificate | None) -> bool:
     """Tell whether some plant's -3 dB bandwidth says nothing: its tracking band does not start at 0 Hz."""
     plants = certificate.plants.values() if certificate is not None else ()
@@ -212,20 +235,23 @@ def _band(value: tuple[float, float] | None) -> str:
 
 
 def _page(
-    title: str, fit: Fit | None, controller: Controller | None, certificate: Certificate | None, figures: Any
-) -> str:
+    title: str, fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None,
+    controller: Controller | None, certificate: Certificate | None, figures: Any,
+) -> str:  # fmt: skip
     from jinja2 import Environment
 
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["number"] = number
     environment.filters["band"] = _band
     environment.filters["interval"] = _interval
+    environment.filters["percent"] = _percent
     template = environment.from_string(
         files("seaopt.reporting").joinpath("report.html.jinja").read_text(encoding="utf-8")
     )
     return template.render(
-        title=title, fit=fit, controller=controller, certificate=certificate, figures=figures,
-        verdict=verdict(fit, controller, certificate), swinging=_swinging(certificate), forces=_forces(controller),
+        title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller, certificate=certificate,
+        figures=figures, verdict=verdict(fit, controller, certificate), swinging=_swinging(certificate),
+        forces=_forces(controller),
     )  # fmt: skip
 
 

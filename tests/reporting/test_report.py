@@ -42,3 +42,29 @@ def test_a_log_with_gaps_and_missing_samples_is_drawn(stand, short_log, thor, tm
     fit = so.fit([so.Experiment(plant=stand, log=log, name="gappy")], thor.free("J"))
     so.write_report([fit], tmp_path / "r.html")
     assert (tmp_path / "figures" / "time_gappy.png").stat().st_size > 5000
+
+
+def test_a_fit_has_diagnostics_and_a_ranking_says_why(stand, short_log, thor, tmp_path):
+    fits = {
+        drive: so.fit(
+            [so.Experiment(plant=so.plants.high_impedance(drive=drive), log=short_log, name="chirp", outputs=("F2",))],
+            thor.free("J", "b_r"), holdout=0.2,
+        )
+        for drive in ("unlumped", "lumped")
+    }  # fmt: skip
+    ranking = so.compare(fits)
+    page = so.write_report([fits["lumped"], ranking], tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "chirp.F2: the residual follows I" in page
+    assert "unlumped is preferred, with very strong evidence against lumped" in page
+    for name in ("residual_chirp", "ranking"):
+        assert (tmp_path / "figures" / f"{name}.svg").exists()
+    alone = so.write_report([ranking], tmp_path / "alone.html").read_text(encoding="utf-8")
+    assert "Which model" in alone and "Parameters" not in alone
+
+
+def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path):
+    """They need residuals and the problem, which fit.json does not hold."""
+    bench = so.Experiment(plant=stand, log=short_log, name="chirp", outputs=("F1",))
+    read = so.Fit.from_dict(so.fit([bench], thor.free("J")).to_dict(), (bench,))
+    page = so.write_report([read], tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Measured against model" in page and "Diagnostics" not in page

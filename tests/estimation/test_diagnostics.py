@@ -1,0 +1,180 @@
+"""Diagnostics against closed forms, and against logs whose fault is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import seaopt as so
+from seaopt.bench import PAPER_STAND, PAPER_SWING
+from seaopt.errors import EstimationError
+from seaopt.estimation import diagnose
+from seaopt.estimation.correlation import autocorrelation, cross_correlation
+from seaopt.files import to_json
+
+FREE = ("J", "b_r", "eta")
+NOISE = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
+
+
+def fitted(plant, log, params, **options):
+    bench = so.Experiment(plant=plant, log=log, name="stand", outputs=("F1", "F2"))
+    return so.fit([bench], params.free(*FREE), **options)
+
+
+def shifted(log, samples):
+    """Return the log with its outputs late by so many samples (early if negative)."""
+    n, k = len(log), abs(samples)
+    u, y = (slice(k, n), slice(0, n - k)) if samples > 0 else (slice(0, n - k), slice(k, n))
+    return so.Log.from_arrays(time=log.time[: n - k], I=log["I"][u], F1=log["F1"][y], F2=log["F2"][y])
+
+
+@pytest.fixture(scope="module")
+def log(stand, thor):
+    return so.virtual_log(stand, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3, sensors=NOISE)
+
+
+def ar1(a, n, rng):
+    return lfilter([1.0], [1.0, -a], rng.normal(size=n + 300))[300:]
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.0, 0.0), (0.9, 0.0), (0.9, 0.8), (0.8, -0.6)])
+def test_the_bound_is_that_of_two_independent_ar1_series(a, b):
+    """Sum R_e(k) R_u(k) over R_e(0) R_u(0) is (1 + ab)/(1 - ab): Ljung (16.60), Bartlett's formula."""
+    rng, n = np.random.default_rng(5), 20_000
+    found = cross_correlation([ar1(a, n, rng)], [ar1(b, n, rng)])
+    assert found.bound * np.sqrt(n) / 2.5758293 == pytest.approx(np.sqrt((1 + a * b) / (1 - a * b)), rel=0.05)
+
+
+def test_chance_is_outside_the_bound_as_often_as_it_says():
+    """1 % of the lags; 1 % or less of the series by Bonferroni's p. A standard error is 0.14 and 0.5 %."""
+    rng, outside, small = np.random.default_rng(7), 0.0, 0
+    for _ in range(400):
+        found = cross_correlation([ar1(0.7, 1000, rng)], [ar1(0.7, 1000, rng)])
+        outside += np.mean(np.abs(found.values) > found.bound) / 400
+        small += found.p < 0.01
+    assert 0.005 < outside < 0.018
+    assert small <= 12
+
+
+def test_correlations_are_numpys():
+    rng = np.random.default_rng(1)
+    e, u = rng.normal(size=300), rng.normal(size=300)
+    centred, moved = e - e.mean(), u - u.mean()
+    found = cross_correlation([e], [u], lags=4)
+    whole = np.correlate(centred, moved, "full")[295:304] / (300 * e.std() * u.std())
+    np.testing.assert_allclose(found.values, whole, rtol=1e-10)
+    full = np.correlate(centred, centred, "full")[299:310]
+    np.testing.assert_allclose(autocorrelation(e, 10), full / full[0], rtol=1e-10)
+
+
+def test_nothing_is_wrong_with_the_right_model(stand, thor, log):
+    fit = fitted(stand, log, thor, holdout=0.2)
+    found = diagnose(fit)
+    assert found.ok, found.sentences
+    assert (found.aic, found.bic) == (fit.aic, fit.bic)
+    for name, item in found.outputs["stand"].items():
+        assert item.free_run.used == pytest.approx(fit.outputs["stand"][name].fit_percent)
+        assert item.free_run.held_out == pytest.approx(fit.outputs["stand"][name].holdout_fit_percent)
+        assert item.one_step.used == pytest.approx(item.free_run.used, abs=0.05)  # no process noise: nothing to gain
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_a_delay_is_found_with_its_size(stand, thor, log, samples):
+    found = diagnose(fitted(stand, shifted(log, samples), thor))
+    said = found.sentences[0]
+    assert "stand.F1: the residual follows I" in said
+    assert float(said.split("with a delay of ")[1].split(" ms")[0]) == pytest.approx(2.5 * samples, rel=0.01)
+    assert found.outputs["stand"]["F1"].inputs["I"].worst_lag > 0
+
+
+def test_an_input_that_is_stamped_late_is_no_delay(stand, thor, log):
+    said = diagnose(fitted(stand, shifted(log, -1), thor)).sentences[0]
+    assert "or an input that is stamped late" in said
+    assert "with a delay" not in said
+
+
+def test_a_missing_mode_is_found_with_its_frequency(thor):
+    """The screw mode of the defaults lies at 80 Hz (paper, Sec. IV-A); the bare model lacks it."""
+    true = so.plants.high_impedance(parts=("screw_mode",))
+    log = so.virtual_log(true, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3, sensors=NOISE)
+    (said,) = [s for s in diagnose(fitted(so.plants.high_impedance(), log, thor)).sentences if s.startswith("stand.F2")]
+    assert "a missing pole" in said
+    assert 70 < float(said.split("below ")[1].split(" Hz")[0]) < 90
+
+
+def test_a_disturbance_is_told_from_what_follows_the_input(stand, thor, log):
+    """Slow noise on the force, independent of the current: coloured, predictable, and followed by nothing."""
+    slow = 60.0 * np.sqrt(1 - 0.99**2) * ar1(0.99, len(log), np.random.default_rng(2))
+    moved = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + slow, F2=log["F2"] + slow)
+    found = diagnose(fitted(stand, moved, thor))
+    assert found.outputs["stand"]["F1"].inputs["I"].p > 0.01
+    assert "coloured" in found.sentences[0] or "PredictionError" in found.sentences[0]
+    item = found.outputs["stand"]["F1"]
+    assert item.one_step.used > item.free_run.used + 3
+
+
+def test_one_step_is_that_of_the_fit_where_it_predicts(stand, thor, log):
+    fit = fitted(stand, log, thor, method=so.PredictionError())
+    item = diagnose(fit).outputs["stand"]["F1"]
+    assert item.one_step.used == pytest.approx(fit.outputs["stand"]["F1"].one_step_fit_percent)
+
+
+def test_shares_are_those_of_independent_averages():
+    """y = a u + e, u^2 = 1: sigma 1 and 2, 20 and 60 samples, a prior of 0.5 have the information 20, 15 and 4."""
+    plant = so.Plant(
+        name="gain", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-"}, parameters={"a": "-"},
+        f=lambda t, x, u, p: {"z": u.u - x.z}, h=lambda t, x, u, p: {"y": p.a * u.u + 0 * x.z},
+    )  # fmt: skip
+    rng, benches = np.random.default_rng(0), []
+    for name, n, sigma in (("one", 20, 1.0), ("two", 60, 2.0)):
+        u = rng.choice([-1.0, 1.0], size=n)
+        log = so.Log.from_arrays(time=np.arange(float(n)), u=u, y=3 * u + sigma * rng.normal(size=n))
+        benches.append(
+            so.Experiment(plant=plant, log=log, name=name, sigma={"y": sigma}, initial_state="rest", offset=False)
+        )
+    prior = so.Parameter(name="a", value=3.0, unit="-", free=True, prior_std=0.5)
+    found = diagnose(so.fit(benches, so.ParameterSet([prior]))).leverage
+    whole = 20 + 15 + 4
+    for name, part in (("one", 20), ("two", 15), ("priors", 4)):
+        assert found[name].parameters["a"] == pytest.approx(part / whole, rel=1e-6)
+        assert found[name].whole == pytest.approx(part / whole, rel=1e-6)
+
+
+def test_shares_add_up_to_one(stand, swing, thor, log):
+    other = so.virtual_log(swing, thor, PAPER_SWING, duration_s=10, rate_hz=400, seed=5, sensors=NOISE)
+    benches = [
+        so.Experiment(plant=stand, log=log, name="stand", outputs=("F1", "F2")),
+        so.Experiment(plant=swing, log=other, name="swing", outputs=("F1", "F2")),
+    ]
+    found = diagnose(so.fit(benches, thor.free("J", "b_r", "I_p"), method=so.OutputError(search=False))).leverage
+    for name in ("J", "b_r", "I_p"):
+        assert sum(item.parameters[name] for item in found.values()) == pytest.approx(1.0)
+    assert all(0.0 <= share <= 1.0 for item in found.values() for share in item.parameters.values())
+
+
+def test_a_bound_and_a_changed_plant_are_told(stand, thor, log):
+    held = thor.update(eta=0.5).bound(eta=(0.0, 0.9)).free(*FREE)
+    bench = so.Experiment(plant=stand, log=log, name="stand", outputs=("F1", "F2"))
+    found = diagnose(so.fit([bench], held))
+    assert found.at_bound == ("eta",)
+    assert "eta lies on its bound" in found.sentences[0]
+    later = log["F1"].copy()
+    later[-len(later) // 5 :] *= 1.2
+    changed = so.Log.from_arrays(time=log.time, I=log["I"], F1=later, F2=log["F2"])
+    said = diagnose(fitted(stand, changed, thor, holdout=0.25)).sentences
+    assert any("stand.F1: held out the residual's rms" in sentence for sentence in said)
+    assert not any("stand.F2" in sentence for sentence in said)
+
+
+def test_it_can_be_written_and_read_by_people(stand, thor, log):
+    fit = fitted(stand, log, thor)
+    found = diagnose(fit)
+    assert json.loads(to_json(found.to_dict()))["outputs"]["stand"]["F1"]["inputs"]["I"]["outside"] in (True, False)
+    assert "nothing is seen to be wrong" in repr(found)
+    assert found._repr_html_().startswith("<pre>Diagnostics")
+    with pytest.raises(EstimationError, match="diagnose needs the fit itself"):
+        diagnose(replace(fit, minimum=None))
