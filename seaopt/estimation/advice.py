@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from seaopt.estimation.correlation import LAGS, CrossCorrelation
 from seaopt.estimation.covariance import Errors
-from seaopt.estimation.forecasts import Percent, used_and_held_out
+from seaopt.estimation.forecasts import Percent, in_band, used_and_held_out
 from seaopt.estimation.least_squares import minimise
 from seaopt.estimation.leverage import PRIORS, Leverage
 from seaopt.estimation.residuals import Residuals
@@ -55,7 +55,7 @@ class OutputDiagnostics:
 
 def sentences(
     fit: Fit, outputs: dict[str, dict[str, OutputDiagnostics]], leverage: dict[str, Leverage],
-    at_bound: tuple[str, ...], free: list[list[Errors]],
+    at_bound: tuple[str, ...], left: list[list[Errors]], free: list[list[Errors]],
 ) -> tuple[str, ...]:  # fmt: skip
     """Return what is wrong and what to do about it; nothing where nothing is seen."""
     problem = fit.at_minimum("diagnose").problem
@@ -65,7 +65,7 @@ def sentences(
         trial = _Later.of(fit, e) if any(_follows(item) for item in outputs[experiment.name].values()) else None
         for o, name in enumerate(experiment.outputs):
             item, label = outputs[experiment.name][name], f"{experiment.name}.{name}"
-            found = _about_inputs(problem, e, o, item, label, free, trial)
+            found = _about_inputs(problem, e, o, item, label, left, trial)
             told += found or _about_colour(item, label, problem.observers is not None)
             told += _about_held_out(problem, e, o, item, label, free)
     return (*told, *_about_leverage(leverage))
@@ -110,7 +110,7 @@ class _Later:
 
 
 def _about_inputs(
-    problem: Residuals, e: int, o: int, item: OutputDiagnostics, label: str, free: list[list[Errors]],
+    problem: Residuals, e: int, o: int, item: OutputDiagnostics, label: str, left: list[list[Errors]],
     trial: _Later | None,
 ) -> list[str]:  # fmt: skip
     """Say which input the residual follows and what that means."""
@@ -129,19 +129,18 @@ def _about_inputs(
         late = f" = {1e3 * lag * period:.3g} ms" if lag else ""
         told.append(
             f"{label}: the residual follows {name}, most around lag {lag}{late} {size}: "
-            f"{_remedy(problem, e, o, free, trial)}"
+            f"{_remedy(problem, e, o, left, trial)}"
         )
     return told
 
 
-def _remedy(problem: Residuals, e: int, o: int, free: list[list[Errors]], trial: _Later | None) -> str:
+def _remedy(problem: Residuals, e: int, o: int, left: list[list[Errors]], trial: _Later | None) -> str:
     """Say whether a delay would explain the residual; a missing pole or resonance otherwise."""
     if trial is not None and trial.left[o] < HALF:
         gone = 100.0 * (1.0 - float(trial.left[o]))
         return f"with a delay of {1e3 * trial.delay_s:.3g} ms {gone:.0f} % of its power is gone; free delay_s"
-    used, _ = used_and_held_out(problem, e, o)
-    raw = np.concatenate([error.raw[:, o] for error in free[e]])
-    frequency = _centre_hz(np.where(used & np.isfinite(raw), raw, 0.0), problem.experiments[e].log.period)
+    residual = np.concatenate([error.weighted[:, o] for error in left[e]])
+    frequency = _centre_hz(residual, problem.experiments[e].log.period)
     what = "a missing pole, or an input that is stamped late" if trial is not None and trial.early else "a missing pole"
     return f"{what}; half of its power is below {frequency:.3g} Hz: compare() it with a plant that has one more part"
 
@@ -176,8 +175,8 @@ def _about_held_out(
     """Say that held-out samples leave a larger residual than those used."""
     if item.free_run.held_out is None:
         return []
-    raw = np.concatenate([error.raw[:, o] for error in free[e]])
-    used, held = (float(np.sqrt(np.mean(raw[rows] ** 2))) for rows in used_and_held_out(problem, e, o))
+    residual = in_band(problem, e, [error.raw[:, o] for error in free[e]])
+    used, held = (float(np.sqrt(np.mean(residual[rows] ** 2))) for rows in used_and_held_out(problem, e, o))
     if held <= WORSE * used:
         return []
     unit = problem.experiments[e].plant.outputs[problem.experiments[e].outputs[o]]

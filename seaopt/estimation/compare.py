@@ -33,7 +33,7 @@ from jaxtyping import Float
 from seaopt.errors import EstimationError
 from seaopt.estimation.correlation import autocorrelation
 from seaopt.estimation.covariance import Errors, errors
-from seaopt.estimation.forecasts import Percent, fit_percent, free_run, used_and_held_out
+from seaopt.estimation.forecasts import Percent, fit_percent, free_run, in_band, used_and_held_out
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit
 
@@ -229,7 +229,7 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
         )
         for name in order
     )  # fmt: skip
-    bands = tuple(band for e, o in places for band in _bands(shared, e, o, {name: free[name] for name in order}))
+    bands = tuple(band for e, o in places for band in _bands({n: problems[n] for n in order}, e, o, weighted))
     evidence = _evidence(rows)
     return Ranking(
         rows=rows, preferred=None if evidence == "undecided" else order[0], evidence=evidence,
@@ -328,28 +328,32 @@ def _held_out(problem: Residuals, left: list[list[Errors]], best: list[list[Erro
             _, held = used_and_held_out(problem, e, o)
             if np.any(held):
                 rms = [
-                    float(np.sqrt(np.mean(np.concatenate([error.raw[:, o] for error in found[e]])[held] ** 2)))
-                    for found in (left, best)
+                    float(np.sqrt(np.mean(in_band(problem, e, _raw(found, e, o))[held] ** 2))) for found in (left, best)
                 ]
                 logs.append(float(np.log(max(rms[0], 1e-300) / max(rms[1], 1e-300))))
     return float(np.exp(np.mean(logs))) if logs else None
 
 
-def _bands(problem: Residuals, e: int, o: int, left: Mapping[str, list[list[Errors]]]) -> list[Band]:
-    """Return the power of every fit's residual of one output in octaves below the Nyquist frequency."""
+def _raw(left: list[list[Errors]], e: int, o: int) -> list[Float[np.ndarray, "..."]]:
+    return [error.raw[:, o] for error in left[e]]
+
+
+def _bands(problems: Mapping[str, Residuals], e: int, o: int, left: Mapping[str, list[list[Errors]]]) -> list[Band]:
+    """Return the power of what each likelihood sees of an output's residual, in octaves below the Nyquist frequency."""
+    problem = next(iter(problems.values()))
     experiment, period = problem.experiments[e], problem.experiments[e].log.period
-    used, _ = used_and_held_out(problem, e, o)
-    length = int(np.sum(used))
-    lowest = LINES / (length * period)
+    residuals = {
+        name: np.concatenate([error.weighted[:, o] for error in left[name][e]]) * own.sigma[e][o]
+        for name, own in problems.items()
+    }
+    counts = {name: max(int(np.count_nonzero(r)), 1) for name, r in residuals.items()}
+    lowest = LINES / (max(counts.values()) * period)
     edges = [0.5 / period]
     while len(edges) <= OCTAVES and edges[-1] / 2.0 > lowest:
         edges.append(edges[-1] / 2.0)
     edges[-1] = 0.0
     rows: list[Band] = []
-    spectra = {
-        name: _spectrum(np.concatenate([error.raw[:, o] for error in found[e]]), used, period)
-        for name, found in left.items()
-    }  # fmt: skip
+    spectra = {name: _spectrum(r, counts[name], period) for name, r in residuals.items()}
     for high, low in pairwise(edges):
         power = {
             name: float(np.sum(density[(f > low if low else f >= 0.0) & (f <= high)]))
@@ -364,13 +368,13 @@ def _bands(problem: Residuals, e: int, o: int, left: Mapping[str, list[list[Erro
     return rows[::-1]
 
 
-def _spectrum(r: Float[np.ndarray, " n"], used: Any, period: float) -> tuple[Any, Any]:
-    """Return frequencies, and the mean square of the samples used that each line carries (Parseval)."""
+def _spectrum(r: Float[np.ndarray, " n"], count: int, period: float) -> tuple[Any, Any]:
+    """Return frequencies, and the mean square of the samples that counted which each line carries (Parseval)."""
     from scipy.fft import rfft  # deferred: scipy is slow to load
 
-    line = np.abs(np.asarray(rfft(np.where(used & np.isfinite(r), r, 0.0)))) ** 2
+    line = np.abs(np.asarray(rfft(r))) ** 2
     line[1 : (r.size + 1) // 2] *= 2.0
-    return np.arange(line.size) / (r.size * period), line / (r.size * max(int(np.sum(used)), 1))
+    return np.arange(line.size) / (r.size * period), line / (r.size * count)
 
 
 def _evidence(rows: tuple[Ranked, ...]) -> str:

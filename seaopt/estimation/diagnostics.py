@@ -144,7 +144,7 @@ def diagnose(fit: Fit) -> Diagnostics:
     minimum = fit.at_minimum("diagnose")
     problem = minimum.problem
     left = fit.residuals or errors(problem, minimum.z)
-    free, ahead = free_run(fit), one_step(minimum, left)
+    free, ahead = free_run(fit), one_step(minimum)
     sums = [leftover(problem, e, minimum.z) for e in range(len(problem.experiments))]
     outputs = {
         experiment.name: {
@@ -156,7 +156,7 @@ def diagnose(fit: Fit) -> Diagnostics:
     shares, at_bound = leverage(minimum), _at_bound(minimum)
     return Diagnostics(
         outputs=outputs, leverage=shares, at_bound=at_bound, aic=fit.aic, bic=fit.bic,
-        sentences=sentences(fit, outputs, shares, at_bound, free),
+        sentences=sentences(fit, outputs, shares, at_bound, left, free),
     )  # fmt: skip
 
 

@@ -57,9 +57,9 @@ def identifiability(
     `values` are the unknowns' own, to which changes along an unseen direction are relative.
     """
     p = len(names)
-    reduced, own = _reduced(hessian, p), np.diag(hessian)[:p]
+    left, own = reduced(hessian, p), np.diag(hessian)[:p]
     size = np.sqrt(np.where(own > 0.0, own, 1.0))
-    eigenvalues, vectors = np.linalg.eigh(reduced / np.outer(size, size))
+    eigenvalues, vectors = np.linalg.eigh(left / np.outer(size, size))
     largest = max(float(eigenvalues[-1]), 1e-300)
     smallest = max(float(eigenvalues[0]), 0.0)
     relative = size * np.where(values != 0.0, np.abs(values), 1.0)
@@ -82,7 +82,7 @@ def identifiability(
     )
 
 
-def _reduced(hessian: Float[np.ndarray, "n n"], p: int) -> Float[np.ndarray, "p p"]:
+def reduced(hessian: Float[np.ndarray, "n n"], p: int) -> Float[np.ndarray, "p p"]:
     """Return the Schur complement of all but the first p unknowns."""
     if hessian.shape[0] == p:
         return hessian.copy()

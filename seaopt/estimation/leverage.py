@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.identifiability import _reduced as reduced
+from seaopt.estimation.identifiability import reduced
 from seaopt.estimation.result import Minimum
 
 PRIORS = "priors"

@@ -85,8 +85,8 @@ class Evaluation:
     cost: float
     gradient: Float[np.ndarray, " n"]
     hessian: Float[np.ndarray, "n n"]
-    squares: tuple[Float[np.ndarray, " ny"], ...]
-    counts: tuple[Float[np.ndarray, " ny"], ...]
+    squares: tuple[Float[np.ndarray, " _"], ...]
+    counts: tuple[Float[np.ndarray, " _"], ...]
     undamped: Bool[np.ndarray, " n"]
     origin: Float[np.ndarray, " n"]
     passes: tuple[tuple[Pass, ...], ...]
@@ -123,13 +123,13 @@ class Residuals:
     experiments: tuple[Experiment, ...]
     segments: tuple[tuple[Segment, ...], ...]
     unknowns: Unknowns
-    sigma: tuple[Float[np.ndarray, " ny"], ...]
+    sigma: tuple[Float[np.ndarray, " _"], ...]
     loss: Loss = Linear()
     band_hz: tuple[float, float] | None = None
     substeps: tuple[int, ...] = ()
     observers: tuple[Observer, ...] | None = None
     holdout: float = 0.0
-    spread: tuple[Float[np.ndarray, " ny"], ...] = ()
+    spread: tuple[Float[np.ndarray, " _"], ...] = ()
 
     def point(self, e: int, z: Float[np.ndarray, " n"]) -> Point:
         """Return where the passes of experiment e are made."""
@@ -236,7 +236,7 @@ class Residuals:
 
     def _sums(
         self, passes: tuple[tuple[Pass, ...], ...], moved: Float[np.ndarray, " n"]
-    ) -> tuple[tuple[Float[np.ndarray, " ny"], ...], tuple[Float[np.ndarray, " ny"], ...]]:
+    ) -> tuple[tuple[Float[np.ndarray, " _"], ...], tuple[Float[np.ndarray, " _"], ...]]:
         """Return each output's sum of squares after the linear unknowns have moved, and its count."""
         squares = tuple(np.zeros(len(sigma)) for sigma in self.sigma)
         counts = tuple(np.zeros(len(sigma)) for sigma in self.sigma)
@@ -248,7 +248,7 @@ class Residuals:
                     counts[e][o] += found.count[0, o]
         return squares, counts
 
-    def with_sigma(self, sigma: tuple[Float[np.ndarray, " ny"], ...]) -> Residuals:
+    def with_sigma(self, sigma: tuple[Float[np.ndarray, " _"], ...]) -> Residuals:
         """Return the problem with other sigmas."""
         return replace(self, sigma=sigma)
 

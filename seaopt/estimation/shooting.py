@@ -243,7 +243,7 @@ def multiple_shooting(
 
 def _joined(
     problem: Residuals, z: Float[np.ndarray, " n"], method: MultipleShooting, callback: Callback | None
-) -> tuple[Float[np.ndarray, " n"], tuple[tuple[Shots, ...], ...], tuple[Float[np.ndarray, " ny"], ...]]:
+) -> tuple[Float[np.ndarray, " n"], tuple[tuple[Shots, ...], ...], tuple[Float[np.ndarray, " _"], ...]]:
     """Return unknowns, shots and sigmas after the joints have closed, as far as they do."""
     shots = _first_shots(problem, z, method.segments)
     low, high = problem.unknowns.low, problem.unknowns.high
@@ -276,7 +276,7 @@ def _joined(
     return z, shots, problem.sigma
 
 
-def _explains(settled: Solved, sigma: tuple[Float[np.ndarray, " ny"], ...]) -> bool:
+def _explains(settled: Solved, sigma: tuple[Float[np.ndarray, " _"], ...]) -> bool:
     """Tell whether single shooting leaves no more than the joined shots do; where the plant runs away it does not."""
     if settled.problem.band_hz is not None or not isinstance(settled.problem.loss, Linear):
         return True  # the joined shots were neither filtered nor robust

@@ -247,7 +247,7 @@ def _first_size(problem: Residuals, e: int, point: Point, spread: Float[np.ndarr
     return 1.0 / np.where(np.isfinite(seen) & (seen > 0.0), seen, 1.0)
 
 
-def estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.ndarray, " ny"], ...]:
+def estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.ndarray, " _"], ...]:
     """Return the rms of each residual where sigma is not given; never less than rounding of the signal."""
     out: list[Float[np.ndarray, " ny"]] = []
     robust = None if isinstance(problem.loss, Linear) else _median_scales(problem, found.z)

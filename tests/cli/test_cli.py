@@ -170,7 +170,7 @@ def test_the_report_stands_alone(folder, done):
     for fetched in re.findall(r'(?:src|href)="([^"]+)"', page):
         assert fetched.startswith("#"), fetched
     assert "<script" not in page
-    assert page.count("<svg") == 5
+    assert page.count("<svg") == 7  # each of two experiments: time, response, residuals; the loop
     for words in ("Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band"):
         assert words in page
     ids = re.findall(r'\bid="([^"]+)"', page)

@@ -117,6 +117,14 @@ def test_a_disturbance_is_told_from_what_follows_the_input(stand, thor, log):
     assert item.one_step.used > item.free_run.used + 3
 
 
+@pytest.mark.parametrize("method", [so.OutputError(), so.PredictionError()])
+def test_held_out_samples_are_predicted_one_step_ahead_too(stand, thor, log, method):
+    slow = 60.0 * np.sqrt(1 - 0.99**2) * ar1(0.99, len(log), np.random.default_rng(2))
+    moved = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + slow, F2=log["F2"] + slow)
+    item = diagnose(fitted(stand, moved, thor, holdout=0.3, method=method)).outputs["stand"]["F1"]
+    assert 100 - item.one_step.held_out < 0.7 * (100 - item.free_run.held_out)
+
+
 def test_one_step_is_that_of_the_fit_where_it_predicts(stand, thor, log):
     fit = fitted(stand, log, thor, method=so.PredictionError())
     item = diagnose(fit).outputs["stand"]["F1"]
