@@ -20,7 +20,7 @@ Long sums are NumPy's own, not the linear-algebra library's, whose threads cost 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,16 +119,22 @@ def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.n
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Part:
-    """Sums over samples of one output: how many, power of model minus measured, and spread of the measured."""
+    """Sums over samples of one output: how many, power and mean of model minus measured, spread of the measured."""
 
     count: int
     power: float
     spread: float
+    bias: float = 0.0
 
     @property
     def fit_percent(self) -> float | None:
         """100 (1 - |y - yhat| / |y - mean(y)|); None of no samples."""
         return 100.0 * (1.0 - float(np.sqrt(self.power / max(self.spread, 1e-300)))) if self.count else None
+
+    def levelled(self, bias: float) -> Part:
+        """Return the sums with an offset taken out of model minus measured."""
+        power = self.power - self.count * bias * (2.0 * self.bias - bias)
+        return replace(self, power=max(power, 0.0), bias=self.bias - bias)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,7 +177,7 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
     pieces, ny = problem.segments[e], len(problem.sigma[e])
     lags = _lags(max(piece.n for piece in pieces))
     correlation, total, count = np.zeros((ny, ny, lags + 1)), np.zeros(ny), np.zeros(ny)
-    sums = np.zeros((2, ny, 4))  # used and rest: count, power, sum and sum of squares of the measured less its first
+    sums = np.zeros((2, ny, 5))  # used, rest: count, power, sum and squares of the measured less its first, sum of raw
     for s, piece in enumerate(pieces):
         tail = np.zeros((ny, 0))
         started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
@@ -188,17 +194,17 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
                 for k, chosen in enumerate((kept[:, o], ~kept[:, o] & np.isfinite(measured) & started)):
                     values = measured if np.all(chosen) else measured[chosen]
                     misses = raw[:, o] if np.all(chosen) else raw[chosen, o]
-                    sums[k, o] += values.size, np.sum(misses**2), np.sum(values), np.sum(values**2)
-    used, rest = (
-        tuple(
-            Part(count=int(n), power=power, spread=square - first**2 / max(n, 1.0)) for n, power, first, square in rows
-        )
-        for rows in sums.tolist()
-    )
+                    sums[k, o] += values.size, np.sum(misses**2), np.sum(values), np.sum(values**2), np.sum(misses)
+    used, rest = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
     return Leftover(
         correlation=correlation.transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
         rest=rest,
     )  # fmt: skip
+
+
+def _part(n: float, power: float, first: float, square: float, raw: float) -> Part:
+    count = max(n, 1.0)
+    return Part(count=int(n), power=power, spread=square - first**2 / count, bias=raw / count)
 
 
 def _lags(n: int) -> int:
@@ -267,9 +273,7 @@ def coloured(
     total = np.zeros((p, p))
     for e, (pieces, sums) in enumerate(zip(problem.segments, left, strict=True)):
         density, ny = correlations(sums), len(problem.sigma[e])
-        for s, piece in enumerate(pieces):
-            if piece.n < 8:
-                continue
+        for s in range(len(pieces)):
             tail = np.zeros((ny, p, density.shape[0] - 1))
             for _, columns, used in column_chunks(problem, e, s, z):
                 influence = np.empty((ny, p, len(columns)))

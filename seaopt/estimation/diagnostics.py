@@ -169,7 +169,7 @@ def _output(
     inputs: dict[str, CrossCorrelation] = {}
     for i, name in enumerate(problem.experiments[e].plant.inputs):
         found = cross_correlation(
-            [error.weighted[:, o] for error in left[e]], [piece.u[i] for piece in problem.segments[e]]
+            [error.weighted[:, o] for error in left[e]], [piece.inputs[i] for piece in problem.segments[e]]
         )
         if found is not None:
             inputs[name] = found

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Int
 
 from seaopt.errors import EstimationError, suggestion
 from seaopt.logs import Log
@@ -157,8 +158,10 @@ class Experiment:
                         f'experiment {self.name}: initial_state names "{name}", which is not a state of '
                         f"{self.plant.name}; {suggestion(name, self.plant.states)}"
                     )
-        if isinstance(self.shots, bool) or self.shots < 1:
+        if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
             raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
+        if self.gaps not in ("split", "error"):
+            raise EstimationError(f'experiment {self.name}: gaps = "{self.gaps}" is not known; use "split" or "error"')
         if self.gaps == "error" and len(self.log.segments) > 1:
             count = _counted(len(self.log.segments) - 1, "gap")
             raise EstimationError(
@@ -177,29 +180,33 @@ class Experiment:
         time, first, whole = self.log.time, float(self.log.time[0]), self.log.duration_s
         used = (time <= first + (1.0 - holdout) * whole).astype(np.uint8) if holdout else None
         step = 2.0 * self.log.period / whole
+        stretches = [whole for whole in self.log.segments for _ in self._cuts(whole)[1:]]
         return [
             Segment(
-                u=tuple(channel[piece] for channel in u),
+                u=tuple(channel[stretch.start : piece.stop] for channel in u),
                 y=tuple(channel[piece] for channel in y),
                 keep=() if used is None else (used[piece],) * len(y),
+                lead=piece.start - stretch.start,
                 start_s=float(time[piece.start]),
                 drift_span=(2.0 * (float(time[piece.start]) - first) / whole - 1.0, step),
             )
-            for piece in self.pieces
+            for piece, stretch in zip(self.pieces, stretches, strict=True)
         ]
 
     @property
     def pieces(self) -> list[slice]:
         """The stretches that are simulated each from a state of its own."""
-        if self.shots == 1:
-            return self.log.segments
-        return [
-            slice(int(a), int(b))
-            for whole in self.log.segments
-            for a, b in pairwise(np.linspace(whole.start, whole.stop, self.shots + 1).astype(int))
-            if b - a >= 2
-        ]
+        return [slice(a, b) for whole in self.log.segments for a, b in pairwise(self._cuts(whole))]
+
+    def _cuts(self, stretch: slice) -> list[int]:
+        """Return the rows at which a stretch is cut into shots, its ends included."""
+        return (stretch.start + shot_edges(stretch.stop - stretch.start, self.shots)).tolist()
 
     def renamed(self, name: str) -> Experiment:
         """Return the experiment under another name."""
         return replace(self, name=name)
+
+
+def shot_edges(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
+    """Return the first rows of shots of about equal length, and one past the last; no shot is under four samples."""
+    return np.linspace(0, n, max(1, min(shots, n // 4)) + 1).astype(int)

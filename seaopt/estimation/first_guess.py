@@ -109,7 +109,7 @@ def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[
                 input=list(experiment.plant.inputs).index(active[0]),
                 output=o,
                 s=s,
-                shift=np.exp(-s * delay),
+                shift=unknowns.locals_of[e].gain[o].value * np.exp(-s * delay),
                 log_response=np.log(estimate.response[chosen]),
                 weight=1.0 / np.maximum(estimate.relative_std[chosen], 0.02),
             )

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
+from seaopt.estimation.covariance import counted
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.least_squares import Callback
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
-from seaopt.estimation.residuals import Linear, Loss, Residuals, spread_of
+from seaopt.estimation.residuals import Huber, Linear, Loss, Residuals, SoftL1, spread_of
 from seaopt.estimation.result import Fit
 from seaopt.estimation.shooting import multiple_shooting
 from seaopt.estimation.solve import Solved, output_error, prediction_error
@@ -80,13 +82,30 @@ def fit(
     started = time.perf_counter()
     chosen = method if method is not None else OutputError()
     named = _named(experiments)
-    if not 0.0 <= holdout < 1.0:
+    if not 0.0 <= holdout <= 0.9:
         raise EstimationError(f"holdout = {holdout:g} is not a fraction; give 0 (none) to 0.9")
+    check_choices(chosen, loss, band_hz)
     complete = _complete(named, params)
-    unknowns = collect(named, complete, noise=isinstance(chosen, PredictionError))
+    unknowns = collect(named, complete, noise=isinstance(chosen, PredictionError), band_hz=band_hz)
     problem = _problem(named, unknowns, loss if loss is not None else Linear(), band_hz, holdout)
     solved = _solved(problem, complete, chosen, callback)
     return summarise(complete, solved, chosen, diagnostics, started)
+
+
+def check_choices(method: Any, loss: Any, band_hz: Any) -> None:
+    """Refuse what is no method, no loss or no band."""
+    if not isinstance(method, OutputError | MultipleShooting | PredictionError):
+        raise EstimationError(
+            f"method = {method!r} is no method; give OutputError(), MultipleShooting() or PredictionError()"
+        )
+    if loss is not None and not isinstance(loss, Linear | Huber | SoftL1):
+        raise EstimationError(f"loss = {loss!r} is no loss; give Linear(), Huber() or SoftL1()")
+    if band_hz is not None and (not isinstance(band_hz, tuple | list) or len(band_hz) != 2):
+        raise EstimationError(f"band_hz = {band_hz!r} is not a band; give (low, high) in Hz")
+    if band_hz is not None and isinstance(method, PredictionError):
+        raise EstimationError(
+            f"band_hz = {band_hz!r} does not go with PredictionError, whose filter models the noise; leave it out"
+        )
 
 
 def _solved(problem: Residuals, params: ParameterSet, method: Method, callback: Callback | None) -> Solved:
@@ -144,6 +163,13 @@ def _problem(
     )  # fmt: skip
     for e, experiment in enumerate(experiments):
         settle = problem.weights(e).settle
+        seen = sum(np.sum(counted(piece, 0), axis=0) for piece in segments[e])
+        for name, count in zip(experiment.outputs, np.asarray(seen), strict=True):
+            if not count:
+                raise EstimationError(
+                    f"experiment {experiment.name}: output {name} has no sample that counts; "
+                    "leave it out of outputs, or keep back less (holdout)"
+                )
         longest = max(segment.n for segment in segments[e])
         if longest <= settle + 2:
             raise EstimationError(

@@ -83,7 +83,7 @@ def minimise(
         return Solution(z=here.z, evaluation=here, status="stalled", message=message, iterations=0)
     scale = _norms(here)
     radius = reach * max(float(np.linalg.norm(scale * here.z)), 1.0)
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
         held = _held(here, low, high)
         distance = _decrement(here, held) + 2.0 * here.pending
         if distance <= decrement + RELATIVE * here.cost:
@@ -91,6 +91,8 @@ def minimise(
                 z=here.z, evaluation=here, status="converged", iterations=iteration - 1,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
             )  # fmt: skip
+        if iteration > max_iterations:
+            break
         step, damping = _step(here, held, scale, radius)
         trial = np.clip(here.z + step, low, high)
         moved = trial - here.z

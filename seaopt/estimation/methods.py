@@ -34,7 +34,8 @@ class MultipleShooting:
     """Each segment is cut into shots that start from states of their own; the shots are joined while the fit goes on.
 
     For plants that are unstable, or start far off: a simulation that starts anew every so often cannot run away. At the
-    end the shots join to rounding, so that the result is that of `OutputError` wherever both find it.
+    end the shots join to rounding: the result is that of `OutputError` wherever both find it. Where the plant runs away
+    in one go the shots keep initial states of their own, which the message says: the intervals are then wider.
 
     Parameters
     ----------
@@ -63,8 +64,10 @@ class MultipleShooting:
 class PredictionError:
     """The residual is the error of the prediction one sample ahead, by a steady-state Kalman filter.
 
-    For plants that noise drives, not only sensors: process noise (one strength a state) and measurement noise are
-    estimated with the parameters, and the filter's gain follows from them and from the plant.
+    For plants that noise drives, not only sensors: process noise (one strength a state) over the measurement noise is
+    estimated with the parameters, and the filter's gain follows from it and from the plant. The measurement noise is
+    taken from the outputs' third differences; together they are scaled by the size of the prediction errors. A band is
+    refused: the filter is itself a model of the noise.
 
     Parameters
     ----------

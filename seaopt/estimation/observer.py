@@ -38,6 +38,8 @@ class Observer:
         Standard deviation of the measurement noise, in output units.
     places : array, shape (m, nx + nu)
         States and inputs over which a nonlinear plant is linearised.
+    gain : array, shape (ny,)
+        Of the sensors, as it is at the start: the filter's gain does not follow it.
     follows : bool
         Whether the gain's derivatives are wanted; False: a gain that stands still.
 
@@ -46,6 +48,7 @@ class Observer:
     size: Float[np.ndarray, " nx"]
     sensors: Float[np.ndarray, " ny"]
     places: Float[np.ndarray, "m w"]
+    gain: Float[np.ndarray, " ny"]
     follows: bool = True
 
     def correction(self, model: Model, point: Point, noise: Float[np.ndarray, " q"]) -> Float[np.ndarray, "ns1 nx ny"]:
@@ -61,7 +64,7 @@ class Observer:
         a, c = self.plants(model, point, trials[:, : point.theta.size])
         level = trials[:, point.theta.size :] if noise.size else np.full((len(trials), model.nx), DISTRUST)
         q = (self.size * np.exp(level)) ** 2
-        gains = kalman_gain(a, c * point.gain[:, None], q, self.sensors**2)
+        gains = kalman_gain(a, c * self.gain[:, None], q, self.sensors**2)
         found = np.zeros((1 + base.size + free_delay, model.nx, model.ny))
         found[0] = gains[0]
         if self.follows:

@@ -53,6 +53,9 @@ class Huber:
 
     threshold: float = 1.345
 
+    def __post_init__(self) -> None:
+        _check_threshold("Huber", self.threshold)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoftL1:
@@ -66,6 +69,14 @@ class SoftL1:
     """
 
     threshold: float = 1.345
+
+    def __post_init__(self) -> None:
+        _check_threshold("SoftL1", self.threshold)
+
+
+def _check_threshold(name: str, value: float) -> None:
+    if not 0.0 < value < np.inf:
+        raise EstimationError(f"{name}(threshold={value:g}): give a positive number of sigmas")
 
 
 Loss = Linear | Huber | SoftL1
@@ -251,6 +262,11 @@ class Residuals:
     def with_sigma(self, sigma: tuple[Float[np.ndarray, " _"], ...]) -> Residuals:
         """Return the problem with other sigmas."""
         return replace(self, sigma=sigma)
+
+
+def sees_level(band_hz: tuple[float, float] | None) -> bool:
+    """Tell whether residuals of a band show an offset: whether the band begins at 0 Hz."""
+    return band_hz is None or band_hz[0] <= 0.0
 
 
 def spread_of(values: Float[np.ndarray, " n"]) -> float:

@@ -74,6 +74,13 @@ class Nuisance:
     substeps: int = 1
     drift: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
     noise: dict[str, float] = field(default_factory=dict[str, float])
+    std: dict[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def told(self) -> list[str]:
+        """What was estimated of delay and gains, in words."""
+        found = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (g, "") for name, g in self.gain.items()}
+        return [f"{key} = {found[key][0]:.5g} ± {std:.2g} {found[key][1]}".rstrip() for key, std in self.std.items()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -298,6 +305,7 @@ class Fit:
         lines += [f"  {line}" for line in repr(shown).splitlines()]
         lines += [f"  {name} = {item.value:.5g} ± {item.std:.2g} {item.unit}" for name, item in self.derived.items()]
         for name, own in self.nuisance.items():
+            lines += [f"  {name}: {line}" for line in own.told]
             if len(own.initial_state) > 1:
                 lines.append(f"  {name}: {len(own.initial_state)} segments with initial states of their own")
         for name, row in self.outputs.items():
@@ -382,6 +390,7 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
                 initial_state=tuple(item["initial_state"]), substeps=int(item.get("substeps", 1)),
                 drift={output: tuple(row) for output, row in item.get("drift", {}).items()},
                 noise=dict(item.get("noise", {})),
+                std={key: _number(value, math.inf) for key, value in item.get("std", {}).items()},
             )
             for name, item in content.get("experiments", {}).items()
         },

@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.errors import EstimationError
 from seaopt.estimation.covariance import errors
+from seaopt.estimation.experiment import Experiment, shot_edges
 from seaopt.estimation.least_squares import Callback, minimise
 from seaopt.estimation.methods import MultipleShooting
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
@@ -224,21 +226,47 @@ def multiple_shooting(
         settled = settle(problem, single, method.max_iterations, callback)
         if settled.solution.status == "converged" and _explains(settled, sigma):
             return settled
+    return _apart(problem, params, method, z, ends, callback)
+
+
+def _apart(
+    problem: Residuals, params: ParameterSet, method: MultipleShooting, z: Float[np.ndarray, " n"],
+    ends: tuple[tuple[Shots, ...], ...], callback: Callback | None,
+) -> Solved:  # fmt: skip
+    """Settle on shots that keep initial states of their own, for a plant that runs away in one go."""
     experiments = tuple(replace(e, shots=e.shots * method.segments) for e in problem.experiments)
-    unknowns = collect(experiments, params)
+    unknowns = collect(experiments, params, band_hz=problem.band_hz)
     segments = tuple(tuple(e.segments(problem.holdout)) for e in experiments)
     apart = replace(problem, experiments=experiments, unknowns=unknowns, segments=segments)
+    for e, experiment in enumerate(experiments):
+        settle_rows, longest = apart.weights(e).settle, max(piece.n for piece in segments[e])
+        if longest <= 2 * settle_rows:
+            raise EstimationError(
+                f"experiment {experiment.name}: the plant runs away in simulation, and its shots have {longest} "
+                f"samples, of which the band filter takes {settle_rows} to settle; use fewer segments or no band_hz"
+            )
     values = unknowns.start.copy()
     for name, value in zip(problem.unknowns.names, z, strict=True):
         if name in unknowns.names:
             values[unknowns.names.index(name)] = value
-    nodes = tuple(np.concatenate([shot.nodes for shot in row]) for row in ends)
-    for places, states in zip(unknowns.locals_of, nodes, strict=True):
-        for slots, state in zip(places.initial, states, strict=False):
-            for slot, value in zip(slots, state, strict=True):
+    for e, places in enumerate(unknowns.locals_of):
+        nodes = _nodes_by_row(problem.experiments[e], ends[e])
+        for slots, piece in zip(places.initial, experiments[e].pieces, strict=True):
+            for slot, value in zip(slots, nodes.get(piece.start, ()), strict=False):
                 if slot.index is not None:
-                    values[slot.index] = value
-    return settle(apart, apart.evaluate(values), method.max_iterations, callback)
+                    values[slot.index] = float(value)
+    found = settle(apart, apart.evaluate(values), method.max_iterations, callback)
+    told = f"{found.solution.message}; the plant runs away in one go: shots keep initial states of their own"
+    return replace(found, solution=replace(found.solution, message=told))
+
+
+def _nodes_by_row(experiment: Experiment, shots: tuple[Shots, ...]) -> dict[int, Float[np.ndarray, " nx"]]:
+    """Return the nodes by the row of the log at which they stand."""
+    return {
+        piece.start + int(edge): node
+        for piece, one in zip(experiment.pieces, shots, strict=True)
+        for edge, node in zip(one.edges[:-1], one.nodes, strict=True)
+    }
 
 
 def _joined(
@@ -278,11 +306,12 @@ def _joined(
 
 def _explains(settled: Solved, sigma: tuple[Float[np.ndarray, " _"], ...]) -> bool:
     """Tell whether single shooting leaves no more than the joined shots do; where the plant runs away it does not."""
-    if settled.problem.band_hz is not None or not isinstance(settled.problem.loss, Linear):
-        return True  # the joined shots were neither filtered nor robust
-    for row in errors(settled.problem.with_sigma(sigma), settled.solution.z):
+    plain = replace(settled.problem, band_hz=None, loss=Linear(), sigma=sigma)  # as the shots were joined
+    for row in errors(plain, settled.solution.z):
         weighted = np.concatenate([error.weighted for error in row])
-        power = np.sum(weighted**2, axis=0) / np.maximum(np.count_nonzero(weighted, axis=0), 1)
+        used = np.maximum(np.count_nonzero(weighted, axis=0), 1)
+        # The level is left free: a band that leaves out 0 Hz does not see it.
+        power = np.sum(weighted**2, axis=0) / used - (np.sum(weighted, axis=0) / used) ** 2
         if not np.all(power < WORSE):
             return False
     return True
@@ -318,8 +347,8 @@ def _first_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> 
         row: list[Shots] = []
         nx = problem.unknowns.models[e].nx
         for s, piece in enumerate(pieces):
-            shots = max(1, min(count, piece.n // 4))
-            edges = np.linspace(0, piece.n, shots + 1).astype(int)
+            edges = shot_edges(piece.n, count)
+            shots = len(edges) - 1
             nodes = np.zeros((shots, nx))
             if watched is not None:
                 states = watched.run(e, s, z, states=True).states

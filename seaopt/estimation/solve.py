@@ -25,7 +25,7 @@ UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leav
 NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 FURTHER = 5  # guesses of the frequency responses that are tried at most
-WATCHED = 20_000  # samples that are looked at for them
+WATCHED = 8_000  # samples that are looked at for them
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
 
 
@@ -80,39 +80,40 @@ def _further(
 
 def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
     """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
-    unknowns, here, iterations = problem.unknowns, start, 0
-    if not np.isfinite(here.cost):
-        solution = minimise(problem.evaluate, here, unknowns.low, unknowns.high)
+    unknowns, iterations = problem.unknowns, 0
+    if not np.isfinite(start.cost):
+        solution = minimise(problem.evaluate, start, unknowns.low, unknowns.high)
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
-    refined, _ = _refined(problem, here.z, 0.1)
-    if refined.substeps != problem.substeps:
-        problem, here = refined, refined.evaluate(here.z)
+    problem, here, error = _refined(problem, start, 0.1)
     decrement = DECREMENT if problem.observers is None else NOISE_DECREMENT
-    error, checked = StepError(), (here.z, ())
+    checked = (here.z, ())
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
             problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement, max_iterations=max_iterations,
             callback=callback,
         )  # fmt: skip
         here, iterations = solution.evaluation, iterations + solution.iterations
-        solution = replace(solution, iterations=iterations)
         if not np.isfinite(here.cost):
+            solution = replace(solution, iterations=iterations)
             return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
         sigma = estimated_sigma(problem, here)
         settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(sigma, problem.sigma, strict=True))
-        finer = problem.with_sigma(sigma)
+        before, problem = problem.substeps, problem.with_sigma(sigma)
+        if isinstance(problem.loss, Linear):
+            here = problem.assemble(here.origin, here.passes)  # other sigmas need no other passes
+        elif not settled:
+            here = problem.evaluate(here.z)
         moved = here.z - checked[0]
-        if not (settled and checked[1] == problem.substeps and moved @ here.hessian @ moved < 1.0):
-            finer, error = _refined(finer, here.z, STEP_ERROR_SIGMA)
-            checked = here.z, finer.substeps
-        same = finer.substeps == problem.substeps and isinstance(problem.loss, Linear)
-        if (settled and finer.substeps == problem.substeps) or attempt == MAX_ROUNDS - 1:
-            if same:
-                problem = finer
-                solution = replace(solution, evaluation=problem.assemble(here.origin, here.passes))
+        if not (settled and checked[1] == before and moved @ here.hessian @ moved < 1.0):
+            problem, here, error = _refined(problem, here, STEP_ERROR_SIGMA)
+            checked = here.z, problem.substeps
+        done = settled and problem.substeps == before
+        if done or attempt == MAX_ROUNDS - 1:
+            solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
+            if not done:
+                message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
+                solution = replace(solution, status="stalled", message=message)
             return Solved(problem=problem, solution=solution, step_error=error)
-        problem = finer
-        here = problem.assemble(here.origin, here.passes) if same else problem.evaluate(here.z)
     raise AssertionError  # the last attempt returns
 
 
@@ -188,7 +189,8 @@ def with_observers(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: b
     observers: list[Observer] = []
     for e, experiment in enumerate(problem.experiments):
         spread = problem.spread[e]
-        sensors = [noise_of(experiment.log[name], float(s)) for name, s in zip(experiment.outputs, spread, strict=True)]
+        seen = [_watched(problem, e, o) for o in range(len(experiment.outputs))]
+        sensors = [noise_of(y, float(s)) for y, s in zip(seen, spread, strict=True)]
         observer = _observer(problem, e, z, np.array(sensors), spread)
         if observer is None:
             return None
@@ -196,10 +198,16 @@ def with_observers(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: b
     return replace(problem, observers=tuple(observers))
 
 
+def _watched(problem: Residuals, e: int, o: int) -> Float[np.ndarray, " n"]:
+    """Return the first samples of an output that are not held out."""
+    piece = problem.segments[e][0]
+    y = piece.y[o][:WATCHED]
+    return y[piece.keep[o][:WATCHED] > 0] if piece.keep else y
+
+
 def noise_of(y: Float[np.ndarray, " n"], spread: float) -> float:
     """Return the standard deviation of white noise on a smooth signal: the median third difference, over sqrt(20)."""
-    seen = y[:WATCHED]
-    third = np.abs(np.diff(seen[np.isfinite(seen)], 3))
+    third = np.abs(np.diff(y[np.isfinite(y)], 3))
     noise = 1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0
     return max(noise, EXACT * spread, 1e-300)
 
@@ -213,10 +221,10 @@ def _observer(
     model, piece, point = problem.unknowns.models[e], problem.segments[e][0], problem.point(e, z)
     places = np.zeros((PLACES, model.nx + model.nu))
     size = _first_size(problem, e, point, spread)
-    observer = Observer(size=size, sensors=sensors, places=places, follows=False)
+    observer = Observer(size=size, sensors=sensors, places=places, gain=point.gain, follows=False)
     rows = np.linspace(0, min(piece.n, WATCHED) - 1, PLACES).astype(int)
-    u, y = (tuple(channel[:WATCHED] for channel in channels) for channels in (piece.u, piece.y))
-    short = Segment(u=u, y=y, start_s=piece.start_s)
+    u, y, keep = (tuple(c[:WATCHED] for c in channels) for channels in (piece.inputs, piece.y, piece.keep))
+    short = Segment(u=u, y=y, keep=keep, start_s=piece.start_s)
     for _ in range(3):
         correction = observer.correction(
             model, replace(point, clock=replace(point.clock, delay_free=False)), np.zeros(0)
@@ -230,14 +238,17 @@ def _observer(
             return None
         places = np.column_stack([states[rows], *(channel[rows] for channel in short.u)])
         size = np.maximum(np.std(states, axis=0), 1e-9 * np.max(np.abs(size)))
-        observer = Observer(size=size, sensors=sensors, places=places, follows=False)
+        observer = Observer(size=size, sensors=sensors, places=places, gain=point.gain, follows=False)
     return observer
 
 
 def _first_size(problem: Residuals, e: int, point: Point, spread: Float[np.ndarray, " ny"]) -> Float[np.ndarray, " nx"]:
     """Return the size of each state that would show as the outputs' spread within ten samples."""
     model = problem.unknowns.models[e]
-    observer = Observer(size=np.ones(model.nx), sensors=np.ones(model.ny), places=np.zeros((1, model.nx + model.nu)))
+    observer = Observer(
+        size=np.ones(model.nx), sensors=np.ones(model.ny), places=np.zeros((1, model.nx + model.nu)),
+        gain=np.ones(model.ny),
+    )  # fmt: skip
     a, c = observer.plants(model, point, point.theta[None])
     rows, power = [], np.eye(model.nx)
     for _ in range(10):
@@ -275,45 +286,50 @@ def _median_scales(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[
     return found
 
 
-def _refined(problem: Residuals, z: Float[np.ndarray, " n"], allowed: float) -> tuple[Residuals, StepError]:
-    """Return the problem with integration steps whose error is below `allowed` sigma, and that error."""
-    found = problem.map(lambda e: _refined_steps(problem, e, z, allowed))
-    worst = StepError(
-        output=max(error.output for _, error in found), parameter=max(error.parameter for _, error in found)
-    )
-    return replace(problem, substeps=tuple(substeps for substeps, _ in found)), worst
+def _refined(problem: Residuals, here: Evaluation, allowed: float) -> tuple[Residuals, Evaluation, StepError]:
+    """Return the problem with steps whose error is below `allowed` sigma, its evaluation there, and that error."""
+    while True:
+        found = problem.map(lambda e, problem=problem, here=here: step_error(problem, e, here))
+        finer = tuple(_steps(m, error, allowed) for m, error in zip(problem.substeps, found, strict=True))
+        if finer == problem.substeps:
+            worst = StepError(
+                output=max(error.output for error in found), parameter=max(error.parameter for error in found)
+            )
+            return problem, here, worst
+        problem = replace(problem, substeps=finer)
+        here = problem.evaluate(here.z)
 
 
-def _refined_steps(problem: Residuals, e: int, z: Float[np.ndarray, " n"], allowed: float) -> tuple[int, StepError]:
-    """Return the steps a sample of one experiment, and their error."""
-    steps = problem.substeps[e]
-    while not problem.unknowns.models[e].linear:
-        substeps = tuple(steps if i == e else m for i, m in enumerate(problem.substeps))
-        error = step_error(replace(problem, substeps=substeps), e, z)
-        over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
-        if over <= 1.0 or steps >= MAX_SUBSTEPS or not np.isfinite(over):
-            return steps, error
-        finer = steps * min(1.1 * over**0.25, 4.0)  # order four says how much finer
-        steps = min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
-    return steps, StepError()
+def _steps(steps: int, error: StepError, allowed: float) -> int:
+    """Return how many steps a sample an error asks for."""
+    over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
+    if over <= 1.0 or not np.isfinite(over):
+        return steps
+    finer = steps * min(1.1 * over**0.25, 4.0)  # order four says how much finer
+    return min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
 
 
 @np.errstate(all="ignore")
-def step_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> StepError:
+def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
     """Return the integration error of experiment e, from steps of half the length (order four: 16/15 of the change).
 
-    In an output it is the largest change, in sigma. In a parameter it is the move of the minimum,
-    H^-1 (change of the gradient), in standard deviations: an error far below the noise can add up over a long log.
+    In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
+    below the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's
+    first samples.
     """
+    if problem.unknowns.models[e].linear:
+        return StepError()
     halved = replace(problem, substeps=tuple(2 * m if i == e else m for i, m in enumerate(problem.substeps)))
-    n, worst = z.size, 0.0
+    z, n, worst = here.origin, here.z.size, 0.0
     gradient, hessian = np.zeros(n), np.diag(problem.unknowns.prior_std**-2.0)
     gain = problem.point(e, z).gain
     sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
-    for s in range(len(problem.segments[e])):
-        coarse, fine = problem.run(e, s, z, outputs=True), halved.run(e, s, z, outputs=True)
-        assert coarse.outputs is not None and fine.outputs is not None
-        change = float(np.max(np.abs(gain * (coarse.outputs - fine.outputs)) / sigma)) * 16.0 / 15.0
+    for s, piece in enumerate(problem.segments[e]):
+        coarse, fine = here.passes[e][s], halved.run(e, s, z)
+        edges = np.array([0, min(piece.n, WATCHED)])
+        one, two = (each.run(e, s, z, edges=edges, outputs=True).outputs for each in (problem, halved))
+        assert one is not None and two is not None
+        change = float(np.max(np.abs(gain * (one - two)) / sigma)) * 16.0 / 15.0
         worst = max(worst, change if np.isfinite(change) else np.inf)
         for o, places in enumerate(problem.columns(e, s)):
             used = np.flatnonzero(places >= 0)

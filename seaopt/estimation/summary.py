@@ -25,12 +25,13 @@ from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
 from seaopt.estimation.least_squares import Solution
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.residuals import Evaluation, Linear, Residuals, sees_level
 from seaopt.estimation.result import Derived, Fit, Minimum, Nuisance, OutputFit
-from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError
-from seaopt.estimation.unknowns import Unknowns
+from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError, explains_little
+from seaopt.estimation.unknowns import Locals, Unknowns
 from seaopt.parameters import ParameterSet
 
+CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
 VAGUE = 3.0  # a std of so many times the value is no estimate
 
 
@@ -47,7 +48,7 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
     seen = identifiability(found.hessian, names, z[:p])
     if seen.rank < seen.free:
         seen = replace(seen, structural_rank=structural_rank(problem, z))
-    std = np.sqrt(np.diag(robust))
+    std, variance = np.sqrt(np.diag(robust)), np.diag(inverse(found.hessian)[0])
     fitted = params.with_parameters(
         *(replace(params[name], value=float(z[i]), std=float(std[i])) for i, name in enumerate(names))
     )
@@ -55,6 +56,17 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
     status, message = _status(solution, seen, found.hessian, names, solved.step_error)
     if status == "converged":
         status, message = _open(fitted, params, message)
+    outputs = _outputs(problem, z, left) if left is not None else {}
+    if left is not None and not _explained(problem, outputs, left):
+        status = "not_identifiable"
+        message = (
+            f"the model explains nothing of any output; check the input's sign, the channels and units ({message})"
+        )
+    elif explains_little(problem, found) and status != "converged" and isinstance(method, OutputError):
+        message = f"{message}; the simulation may run away: try PredictionError() or MultipleShooting()"
+    bounded = [name for name, item in fitted.items() if item.free and item.at_bound]
+    if bounded:
+        message = f"{message}; {listed(bounded)} {'is at its bound' if len(bounded) == 1 else 'are at their bounds'}"
     return Fit(
         status=status,
         message=message,
@@ -62,8 +74,11 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         covariance=covariance,
         white_covariance=Covariance(names=names, matrix=white),
         derived=_derived(problem.experiments, fitted, covariance),
-        outputs=_outputs(problem, z, left) if left is not None else {},
-        nuisance={e.name: _nuisance(e, unknowns, i, z, problem.substeps[i]) for i, e in enumerate(problem.experiments)},
+        outputs=outputs,
+        nuisance={
+            e.name: _nuisance(e, unknowns, i, z, problem.substeps[i], _levels(problem, i, left), variance)
+            for i, e in enumerate(problem.experiments)
+        },
         identifiability=seen,
         cost=found.cost,
         iterations=solution.iterations,
@@ -100,6 +115,22 @@ def _covariances(
     columns = back[:, :p]
     meat = coloured(problem, found.z, columns, left) + (columns.T * prior) @ columns
     return white, with_infinities(meat, unseen[:p])
+
+
+def _own_std(experiment: Experiment, places: Locals, variance: Float[np.ndarray, " n"]) -> dict[str, float]:
+    """Return the standard deviations of the experiment's free delay and gains."""
+    slots = {"delay_s": places.delay}
+    slots |= {f"gain.{name}": slot for name, slot in zip(experiment.outputs, places.gain, strict=True)}
+    free = {key: slot.index for key, slot in slots.items() if slot.index is not None}
+    return {key: float(np.sqrt(max(variance[index], 0.0))) for key, index in free.items()}
+
+
+def _levels(problem: Residuals, e: int, left: list[Leftover] | None) -> list[float]:
+    """Return the offsets that the fit did not see, from what is left over on average."""
+    experiment = problem.experiments[e]
+    if left is None or not _level_unseen(problem, experiment):
+        return [0.0] * len(experiment.outputs)
+    return [-part.bias for part in left[e].used]
 
 
 def _log_likelihood(problem: Residuals, found: Evaluation) -> float:
@@ -145,13 +176,17 @@ def _status(
 
 
 def _nuisance(
-    experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.ndarray, " n"], substeps: int
-) -> Nuisance:
+    experiment: Experiment, unknowns: Unknowns, e: int, z: Float[np.ndarray, " n"], substeps: int,
+    levels: list[float], variance: Float[np.ndarray, " n"],
+) -> Nuisance:  # fmt: skip
     places = unknowns.locals_of[e]
     return Nuisance(
         delay_s=places.delay.at(z),
         gain={name: slot.at(z) for name, slot in zip(experiment.outputs, places.gain, strict=True)},
-        offset={name: slot.at(z) for name, slot in zip(experiment.outputs, places.offset, strict=True)},
+        offset={
+            name: slot.at(z) + level
+            for name, slot, level in zip(experiment.outputs, places.offset, levels, strict=True)
+        },
         drift={
             name: tuple(slot.at(z) for slot in row) for name, row in zip(experiment.outputs, places.drift, strict=True)
         },
@@ -160,6 +195,7 @@ def _nuisance(
             for row in places.initial
         ),
         noise={name: slot.at(z) for name, slot in zip(experiment.plant.states, places.noise, strict=False)},
+        std=_own_std(experiment, places, variance),
         substeps=substeps,
     )
 
@@ -199,6 +235,8 @@ def _outputs(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover
         found[experiment.name] = {}
         for o, name in enumerate(experiment.outputs):
             used, rest = simulated[e].used[o], simulated[e].rest[o]
+            if _level_unseen(problem, experiment):
+                used, rest = used.levelled(used.bias), rest.levelled(used.bias)
             found[experiment.name][name] = OutputFit(
                 fit_percent=used.fit_percent if used.fit_percent is not None else np.nan,
                 holdout_fit_percent=rest.fit_percent,
@@ -210,6 +248,27 @@ def _outputs(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover
                 whiteness_p=left[e].whiteness(o),
             )
     return found
+
+
+def _level_unseen(problem: Residuals, experiment: Experiment) -> bool:
+    """Tell whether an offset is wanted that the fit's band does not show: it is then what is left over on average."""
+    return experiment.offset is True and not sees_level(problem.band_hz)
+
+
+def _explained(problem: Residuals, outputs: dict[str, dict[str, OutputFit]], left: list[Leftover]) -> bool:
+    """Tell whether some output is explained better than by chance: N R^2 of its band is far above its mean, 1."""
+    for e, experiment in enumerate(problem.experiments):
+        for o, name in enumerate(experiment.outputs):
+            row = outputs[experiment.name][name]
+            shown = max(
+                percent
+                for percent in (row.fit_percent, row.band_fit_percent, row.one_step_fit_percent)
+                if percent is not None
+            )
+            gain = 1.0 - (1.0 - max(shown, 0.0) / 100.0) ** 2
+            if gain * float(left[e].count[o]) > CHANCE_POWER:
+                return True
+    return False
 
 
 def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float | None:
@@ -225,6 +284,8 @@ def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, "
         present = counted(piece, weights.settle)[:, o]
         own = columns[:, o, -(2 + point.drift_terms) :]  # filtered: 1, drift's polynomials, the model output
         modelled = own[:, 0] * point.offset[o] + own[:, 1:-1] @ point.drift[o] + point.gain[o] * own[:, -1]
+        if not np.any(present):
+            continue
         measured = (modelled - columns[:, o, 0])[present]
         residual += float(np.sum(columns[present, o, 0] ** 2))
         signal += float(np.sum((measured - np.mean(measured)) ** 2))

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.errors import EstimationError, suggestion
+from seaopt.errors import EstimationError, SeaoptError, suggestion
 from seaopt.estimation.experiment import Experiment
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.linear import point
-from seaopt.simulation import Model, make_model
+from seaopt.simulation import Model, depends_on_time, make_model
+from seaopt.units import factor
 
 NOISE_START, NOISE_PRIOR = math.log(1e-2), 3.0  # of the logarithm of process noise over the state's size
 
@@ -115,22 +117,35 @@ class _Builder:
         self.linear.append(linear)
         return Slot(value=item.value, index=len(self.items) - 1)
 
-    def maybe(self, given: float | Parameter, name: str, low: float) -> Slot:
-        """Add a free Parameter under `name`; a number, or one that is not free, is known."""
+    def maybe(self, given: float | Parameter, name: str, unit: str, low: float) -> Slot:
+        """Add a free Parameter under `name`; a number, or one that is not free, is known. Its unit is converted."""
         if not isinstance(given, Parameter):
             return Slot(value=float(given))
+        try:
+            scale = factor(given.unit, unit) if given.unit else 1.0
+        except SeaoptError as error:
+            raise EstimationError(f"{name} is in {given.unit}, and must be in {unit}: {error}") from error
         if not given.free:
-            return Slot(value=given.value)
+            return Slot(value=scale * given.value)
+        prior = None if given.prior_std is None else scale * given.prior_std
         return self.add(
             Parameter(
-                name=name, value=given.value, unit=given.unit, free=True, min=max(given.min, low), max=given.max,
-                prior_std=given.prior_std,
+                name=name, value=scale * given.value, unit=unit, free=True, min=max(scale * given.min, low),
+                max=scale * given.max, prior_std=prior,
             )
         )  # fmt: skip
 
 
-def collect(experiments: tuple[Experiment, ...], params: ParameterSet, noise: bool = False) -> Unknowns:
+def collect(
+    experiments: tuple[Experiment, ...],
+    params: ParameterSet,
+    noise: bool = False,
+    band_hz: tuple[float, float] | None = None,
+) -> Unknowns:
     """List the unknowns of a fit; with `noise`, those of the process noise too.
+
+    A band that leaves out 0 Hz does not see offsets and drifts, nor an initial state that is forgotten before the band
+    filter has settled: those are then not estimated.
 
     Raises
     ------
@@ -152,7 +167,7 @@ def collect(experiments: tuple[Experiment, ...], params: ParameterSet, noise: bo
     shared = len(builder.items)
     models = tuple(make_model(e.plant, params, params.free_names, e.outputs) for e in experiments)
     pairs = zip(experiments, models, strict=True)
-    places = tuple(_locals(builder, experiment, model.linear, noise) for experiment, model in pairs)
+    places = tuple(_locals(builder, experiment, model, noise, band_hz) for experiment, model in pairs)
     items = builder.items
     return Unknowns(
         names=tuple(item.name for item in items),
@@ -167,13 +182,27 @@ def collect(experiments: tuple[Experiment, ...], params: ParameterSet, noise: bo
     )
 
 
-def _locals(builder: _Builder, experiment: Experiment, linear: bool, noise: bool) -> Locals:
+def _locals(
+    builder: _Builder, experiment: Experiment, model: Model, noise: bool, band_hz: tuple[float, float] | None
+) -> Locals:
     name = experiment.name
-    delay = builder.maybe(experiment.delay_s, f"{name}.delay_s", 0.0)
-    gain = tuple(builder.maybe(experiment.gain.get(o, 1.0), f"{name}.gain.{o}", -math.inf) for o in experiment.outputs)
+    level = band_hz is None or band_hz[0] <= 0.0
+    forgotten = not level and _forgotten(builder, experiment, model, band_hz)
+    delay = builder.maybe(experiment.delay_s, f"{name}.delay_s", "s", 0.0)
+    gain = tuple(
+        builder.maybe(experiment.gain.get(o, 1.0), f"{name}.gain.{o}", "-", -math.inf) for o in experiment.outputs
+    )
+    no_drift: tuple[tuple[Slot, ...], ...] = ((),) * len(experiment.outputs)
+    if delay.index is not None and depends_on_time(model):
+        raise EstimationError(
+            f"experiment {name}: delay_s is free and {experiment.plant.name} depends on time itself; "
+            "give delay_s a value"
+        )
     return Locals(
-        delay=delay, gain=gain, offset=_offsets(builder, experiment), drift=_drifts(builder, experiment),
-        initial=_initial(builder, experiment, linear), noise=_noise(builder, experiment) if noise else (),
+        delay=delay, gain=gain, offset=_offsets(builder, experiment, level),
+        drift=_drifts(builder, experiment) if level else no_drift,
+        initial=_initial(builder, experiment, model.linear, forgotten),
+        noise=_noise(builder, experiment) if noise else (),
     )  # fmt: skip
 
 
@@ -181,11 +210,11 @@ def _free(builder: _Builder, name: str, unit: str, linear: bool = True) -> Slot:
     return builder.add(Parameter(name=name, value=0.0, unit=unit, free=True), linear)
 
 
-def _offsets(builder: _Builder, experiment: Experiment) -> tuple[Slot, ...]:
-    if experiment.offset is True:
+def _offsets(builder: _Builder, experiment: Experiment, level: bool) -> tuple[Slot, ...]:
+    if experiment.offset is True and level:
         units = experiment.plant.outputs
         return tuple(_free(builder, f"{experiment.name}.offset.{o}", units[o]) for o in experiment.outputs)
-    known = experiment.offset if experiment.offset else {}
+    known = experiment.offset if isinstance(experiment.offset, Mapping) else {}
     return tuple(Slot(value=float(known.get(o, 0.0))) for o in experiment.outputs)
 
 
@@ -199,17 +228,32 @@ def _drifts(builder: _Builder, experiment: Experiment) -> tuple[tuple[Slot, ...]
     )
 
 
-def _initial(builder: _Builder, experiment: Experiment, linear: bool) -> tuple[tuple[Slot, ...], ...]:
-    plant = experiment.plant
-    count = len(experiment.pieces)
-    if experiment.initial_state != "estimate":
-        known = None if experiment.initial_state == "rest" else dict(experiment.initial_state)
-        return (tuple(Slot(value=float(v)) for v in point("state", plant.states, known)),) * count
-    labels = [f"{experiment.name}.initial{number + 1 if number else ''}" for number in range(count)]
-    return tuple(
-        tuple(_free(builder, f"{label}.{state}", unit, linear) for state, unit in plant.states.items())
-        for label in labels
-    )
+def _initial(builder: _Builder, experiment: Experiment, linear: bool, forgotten: bool) -> tuple[tuple[Slot, ...], ...]:
+    """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones."""
+    plant, given = experiment.plant, experiment.initial_state
+    known = point("state", plant.states, dict(given) if isinstance(given, Mapping) else None)
+    starts = {stretch.start for stretch in experiment.log.segments}
+    found: list[tuple[Slot, ...]] = []
+    for number, piece in enumerate(experiment.pieces):
+        if forgotten or (given != "estimate" and piece.start in starts):
+            found.append(tuple(Slot(value=float(v)) for v in known))
+            continue
+        label = f"{experiment.name}.initial{number + 1 if number else ''}"
+        found.append(tuple(_free(builder, f"{label}.{state}", unit, linear) for state, unit in plant.states.items()))
+    return tuple(found)
+
+
+def _forgotten(builder: _Builder, experiment: Experiment, model: Model, band_hz: tuple[float, float] | None) -> bool:
+    """Tell whether a linear plant's initial state is gone, to a hundredth, before the band filter has settled."""
+    from seaopt.estimation.residuals import band_filter  # above this module
+
+    if not model.linear or experiment.initial_state != "estimate":
+        return False
+    values = {item.name: item.value for item in builder.items}
+    rates = model.matrices(np.array([values[name] for name in model.free]))[0][: model.nx, : model.nx]
+    slowest = float(np.max(np.linalg.eigvals(rates).real)) if np.all(np.isfinite(rates)) else 0.0
+    settle_s = band_filter(band_hz, experiment.log.period)[1] * experiment.log.period
+    return slowest * settle_s < math.log(1e-2)
 
 
 def _noise(builder: _Builder, experiment: Experiment) -> tuple[Slot, ...]:

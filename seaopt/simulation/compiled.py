@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.errors import SimulationError
 from seaopt.simulation.compiler import load_library
 from seaopt.simulation.discretisation import transition
 from seaopt.simulation.integrator import Rates, rate_functions
@@ -31,12 +32,13 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
     pointer, whole, real = np.uint64, np.int64, np.float64
     return np.dtype([
-        ("from", whole), ("to", whole), ("length", whole), ("u", pointer, (nu,)), ("y", pointer, (ny,)),
-        ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole), ("start", whole), ("t0", real),
-        ("tau0", real), ("dtau", real), ("model", pointer), ("correction", pointer), ("x0", pointer),
-        ("offset", pointer), ("gain", pointer), ("drift", pointer), ("sos", pointer), ("sections", whole),
-        ("loss", whole), ("knee", pointer), ("gram", pointer), ("rho", pointer), ("count", pointer),
-        ("outputs", pointer), ("columns", pointer), ("states", pointer), ("last", pointer), ("carry", pointer),
+        ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
+        ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole),
+        ("start", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer), ("correction", pointer),
+        ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer), ("sos", pointer),
+        ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer), ("rho", pointer),
+        ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer), ("last", pointer),
+        ("carry", pointer),
     ])  # fmt: skip
 
 
@@ -161,10 +163,7 @@ class _Memory:
 
 
 class Program:
-    """The passes of one segment at one point, ready to run.
-
-    Raises nothing: `make` returns None where there is no compiler.
-    """
+    """The passes of one segment at one point, ready to run."""
 
     def __init__(self, model: Model, segment: Segment, point: Point, weights: Weights, library: Any) -> None:
         self.model, self.segment, self.library = model, segment, library
@@ -176,7 +175,8 @@ class Program:
         ny = model.ny
         base = np.zeros(1, dtype=_arguments(model.nu, ny))
         base["length"] = segment.n
-        base["u"] = [memory.constant(channel) for channel in segment.u]
+        base["lead"] = segment.lead
+        base["u"] = [memory.constant(channel) + 8 * segment.lead for channel in segment.u]
         base["y"] = [memory.constant(channel) for channel in segment.y] if segment.y else 0
         base["keep"] = [memory.address(np.ascontiguousarray(mask)) for mask in segment.keep] if segment.keep else 0
         base["lag_a"], base["lag_b"] = point.clock.lags
@@ -216,11 +216,13 @@ class Program:
         """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped."""
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
+        if x0.shape != (shots, nx) or first < 0 or edges[-1] > self.segment.n or np.any(np.diff(edges) < 0):
+            raise SimulationError(f"{shots} shots of {nx} states over {self.segment.n} samples: x0 or edges do not fit")
         result = Pass(
             gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
             last=np.zeros((shots, nx, layout.states)),
             outputs=np.empty((n, ny)) if outputs else None,
-            columns=np.empty((n, ny, nc)) if columns else None,
+            columns=np.empty((n, ny, nc)) if columns and self.segment.y else None,
             states=np.empty((n, nx)) if states else None,
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
@@ -236,7 +238,7 @@ class Program:
         ):
             arguments[name] = array.ctypes.data + array.strides[0] * np.arange(shots)
         for name, array in (("outputs", outputs), ("columns", columns), ("states", states)):
-            if array:
+            if array and getattr(result, name) is not None:
                 kept = getattr(result, name)
                 arguments[name] = kept.ctypes.data + kept.strides[0] * (edges[:-1] - first)
         if resume is not None:

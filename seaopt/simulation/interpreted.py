@@ -101,8 +101,8 @@ def _robust(
 def _held_inputs(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
     """Return [u_a, u_b, 1] of every sample."""
     n, u = segment.n, np.column_stack(segment.u)
-    rows = np.arange(n)
-    ua, ub = (u[np.clip(rows - lag, 0, n - 1)] for lag in point.clock.lags)
+    rows = segment.lead + np.arange(n)
+    ua, ub = (u[np.clip(rows - lag, 0, len(u) - 1)] for lag in point.clock.lags)
     return np.hstack([ua, ub, np.ones((n, 1))])
 
 
@@ -308,7 +308,7 @@ def _folded_trace(
     x0: Float[np.ndarray, " nx"],
 ) -> Trace:  # fmt: skip
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
-    layout = layout_of(model.nx, model.ny, model.np, point)
+    layout, clock = layout_of(model.nx, model.ny, model.np, point), point.clock
     piece = slice(*rows)
     w, data = np.column_stack([_times(segment, point, rows), held[piece, :-1]]), _data(model, point)
     if point.correction is not None:
@@ -319,7 +319,8 @@ def _folded_trace(
     fold, output = _program(model, point, layout, (w.shape[1], data.size))
     path = _fold(fold, _first(x0, layout), w, data)
     n = len(w)
-    key = f"{output} {n} {layout} {point.clock}"
+    split = clock.delay_free, clock.fraction_s > 0.0
+    key = f"output map {n} {layout} {clock.hold} {split} {w.shape[1]} {data.size}"
     if key not in model.functions:
         model.functions[key] = output.map(n)
     flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)

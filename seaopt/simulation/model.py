@@ -125,6 +125,11 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
     )  # fmt: skip
 
 
+def depends_on_time(model: Model) -> bool:
+    """Tell whether f or h depends on the time itself."""
+    return bool(ca.depends_on(ca.vertcat(model.f, model.h), model.t))
+
+
 def linearised(model: Model) -> Model:
     """Return the model linearised at zero state and input."""
     if model.linear:

@@ -14,7 +14,8 @@
 
 typedef struct {
     long from, to;                 /* rows of the log: first, and one past the last */
-    long length;                   /* rows of the whole log: inputs are clamped to it */
+    long length;                   /* rows: inputs are clamped to them */
+    long lead;                     /* rows of inputs that go before row 0 */
     const double *u[NU];
     const double *y[NY];           /* y[0] NULL: simulate only */
     const unsigned char *keep[NY]; /* NULL: all kept */
@@ -58,7 +59,7 @@ typedef struct {
     long waiting[NY];
     double filter[NY][MAX_SECTIONS][2][NCP];
 #if LINEAR
-    double model[(NX + NY) * (NX + (NX + NI) * NJP)];
+    double model[(NX + NY) * (NX + (NX + NI) * NJP)] __attribute__((aligned(32)));
 #else
     double work[SZ_W + 1];
 #endif
@@ -67,7 +68,7 @@ typedef struct {
 
 static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {
     long row = k - lag;
-    if (row < 0) row = 0;
+    if (row < -a->lead) row = -a->lead;
     if (row >= a->length) row = a->length - 1;
     for (int i = 0; i < NU; i++) u[i] = a->u[i][row];
 }
@@ -360,7 +361,7 @@ static void one_pass(const seaopt_pass_args *a) {
         advance(q, a, k);
 #if CORRECT
         for (int o = 0; o < NY; o++)
-            if (present[o])
+            if (a->y[0] && present[o])
                 for (int i = 0; i < NX; i++) {
                     const double *g = a->correction + (i * NY + o) * NJP;
                     for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];

@@ -58,12 +58,14 @@ class Segment:
 
     Parameters
     ----------
-    u : tuple of arrays, shape (n,)
+    u : tuple of arrays, shape (lead + n,)
         Input samples; finite.
     y : tuple of arrays, shape (n,)
         Measured outputs, NaN where missing. Empty: simulate only.
     keep : tuple of arrays, shape (n,)
         One an output, 0 where a sample gets no weight. Empty: all are kept.
+    lead : int
+        How many of the input samples go before the first sample: what a delay reaches back to.
     start_s : float
         Time of the first sample, for plants that depend on time.
     drift_span : (float, float)
@@ -71,16 +73,22 @@ class Segment:
 
     """
 
-    u: tuple[Float[np.ndarray, " n"], ...]
+    u: tuple[Float[np.ndarray, " m"], ...]
     y: tuple[Float[np.ndarray, " n"], ...] = ()
     keep: tuple[UInt8[np.ndarray, " n"], ...] = ()
+    lead: int = 0
     start_s: float = 0.0
     drift_span: tuple[float, float] = (0.0, 0.0)
 
     @property
     def n(self) -> int:
         """Number of samples."""
-        return self.u[0].size
+        return self.u[0].size - self.lead
+
+    @property
+    def inputs(self) -> tuple[Float[np.ndarray, " n"], ...]:
+        """Input samples at the samples of the outputs."""
+        return tuple(channel[self.lead :] for channel in self.u)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
-from seaopt.estimation.fit import _complete, _problem
+from seaopt.estimation.fit import _complete, _problem, check_choices
 from seaopt.estimation.observer import kalman_gain
 from seaopt.estimation.residuals import Linear
 from seaopt.estimation.unknowns import collect
@@ -231,7 +231,7 @@ def test_the_step_error_is_that_of_the_parameters(swing, thor):
     std = np.sqrt(np.diag(np.linalg.inv(fine.evaluation.hessian)))
     bias = np.max(np.abs(coarse.z - fine.z) / std)
     assert bias > 1.0
-    assert step_error(crude, 0, coarse.z).parameter == pytest.approx(bias, rel=0.35)
+    assert step_error(crude, 0, coarse.evaluation).parameter == pytest.approx(bias, rel=0.35)
     done = settle(problem, problem.evaluate(unknowns.start), 60, None)
     assert done.step_error.small
     np.testing.assert_allclose(done.solution.z, fine.z, atol=0.1 * np.max(std / fine.z) * np.max(fine.z))
@@ -292,3 +292,123 @@ def test_bad_options(make, words):
 
 def flat():
     return so.Log.from_arrays(time=np.arange(10) / 400, I=np.ones(10), F1=np.ones(10))
+
+
+def lag():
+    return so.Plant(
+        name="lag", states={"x": "N"}, inputs={"u": "N"}, outputs={"y": "N"}, parameters={"a": "1/s", "b": "1/s"},
+        f=lambda t, x, u, p: {"x": -p.a * x.x + p.b * u.u}, h=lambda t, x, u, p: {"y": x.x},
+    )  # fmt: skip
+
+
+def lag_log(n=2000, delay=0, noise=1e-3, seed=0):
+    """The exact samples of a lag with a = 0.2, b = 1 at 100 Hz."""
+    rng = np.random.default_rng(seed)
+    u, x, y = rng.normal(size=n), 0.0, np.zeros(n)
+    f = np.exp(-0.2 / 100)
+    for k in range(n):
+        y[k] = x + noise * rng.normal()
+        x = f * x + (1 - f) / 0.2 * u[max(k - delay, 0)]
+    return np.arange(n) / 100, u, y
+
+
+LAG = so.ParameterSet.of(a=(0.5, "1/s"), b=(0.5, "1/s")).free("a", "b")
+
+
+@pytest.mark.parametrize("options", [{"initial_state": "rest"}, {"delay_s": 0.15}, {}])
+def test_shots_start_where_the_plant_is(options):
+    """A known initial state is that of the log, not of each shot; a delay reaches back before a shot."""
+    time, u, y = lag_log(delay=15 if "delay_s" in options else 0)
+    log = so.Log.from_arrays(time=time, u=u, y=y)
+    for shots in (1, 40):
+        fit = so.fit([so.Experiment(plant=lag(), log=log, offset=False, shots=shots, **options)], LAG)
+        assert fit.parameters["a"].value == pytest.approx(0.2, abs=4.5 * fit.parameters["a"].std)
+        assert fit.parameters["b"].value == pytest.approx(1.0, abs=4.5 * fit.parameters["b"].std)
+        assert fit.outputs["experiment"]["y"].sigma == pytest.approx(1e-3, rel=0.1)
+
+
+def test_stretches_of_a_few_samples_count_in_the_covariance():
+    """A log of stretches of seven samples has the std that linear least squares states, not none."""
+    time, u, y = lag_log(noise=0.01)
+    keep = np.arange(time.size) % 9 < 7
+    log = so.Log.from_arrays(time=time[keep], u=u[keep], y=y[keep])
+    fit = so.fit([so.Experiment(plant=lag(), log=log, offset=False)], LAG)
+    for name in ("a", "b"):
+        assert fit.parameters[name].std == pytest.approx(fit.white_covariance.std(name), rel=0.3)
+
+
+def test_a_band_without_0_hz_leaves_the_level_to_the_rest(stand, thor):
+    """Offsets that the band does not show are what is left over on average, not what the filter's tail makes of them."""
+    log = noisy(stand, thor)
+    shifted = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + 30, F2=log["F2"] - 5)
+    fit = so.fit([experiment(stand, shifted)], thor.update(J=2e-6).free("J", "b_r"), band_hz=(0.5, 100.0))
+    so.testing.assert_recovered(fit, thor, sigmas=4.5)
+    assert fit.nuisance["log"].offset["F1"] == pytest.approx(30, abs=1)
+    assert fit.outputs["log"]["F1"].fit_percent > 95
+    assert fit.outputs["log"]["F1"].rms_residual < 3
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_alone_is_not_called_a_fit(stand, thor, method):
+    rng = np.random.default_rng(3)
+    n = 4000
+    log = so.Log.from_arrays(
+        time=np.arange(n) / 400, I=rng.normal(size=n), F1=rng.normal(size=n), F2=rng.normal(size=n)
+    )
+    fit = so.fit([experiment(stand, log)], thor.update(J=1e-6).free("J", "b_r", "eta"), method=METHODS[method])
+    assert not fit.ok
+    assert "explains nothing" in fit.message or "hardly show" in fit.message
+
+
+def test_a_flipped_sign_is_said(stand, thor):
+    log = noisy(stand, thor)
+    flipped = so.Log.from_arrays(time=log.time, I=-log["I"], F1=log["F1"], F2=log["F2"])
+    fit = so.fit([experiment(stand, flipped)], thor.free("J", "b_r", "eta"))
+    assert not fit.ok
+    assert "sign" in fit.message
+
+
+def test_a_free_delay_and_gain_are_printed_and_converted(stand, thor):
+    log = noisy(stand, thor, outputs=("F1",), duration_s=20)
+    late = so.simulate(stand, thor, log, delay_s=0.0031)["F1"] + np.random.default_rng(0).normal(size=len(log))
+    bench = experiment(
+        stand, so.Log.from_arrays(time=log.time, I=log["I"], F1=late), outputs=("F1",),
+        delay_s=so.Parameter(name="d", value=1.0, unit="ms", free=True, max=10.0),
+    )  # fmt: skip
+    fit = so.fit([bench], thor.free("J", "b_r"))
+    own = fit.nuisance["log"]
+    assert own.delay_s == pytest.approx(0.0031, abs=4 * own.std["delay_s"])
+    assert own.std["delay_s"] < 1e-4
+    assert "delay_s = 0.003" in repr(fit)
+
+
+def test_a_free_delay_of_a_plant_that_depends_on_time_is_refused():
+    plant = so.Plant(
+        name="modulated", states={"x": "N"}, inputs={"u": "N"}, outputs={"y": "N"}, parameters={"a": "1/s"},
+        f=lambda t, x, u, p: {"x": -p.a * x.x + u.u * t}, h=lambda t, x, u, p: {"y": x.x},
+    )  # fmt: skip
+    time, u, y = lag_log(n=200)
+    delay = so.Parameter(name="d", value=1e-3, unit="s", free=True)
+    bench = so.Experiment(plant=plant, log=so.Log.from_arrays(time=time, u=u, y=y), delay_s=delay)
+    with pytest.raises(EstimationError, match="depends on time"):
+        so.fit([bench], so.ParameterSet.of(a=(1.0, "1/s")).free("a"))
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        (("multiple_shooting", None, None), "is no method"),
+        ((so.OutputError(), "huber", None), "is no loss"),
+        ((so.OutputError(), None, 20.0), "is not a band"),
+        ((so.PredictionError(), None, (0.0, 20.0)), "does not go with"),
+    ],
+)
+def test_wrong_choices_are_named(choice, words):
+    with pytest.raises(EstimationError, match=words):
+        check_choices(*choice)
+
+
+@pytest.mark.parametrize("loss", [so.Huber, so.SoftL1])
+def test_a_threshold_is_positive(loss):
+    with pytest.raises(EstimationError, match="threshold=-1"):
+        loss(threshold=-1.0)
