@@ -266,7 +266,7 @@ def _explained(problem: Residuals, outputs: dict[str, dict[str, OutputFit]], lef
                 if percent is not None
             )
             gain = 1.0 - (1.0 - max(shown, 0.0) / 100.0) ** 2
-            if gain * float(left[e].count[o]) > CHANCE_POWER:
+            if gain > 0.5 or gain * float(left[e].count[o]) > CHANCE_POWER:
                 return True
     return False
 

@@ -338,7 +338,7 @@ def test_stretches_of_a_few_samples_count_in_the_covariance():
 
 
 def test_a_band_without_0_hz_leaves_the_level_to_the_rest(stand, thor):
-    """Offsets that the band does not show are what is left over on average, not what the filter's tail makes of them."""
+    """Offsets that the band does not show are what is left over on average, not what the filter's tail makes."""
     log = noisy(stand, thor)
     shifted = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + 30, F2=log["F2"] - 5)
     fit = so.fit([experiment(stand, shifted)], thor.update(J=2e-6).free("J", "b_r"), band_hz=(0.5, 100.0))
