@@ -59,8 +59,11 @@ def start() -> so.ParameterSet:
 
 def against_reading() -> None:
     """Print the stand fit beside reading its CSV."""
-    import pandas as pd
-
+    try:
+        import pandas as pd
+    except ImportError:
+        print('pandas is not installed, so that its reading is not compared; pip install "seaopt[bench]"')
+        return
     log = stand_log(164)
     experiment = so.Experiment(plant=so.plants.high_impedance(), log=log, outputs=("F1", "F2"))
     with tempfile.TemporaryDirectory() as folder:
