@@ -10,6 +10,12 @@ PYTEST := $(BIN)/python -m pytest
 .PHONY: demo test check lint types contract notebooks bench bench-peers nocompiler clean setup
 .DEFAULT_GOAL := demo
 
+# Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
+METHODS     := tests/estimation/test_methods.py
+INTERPRETED := tests/simulation tests/estimation/test_fit.py tests/estimation/test_nist.py tests/test_whole_path.py \
+               $(METHODS)::test_prediction_error_sees_noise_inside_the_plant \
+               $(METHODS)::test_slow_drift_is_taken_out $(METHODS)::test_shots_start_where_the_plant_is
+
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt tools/setup.sh
@@ -24,7 +30,7 @@ test: $(READY)
 
 # The same numbers without a C compiler: the tests that compare both ways, and the simulation and fit tests.
 nocompiler: $(READY)
-	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q tests/simulation tests/estimation tests/test_whole_path.py
+	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q $(INTERPRETED)
 
 lint: $(READY)
 	$(BIN)/ruff check .
