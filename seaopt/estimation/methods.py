@@ -24,7 +24,7 @@ class OutputError:
 
     """
 
-    max_iterations: int = 60
+    max_iterations: int = 120
     search: bool = True
     seed: int = 0
 
@@ -51,7 +51,7 @@ class MultipleShooting:
     """
 
     segments: int = 50
-    max_iterations: int = 60
+    max_iterations: int = 120
     search: bool = True
     seed: int = 0
 
@@ -80,7 +80,7 @@ class PredictionError:
 
     """
 
-    max_iterations: int = 60
+    max_iterations: int = 240
     search: bool = True
     seed: int = 0
 

@@ -89,8 +89,8 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     checked = (here.z, ())
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement, max_iterations=max_iterations,
-            callback=callback,
+            problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement,
+            max_iterations=max(max_iterations - iterations, 1), callback=callback,
         )  # fmt: skip
         here, iterations = solution.evaluation, iterations + solution.iterations
         if not np.isfinite(here.cost):
@@ -107,10 +107,13 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
         if not (settled and checked[1] == before and moved @ here.hessian @ moved < 1.0):
             problem, here, error = _refined(problem, here, STEP_ERROR_SIGMA)
             checked = here.z, problem.substeps
-        done = settled and problem.substeps == before
-        if done or attempt == MAX_ROUNDS - 1:
+        done, spent = settled and problem.substeps == before, iterations >= max_iterations
+        if done or spent or attempt == MAX_ROUNDS - 1:
             solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
-            if not done:
+            if not done and spent:
+                message = f"still moving after {iterations} iterations; raise max_iterations or start closer"
+                solution = replace(solution, status="max_iterations", message=message)
+            elif not done:
                 message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
                 solution = replace(solution, status="stalled", message=message)
             return Solved(problem=problem, solution=solution, step_error=error)
@@ -268,7 +271,7 @@ def estimated_sigma(problem: Residuals, found: Evaluation) -> tuple[Float[np.nda
             rms = float(np.sqrt(found.squares[e][o] / max(found.counts[e][o], 1.0)))
             if robust is not None:
                 rms = robust[e][o]
-            floor = 1e-9 * float(problem.spread[e][o])
+            floor = 1e-9 * (float(problem.spread[e][o]) or 1.0)  # a constant output has no size of its own
             row.append(experiment.sigma.get(name, max(rms, floor, 1e-300)))
         out.append(np.array(row))
     return tuple(out)

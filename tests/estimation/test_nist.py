@@ -55,6 +55,7 @@ MODELS = {
     "Thurber": cubic_over_cubic,
 }
 STARTS = {"far": 0, "near": 1}
+PATIENT = so.OutputError(max_iterations=1000)  # MGH10 follows a narrow valley for 300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +102,7 @@ def fitted(name, start):
     log = so.Log.from_arrays(time=np.arange(x.size, dtype=float), x=x, y=y)
     bench = so.Experiment(plant=regression(name, table.names), log=log, hold="zero", initial_state="rest", offset=False)
     given = {b: (value, "-") for b, value in zip(table.names, table.starts[STARTS[start]], strict=True)}
-    return table, so.fit([bench], so.ParameterSet.of(**given).free(*table.names))
+    return table, so.fit([bench], so.ParameterSet.of(**given).free(*table.names), method=PATIENT)
 
 
 def sets(*but):
