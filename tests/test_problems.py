@@ -122,7 +122,7 @@ def test_flexlink_frequency_and_damping(data):
 
 
 def test_xl330_on_trajectories_not_fitted(data):
-    """Friction from the load halves the error on other trajectories; the servo is that of the published fit."""
+    """Friction from the load takes four tenths of the error on other trajectories; the inertia is the published one."""
     xl330 = script("xl330")
     folder = measured(data, "xl330")
     assert xl330.duty_scale(folder) == pytest.approx(4096 / (2 * np.pi) / 256, rel=0.01)
