@@ -26,6 +26,7 @@ Trace = tuple[
 ]
 
 
+@np.errstate(all="ignore")  # a plant that overflows gives numbers that are not finite, as the compiled pass does
 def interpreted_passes(
     model: Model,
     segment: Segment,
