@@ -33,7 +33,6 @@ from seaopt.estimation.covariance import (
     Covariance,
     Errors,
     column_chunks,
-    errors,
     inverse,
     pull_of,
     robust_bread,
@@ -158,7 +157,7 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     minimum = fit.at_minimum("bootstrap")
     problem = minimum.problem
     _check(fit, problem, draws, refit, block)
-    left = fit.residuals or errors(problem, minimum.z)
+    left = minimum.errors()
     rng = np.random.default_rng(seed)
     names = problem.unknowns.names[: problem.unknowns.shared]
     lengths = [_length(problem, left, e, block) for e in range(len(problem.experiments))]

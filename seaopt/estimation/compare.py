@@ -32,7 +32,7 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.correlation import autocorrelation
-from seaopt.estimation.covariance import Errors, errors
+from seaopt.estimation.covariance import Errors
 from seaopt.estimation.forecasts import Percent, fit_percent, free_run, in_band, used_and_held_out
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit
@@ -208,12 +208,11 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
 
     """
     named = _named(fits)
-    problems = {name: fit.at_minimum("compare").problem for name, fit in named.items()}
+    minima = {name: fit.at_minimum("compare") for name, fit in named.items()}
+    problems = {name: minimum.problem for name, minimum in minima.items()}
     _check(problems)
-    weighted = {
-        name: fit.residuals or errors(problems[name], fit.at_minimum("compare").z) for name, fit in named.items()
-    }
-    free = {name: free_run(fit) for name, fit in named.items()}
+    weighted = {name: minimum.errors() for name, minimum in minima.items()}
+    free = {name: free_run(minimum, weighted[name]) for name, minimum in minima.items()}
     shared = next(iter(problems.values()))
     places = [(e, o) for e, experiment in enumerate(shared.experiments) for o in range(len(experiment.outputs))]
     effective = {

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from seaopt.estimation.advice import OutputDiagnostics, sentences
 from seaopt.estimation.correlation import LAGS, QUANTILE, CrossCorrelation, autocorrelation, cross_correlation
-from seaopt.estimation.covariance import Errors, errors, leftover
+from seaopt.estimation.covariance import Errors, leftover
 from seaopt.estimation.forecasts import Percent, fit_percent, free_run, one_step
 from seaopt.estimation.leverage import Leverage, leverage
 from seaopt.estimation.residuals import Residuals
@@ -36,6 +36,8 @@ class Diagnostics:
         Of the fit.
     sentences : tuple of str
         What is wrong and what to do about it, the worst first; empty if nothing is seen.
+    residuals : list of lists of Errors
+        What was tested, of each experiment and segment.
 
     """
 
@@ -45,6 +47,7 @@ class Diagnostics:
     aic: float
     bic: float
     sentences: tuple[str, ...]
+    residuals: list[list[Errors]] = field(default_factory=list[list[Errors]], repr=False)
 
     @property
     def ok(self) -> bool:
@@ -143,12 +146,12 @@ def diagnose(fit: Fit) -> Diagnostics:
     """
     minimum = fit.at_minimum("diagnose")
     problem = minimum.problem
-    left = fit.residuals or errors(problem, minimum.z)
-    free, ahead = free_run(fit), one_step(minimum)
-    sums = [leftover(problem, e, minimum.z) for e in range(len(problem.experiments))]
+    left = minimum.errors()
+    free, ahead = free_run(minimum, left), one_step(minimum)
+    white = _whiteness(fit, minimum)
     outputs = {
         experiment.name: {
-            name: _output(problem, e, o, left, free, ahead, sums[e].whiteness(o))
+            name: _output(problem, e, o, left, free, ahead, white[experiment.name][name])
             for o, name in enumerate(experiment.outputs)
         }
         for e, experiment in enumerate(problem.experiments)
@@ -156,8 +159,19 @@ def diagnose(fit: Fit) -> Diagnostics:
     shares, at_bound = leverage(minimum), _at_bound(minimum)
     return Diagnostics(
         outputs=outputs, leverage=shares, at_bound=at_bound, aic=fit.aic, bic=fit.bic,
-        sentences=sentences(fit, outputs, shares, at_bound, left, free),
+        sentences=sentences(fit, outputs, shares, at_bound, left, free), residuals=left,
     )  # fmt: skip
+
+
+def _whiteness(fit: Fit, minimum: Minimum) -> dict[str, dict[str, float]]:
+    """Return each output's Ljung-Box p, which a fit without diagnostics does not have."""
+    if fit.outputs:
+        return {name: {output: item.whiteness_p for output, item in row.items()} for name, row in fit.outputs.items()}
+    sums = [leftover(minimum.problem, e, minimum.z) for e in range(len(fit.experiments))]
+    return {
+        experiment.name: {name: one.whiteness(o) for o, name in enumerate(experiment.outputs)}
+        for experiment, one in zip(fit.experiments, sums, strict=True)
+    }
 
 
 def _output(

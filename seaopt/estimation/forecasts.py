@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from seaopt.estimation.covariance import Errors, counted, errors
 from seaopt.estimation.residuals import Residuals
-from seaopt.estimation.result import Fit, Minimum
+from seaopt.estimation.result import Minimum
 from seaopt.estimation.solve import with_observers
 from seaopt.estimation.unknowns import Slot
 
@@ -68,11 +68,10 @@ def in_band(problem: Residuals, e: int, rows: list[Float[np.ndarray, "..."]]) ->
     return np.concatenate(found)
 
 
-def free_run(fit: Fit) -> list[list[Errors]]:
-    """Return what the simulation leaves over, also of a fit of errors of prediction."""
-    minimum = fit.at_minimum("free_run")
+def free_run(minimum: Minimum, left: list[list[Errors]]) -> list[list[Errors]]:
+    """Return what the simulation leaves over, which is the fit's own residuals unless they are errors of prediction."""
     if minimum.problem.observers is None:
-        return fit.residuals or errors(minimum.problem, minimum.z)
+        return left
     return errors(replace(minimum.problem, observers=None), minimum.z)
 
 

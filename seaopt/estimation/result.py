@@ -114,6 +114,10 @@ class Minimum:
     problem: Residuals
     z: Float[np.ndarray, " n"]
 
+    def errors(self) -> list[list[Errors]]:
+        """Return the residuals of each experiment and segment, by a simulation of them all."""
+        return errors(self.problem, self.z)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
@@ -181,11 +185,6 @@ class Fit:
     def ok(self) -> bool:
         """Whether the search converged and every free parameter can be told."""
         return self.status == "converged"
-
-    @property
-    def residuals(self) -> list[list[Errors]]:
-        """Residuals of each experiment and segment, made anew; empty when the fit was read from a file."""
-        return [] if self.minimum is None else errors(self.minimum.problem, self.minimum.z)
 
     @property
     def aic(self) -> float:

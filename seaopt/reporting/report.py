@@ -74,7 +74,7 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     if controller is None and certificate is not None:
         controller = certificate.controller
     surveys = fit_surveys(fit) if fit is not None else {}
-    diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None and fit.residuals else None
+    diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None else None
     figures = all_figures(fit, surveys, controller, _plants(controller, certificate))
     figures |= _leftover_figures(fit, diagnostics, ranking)
     target = Path(path)

@@ -25,7 +25,7 @@ def residual_figure(fit: Fit, found: Diagnostics, name: str) -> Figure:
     figure, axes = panels(len(outputs), 3, ROW * len(outputs), sharex="col", width_ratios=(1.2, 0.8, 1.0))
     for o, (output, item) in enumerate(outputs.items()):
         left, middle, right = axes[o]
-        _residual(left, fit, e, o)
+        _residual(left, fit, found, e, o)
         left.set_ylabel(f"{output} [sigma]")
         lags = np.arange(item.autocorrelation.size)
         _band(middle, item.autocorrelation_bound)
@@ -47,8 +47,8 @@ def residual_figure(fit: Fit, found: Diagnostics, name: str) -> Figure:
     return figure
 
 
-def _residual(axis: Axes, fit: Fit, e: int, o: int) -> None:
-    rows = [error.weighted[:, o] for error in fit.residuals[e]]
+def _residual(axis: Axes, fit: Fit, found: Diagnostics, e: int, o: int) -> None:
+    rows = [error.weighted[:, o] for error in found.residuals[e]]
     log = fit.experiments[e].log
     time = np.concatenate([log.time[piece] for piece in fit.experiments[e].pieces]) - log.time[0]
     values = np.concatenate(rows)
