@@ -10,6 +10,29 @@ from jaxtyping import Float
 from seaopt.errors import LogError
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """Where a channel came from.
+
+    Parameters
+    ----------
+    file : str
+        The file's path as given; "" for arrays.
+    sha256 : str
+        Of the file's bytes, hexadecimal; "" for arrays.
+    column : str
+        Header, path or topic.field inside the file.
+    conversion : str
+        What was done to its numbers on the way to SI, in words, for example "mA to A".
+
+    """
+
+    file: str = ""
+    sha256: str = ""
+    column: str = ""
+    conversion: str = ""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Signal:
     """One channel of a log: samples in an SI unit.
@@ -22,12 +45,15 @@ class Signal:
         Samples in `unit`; NaN marks a missing one.
     unit : str
         SI unit text; "" where it was not said (arrays from Python are SI by convention).
+    origin : Origin
+        File, column and conversion.
 
     """
 
     name: str
     values: Float[np.ndarray, " n"]
     unit: str = ""
+    origin: Origin = Origin()
 
     def __post_init__(self) -> None:
         if self.values.ndim != 1:
