@@ -48,16 +48,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-from scipy.linalg import block_diag
+from jaxtyping import Complex, Float
+from scipy.linalg import block_diag, schur
 
 from seaopt.control.controller import Controller
 from seaopt.control.law import TransferFunction
 from seaopt.errors import ControlError
 
 Vector = Float[np.ndarray, " n"]
-AT_ONE = 1e-12  # a denominator this small at q = 1, against its coefficients, has a root there
+EPS = float(np.finfo(float).eps)
+POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coefficients, has a root there
+ZERO_AT_ONE = 4 * EPS  # stricter for a numerator: a weak integral is to be kept, and one of rounding does no harm
 NEGLIGIBLE = 1e-13  # Hankel singular values below this share of the law's gain are rounding
+SAME = 1e-6  # how well the state space must have the response of its transfer functions
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
@@ -129,6 +132,14 @@ class RunnableLaw:
         inner = np.eye(n - m) - self.a[m:, m:]
         out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
         return out[0], out[1]
+
+    def response(self, f: Float[np.ndarray, " k"]) -> tuple[Complex[np.ndarray, " k"], Complex[np.ndarray, " k"]]:
+        """Return C_r and C_y at frequencies in Hz, above zero."""
+        z = np.exp(2j * np.pi * f * self.sample_time_s)
+        inner = z[:, None, None] * np.eye(self.c.size) - self.a
+        causes = np.column_stack([self.b_reference, self.b_measurement]).astype(complex)
+        out = self.c @ np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape)))
+        return out[:, 0] + self.d_reference, out[:, 1] + self.d_measurement
 
     def reset(self, reference: float = 0.0, measurement: float = 0.0, current_A: float = 0.0) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
@@ -250,7 +261,8 @@ def realise(
     Raises
     ------
     ControlError
-        A number is out of range, or the law by itself is unstable other than by integrators.
+        A number is out of range, the law by itself is unstable other than by integrators, or its poles lie so close
+        together that double precision does not hold it.
 
     """
     for name, value in (
@@ -271,7 +283,7 @@ def realise(
     tracking = _tracking(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
     share = sample_time_s / (tracking + sample_time_s) if tracking is not None else 0.0
     b = np.vstack([gains, b])
-    return RunnableLaw(
+    law = RunnableLaw(
         a=np.asarray(block_diag(np.eye(m) + np.eye(m, k=1), a)),
         b_reference=b[:, 0].copy(),
         b_measurement=b[:, 1].copy(),
@@ -285,6 +297,24 @@ def realise(
         current_per_force_A_per_N=current_per_force_A_per_N,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
     )
+    _check(law, reference, measurement)
+    return law
+
+
+def _check(law: RunnableLaw, reference: TransferFunction, measurement: TransferFunction) -> None:
+    """Refuse a law whose response is not that of its transfer functions, but for their coefficients' rounding."""
+    f = np.geomspace(1e-4, 0.49, 25) / law.sample_time_s
+    q = np.exp(-2j * np.pi * f * law.sample_time_s)
+    for found, tf in zip(law.response(f), (reference, measurement), strict=True):
+        bottom = np.polynomial.polynomial.polyval(q, tf.den)
+        wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
+        rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
+        allowed = SAME * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
+        if not np.all(np.abs(found - wanted) <= allowed):
+            raise ControlError(
+                "the law's slow poles are too close together to tell from integrators in double precision; "
+                "sample more slowly, or make them faster"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -302,9 +332,9 @@ def _split(name: str, tf: TransferFunction) -> _Part:
     num, den, m = tf.num.astype(float), np.trim_zeros(tf.den.astype(float), "b"), 0
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
         raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
-    while den.size > 1 and _at_one(den):
+    while den.size > 1 and _at_one(den, POLE_AT_ONE):
         den, m = np.cumsum(den)[:-1], m + 1
-        if num.size > 1 and _at_one(num):
+        if num.size > 1 and _at_one(num, ZERO_AT_ONE):
             num, m = np.cumsum(num)[:-1], m - 1
     series = _taylor(num, den, m + 2)
     chain = np.zeros(m + 1)  # the coefficients of w^0 ... w^m in X / delta^m, with 1/delta = 1 + w
@@ -327,8 +357,8 @@ def _common(parts: list[_Part]) -> tuple[list[Float[np.ndarray, " _"]], Float[np
     return [np.convolve(one.rest, other.den), np.convolve(other.rest, one.den)], np.convolve(one.den, other.den)
 
 
-def _at_one(polynomial: Float[np.ndarray, " n"]) -> bool:
-    return bool(abs(np.sum(polynomial)) <= AT_ONE * np.sum(np.abs(polynomial)))
+def _at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:
+    return bool(abs(np.sum(polynomial)) <= share * np.sum(np.abs(polynomial)))
 
 
 def _flipped(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -370,6 +400,8 @@ def _balanced(
     b = np.column_stack([np.pad(p, (0, n + 1 - p.size))[1:] - p[0] * column for p in numerators])
     if not c.size:
         return a, b, c
+    a, turn = (np.asarray(part) for part in schur(a))  # powers of a triangle keep its poles, of a companion form not
+    b, c = turn.T @ b, c @ turn
     radius = float(np.max(np.abs(np.linalg.eigvals(a))))
     if radius >= 1.0:
         raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; tune a stable one")
