@@ -128,6 +128,15 @@ def test_what_nothing_drives_is_left_out():
     assert law_of("pd", k_d=0.0).run(np.ones(3), np.ones(3))[0] == pytest.approx([1.0, 1.0, 1.0])
 
 
+def test_a_law_may_leave_the_reference_out(signals):
+    c_y = Gains(**GAINS).transfer_functions("pid", TS)[1]
+    law = realise(tf([0.0], c_y.den), c_y, sample_time_s=TS)
+    r, y = signals[:, :200]
+    expected = -lfilter(c_y.num, c_y.den, y)
+    np.testing.assert_allclose(law.run(r, y)[0], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert law.tracking_time_s == pytest.approx(3.2 / 1.3, rel=1e-3)
+
+
 def test_a_state_takes_single_precision():
     """Rounding every matrix to single leaves the response within 1e-6 of itself: no companion form of high order."""
     poles = product([1, -1], [1, -0.99], [1, -0.97], [1, -0.9], [1, -1.9, 0.92])
