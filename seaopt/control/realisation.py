@@ -106,6 +106,14 @@ class RunnableLaw:
         """The motor force at the current limit."""
         return self.current_limit_A / self.current_per_force_A_per_N
 
+    def __repr__(self) -> str:
+        tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
+        limit = "no current limit" if math.isinf(self.current_limit_A) else f"limited to {self.current_limit_A:g} A"
+        return (
+            f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
+            f"{1 / self.sample_time_s:.6g} Hz, {limit}"
+        )
+
     def rest(self) -> tuple[Vector, Vector]:
         """Return x per reference and per measurement (counted negative) at rest, integrators zero."""
         m, n = self.integrators, self.c.size

@@ -191,6 +191,9 @@ def test_back_calculation_is_the_written_one(signals):
 def test_the_default_tracking_time_is_that_of_the_docs():
     assert law_of().tracking_time_s == pytest.approx((1.0 + 3.2) / 1.3 - TS / 2, rel=1e-9)
     assert law_of("pd").tracking_time_s is None
+    assert repr(law_of(limit=9.0)) == (
+        "RunnableLaw of order 2 (1 of it integrators, tracking time 3.23 s) at 1000 Hz, limited to 9 A"
+    )
 
 
 def test_a_disturbance_observer_sees_the_saturated_command(signals):
