@@ -24,12 +24,13 @@ Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Fol
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON and nothing else.")]
 
 
-def _version(wanted: bool) -> None:
+def _version(wanted: bool) -> bool:
     if wanted:
         from seaopt import __version__
 
         typer.echo(f"seaopt {__version__}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()
@@ -119,6 +120,31 @@ for _name, _text in (
     ("report", "Write report.html and figures from the results in DIR."),
 ):
     app.command(_name)(_stage(_name, _text))
+
+
+@app.command()
+def export(
+    results: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with controller.json.", show_default=False)],
+    c: Annotated[Path, typer.Option("--c", metavar="OUT", help="Folder for the C code and the gains.")],
+    precision: Annotated[str, typer.Option(metavar="double|float", help="Of the C code.")] = "double",
+    name: Annotated[str, typer.Option(help="Begins every name in C.")] = "force_law",
+    current_limit: Annotated[
+        float | None, typer.Option(metavar="AMPERES", help="In place of the specification's current_limit_A.")
+    ] = None,
+    tracking_time: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Of the anti-windup, in place of the default.")
+    ] = None,
+    allow_infeasible: Annotated[
+        bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
+    from seaopt.cli.exported import exported
+
+    options = {"current_limit_A": current_limit, "tracking_time_s": tracking_time, "allow_infeasible": allow_infeasible}
+    if not exported(results, c, json, precision=precision, name=name, **options):
+        raise typer.Exit(1)
 
 
 def main() -> None:

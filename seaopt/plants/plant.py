@@ -42,6 +42,9 @@ class Plant:
         Figures of interest that follow from the parameters; a fit reports them with their uncertainty.
     optional_inputs : collection of names
         Inputs that a log may leave out; they are then zero (external forces).
+    port : callable ``() -> Plant``, optional
+        Makes the same actuator with link 1 held and a mass m_2 on link 2 (states x_2 and v_2, input Fe2), for the
+        impedance that it shows at link 2.
 
     Raises
     ------
@@ -76,6 +79,7 @@ class Plant:
     h: Equations
     derived: Derived | None = None
     optional_inputs: frozenset[str] = frozenset()
+    port: Callable[[], Any] | None = field(default=None, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
     u: Any = field(init=False, repr=False)

@@ -285,6 +285,8 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
             values |= {f"x_{number}": link.position, f"phi{build.suffixes[number - 1]}": link.coordinate}
         return {name: values[name] for name in outputs}
 
+    inside = [part for part in build.parts if part in part_laws.INSIDE]
+    held = replace(build, links=("fixed", "mass"), suffixes=("1", "2"), parts=tuple(inside))
     plant = Plant(
         name=name,
         states=states,
@@ -295,6 +297,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         h=h,
         derived=lambda p: derived_figures(p, housing_rides=build.drive == "unlumped" and build.spring == "link2"),
         optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
+        port=lambda: _actuator(f"port of {name}", held, external=True),
     )
     return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])
 
