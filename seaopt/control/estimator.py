@@ -169,9 +169,7 @@ class Estimator:
         innovation = y - self.offset - self.C @ state.predicted - self.D @ applied
         return state.predicted + self.gain @ np.where(np.isnan(innovation), 0.0, innovation), innovation
 
-    def step(
-        self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]
-    ) -> EstimatorState:
+    def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
         """Take one sample in: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
         line = np.vstack([state.past, u])
         applied = line[0]
@@ -241,8 +239,7 @@ class Estimator:
 
     def __repr__(self) -> str:
         rows = [
-            f"  {name:<12} ± {std:.3g} {unit}"
-            for (name, std), unit in zip(self.std.items(), self.units, strict=True)
+            f"  {name:<12} ± {std:.3g} {unit}" for (name, std), unit in zip(self.std.items(), self.units, strict=True)
         ]
         plural = "" if self.delay_samples == 1 else "s"
         delay = f", delay of {self.delay_samples} sample{plural}" if self.delay_samples else ""
