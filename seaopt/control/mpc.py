@@ -39,9 +39,11 @@ from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
+RHO = 0.3  # of ADMM at the start of each program; with slew limits on many knots it has to grow on the way
 SETTINGS: dict[str, Any] = {
-    "eps_abs": 1e-5, "eps_rel": 1e-5, "max_iter": 500, "check_termination": 10, "rho": 0.1, "adaptive_rho": False,
-    "polishing": False, "warm_starting": True, "scaling": 10, "verbose": False,
+    "eps_abs": 1e-4, "eps_rel": 1e-4, "max_iter": 1000, "check_termination": 5, "rho": RHO, "adaptive_rho": True,
+    "adaptive_rho_interval": 20, "adaptive_rho_tolerance": 2.0, "polishing": False, "warm_starting": True,
+    "scaling": 10, "verbose": False,
 }  # fmt: skip
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
@@ -346,7 +348,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec, design=(plant, values), kalman=kalman, regulator=found, prediction=prediction, static_gain=gain,
-        rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=_solver(prediction),
+        rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
     )  # fmt: skip
 
 
@@ -375,7 +377,7 @@ def _static_gain(plant: Plant, a: Float[np.ndarray, "n n"], gain: float, d: floa
     return gain
 
 
-def _solver(prediction: Prediction) -> Any:
+def make_solver(prediction: Prediction) -> Any:
     """Return OSQP set up with the program's matrices, and bounds that have no effect yet."""
     import osqp  # deferred: scipy.sparse and jinja2 are slow to load
     from scipy.sparse import csc_matrix
@@ -397,6 +399,8 @@ def _solved(
     solver.update(q=q, l=low, u=high)
     solver.warm_start(x=first, y=dual)
     result = solver.solve(raise_error=False)
+    if result.info.rho_updates:
+        solver.update_settings(rho=RHO)  # the next step starts as this one did
     x, y = np.array(result.x), np.array(result.y)
     wrong = "" if result.info.status == "solved" else str(result.info.status)
     if not wrong and not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
