@@ -1,4 +1,4 @@
-"""A digital law on a plant as it is, nonlinear and between samples, with the delay, sensor noise and disturbance it has."""
+"""A digital law on a plant as it is, nonlinear and continuous, with delay, sensor noise and disturbance."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 r"""A Kalman filter of an identified plant: forces, spring rate and motion of the links from what is measured.
 
-The plant is linearised at rest and sampled through a zero-order hold; white noise w and random walk d of its inputs (see
-`noise`) are states beside its own, so that :math:`z = [x, w, d]` and
+The plant is linearised at rest and sampled through a zero-order hold; white noise w and random walk d of its inputs
+(see `noise`) are states beside its own, so that :math:`z = [x, w, d]` and
 
 .. math::
     z_{k+1} = A z_k + B u_{k-n} + v_k, \quad y_k = C z_k + D u_{k-n} + e_k, \qquad
@@ -9,7 +9,8 @@ The plant is linearised at rest and sampled through a zero-order hold; white noi
 
 with n whole samples of delay, innovations :math:`\epsilon_k = y_k - C \hat z_k - D u_{k-n}` and the steady-state gain
 :math:`L = P C^T S^{-1}`, :math:`S = C P C^T + R`, where P solves the discrete algebraic Riccati equation. If plant and
-noise are right the innovations are white with covariance S: `run` tests that on a log (Ljung and Box, Biometrika 65, 1978).
+noise are right the innovations are white with covariance S: `run` tests that on a log (Ljung and Box, Biometrika 65,
+1978).
 
 Every matrix is public: a step is two products of small matrices, as easily written in C.
 """
@@ -19,11 +20,11 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.estimates import augmented, disturbances_of, estimates
 from seaopt.control.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
@@ -300,8 +301,8 @@ def estimator(
     block = np.zeros((nx + nu, nx + nu))
     block[:nx, :nx], block[:nx, nx:] = a, b
     whole, _ = expm_with_derivatives(block * sample_time_s, np.zeros((0, nx + nu, nx + nu)))
-    disturbances = _disturbances(plant, noise, sample_time_s)
-    A, B, Q = _augmented(whole[:nx, :nx], whole[:nx, nx:], disturbances)
+    disturbances = disturbances_of(plant, noise, sample_time_s)
+    A, B, Q = augmented(whole[:nx, :nx], whole[:nx, nx:], disturbances)
     columns = [column for column, _, _ in disturbances]
     rows = [list(plant.outputs).index(name) for name in chosen]
     C, D = np.hstack([c, d[:, columns]])[rows], d[rows]
@@ -310,7 +311,7 @@ def estimator(
     S = C @ P @ C.T + R
     gain = np.linalg.solve(S, C @ P).T
     keep = np.eye(len(A)) - gain @ C
-    names, units, G, H = _estimates(plant, values, (a, b, c, d), disturbances)
+    names, units, G, H = estimates(plant, values, (a, b, c, d), disturbances)
     return Estimator(
         plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples, noise=noise,
         A=A, B=B, C=C, D=D, gain=gain, covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
@@ -341,25 +342,6 @@ def _check(
         raise ControlError("noise: nothing but the sensors is noisy; give input_noise or input_drift above zero")
 
 
-def _disturbances(plant: Plant, noise: NoiseModel, sample_time_s: float) -> list[tuple[int, float, float]]:
-    """Return (input, pole, variance over one sample) of each disturbance: white ones have pole 0, walks pole 1."""
-    inputs, root = list(plant.inputs), np.sqrt(sample_time_s)
-    white = [(inputs.index(name), 0.0, (s / root) ** 2) for name, s in noise.input_noise.items() if s > 0.0]
-    return white + [(inputs.index(name), 1.0, (s * root) ** 2) for name, s in noise.input_drift.items() if s > 0.0]
-
-
-def _augmented(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, "nx nu"], disturbances: list[tuple[int, float, float]]
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n nu"], Float[np.ndarray, "n n"]]:
-    """Return A, B and Q of the plant with its disturbances as states."""
-    nx, count = len(a), len(disturbances)
-    A, Q = np.zeros((nx + count, nx + count)), np.zeros((nx + count, nx + count))
-    A[:nx, :nx] = a
-    for i, (column, pole, variance) in enumerate(disturbances, start=nx):
-        A[:nx, i], A[i, i], Q[i, i] = b[:, column], pole, variance
-    return A, np.vstack([b, np.zeros((count, b.shape[1]))]), Q
-
-
 def _riccati(
     plant: Plant, outputs: tuple[str, ...], A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"],
     Q: Float[np.ndarray, "n n"], R: Float[np.ndarray, "ny ny"],
@@ -380,50 +362,9 @@ def _riccati(
         return np.asarray(solve_discrete_are(A.T, C.T, Q, R))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ControlError(
-            f"no steady filter of {plant.name} from {', '.join(outputs)} ({error}); measure more outputs, or give noise "
-            "to every input"
+            f"no steady filter of {plant.name} from {', '.join(outputs)} ({error}); "
+            "measure more outputs, or give noise to every input"
         ) from error
-
-
-def _estimates(
-    plant: Plant, params: ParameterSet, matrices: tuple[Any, Any, Any, Any],
-    disturbances: list[tuple[int, float, float]],
-) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:  # fmt: skip
-    """Return names, units, G and H of everything that is estimated."""
-    a, b, c, d = matrices
-    nx, nu = b.shape
-    columns = [column for column, _, _ in disturbances]
-    units = dict(plant.outputs)
-    rows = {name: (c[i], d[i]) for i, name in enumerate(plant.outputs)}
-    for i, (name, unit) in enumerate(plant.states.items()):
-        if name not in rows:
-            rows[name], units[name] = (np.eye(nx)[i], np.zeros(nu)), unit
-    weights = _deflection(plant, params)
-    if weights:
-        row = np.sum([weight * rows[name][0] for name, weight in weights.items()], axis=0)
-        unit = "m" if "q" in weights else "rad"
-        rows |= {"spring_deflection": (row, np.zeros(nu)), "spring_rate": (row @ a, row @ b)}
-        units |= {"spring_deflection": unit, "spring_rate": f"{unit}/s"}
-    G = np.array([np.concatenate([x, u[columns]]) for x, u in rows.values()])
-    H = np.array([u for _, u in rows.values()])
-    inputs = list(plant.inputs)
-    for i, (column, pole, _) in enumerate(disturbances, start=nx):
-        if pole == 1.0:
-            name = f"{inputs[column]}_drift"
-            units[name] = plant.inputs[inputs[column]]
-            G, H = np.vstack([G, np.eye(nx + len(disturbances))[i]]), np.vstack([H, np.zeros(nu)])
-            rows[name] = (np.zeros(nx), np.zeros(nu))
-    return tuple(rows), tuple(units[name] for name in rows), G, H
-
-
-def _deflection(plant: Plant, params: ParameterSet) -> dict[str, float]:
-    """Return the compression of the spring as weights of outputs and states; empty for a plant not of ours."""
-    if "q" in plant.outputs and "k" in plant.parameters:  # q [+ s] + x_2 - x_1 with either end of the spring
-        signs = {"q": 1.0, "s": 1.0, "x_2": 1.0, "x_1": -1.0}
-        return {name: sign for name, sign in signs.items() if name in plant.outputs or name in plant.states}
-    if {"theta_m", "theta_l"} <= set(plant.outputs) and "N" in plant.parameters:
-        return {"theta_m": 1.0 / plant.complete(params)["N"].value, "theta_l": -1.0}
-    return {}
 
 
 def recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:

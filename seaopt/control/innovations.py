@@ -100,7 +100,7 @@ def _late(kalman: Estimator, log: Log) -> Float[np.ndarray, "m ny"]:
 
 
 def _third_difference(y: Float[np.ndarray, " n"]) -> float:
-    """Return the standard deviation of white noise on a smooth signal: its third differences have 20 times its variance."""
+    """Return the standard deviation of white noise on a smooth signal: third differences have 20 times its variance."""
     found = float(np.sqrt(np.mean(np.diff(y, 3) ** 2) / 20.0))
     return max(found, 1e-9 * float(np.max(np.abs(y))), 1e-300)
 

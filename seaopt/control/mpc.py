@@ -7,13 +7,12 @@ disturbance,
 .. math:: u_s = \operatorname{clip}(F_\mathrm{ref}/g - \hat d,\ \pm I_\mathrm{max}), \qquad
           x_s = (I - A)^{-1} b\,(u_s + \hat d),
 
-make the force free of offset wherever a current within limits can (Pannocchia and Rawlings, AIChE J. 49, 2003); and the
-program of `prediction`, which always has a solution, is solved by OSQP (Stellato et al., Math. Prog. Comp. 12, 2020) from
-the last one shifted by a sample. Only its vectors change, so that the matrices are factorised once, here and in the C code.
+make the force free of offset wherever a current within limits can (Pannocchia and Rawlings, AIChE J. 49, 2003); and
+the program of `prediction`, which always has a solution, is solved from the last one shifted by a sample.
 
-What the solver returns is not trusted: its status is checked, its currents are held against the limits, and the one that
-is used is clipped to them. If it fails, the current goes towards :math:`u_s` as fast as the slew limit lets it, and the
-step says so.
+What the solver returns is not trusted: its status is checked, its currents are held against the limits, and the one
+that is used is clipped to them. If it fails, the current goes towards :math:`u_s` as fast as the slew limit lets it,
+and the step says so.
 """
 
 from __future__ import annotations
@@ -33,18 +32,13 @@ from seaopt.control.loop import Loop
 from seaopt.control.mpc_spec import MPCSpec
 from seaopt.control.noise import NoiseModel
 from seaopt.control.prediction import Prediction, Regulator, condense, regulator_of_bandwidth, spread_knots
+from seaopt.control.quadratic_program import make_solver, solved
 from seaopt.control.tuner import current_per_force
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
-RHO = 0.3  # of ADMM at the start of each program; with slew limits on many knots it has to grow on the way
-SETTINGS: dict[str, Any] = {
-    "eps_abs": 1e-4, "eps_rel": 1e-4, "max_iter": 1000, "check_termination": 5, "rho": RHO, "adaptive_rho": True,
-    "adaptive_rho_interval": 20, "adaptive_rho_tolerance": 2.0, "polishing": False, "warm_starting": True,
-    "scaling": 10, "verbose": False,
-}  # fmt: skip
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
 
@@ -164,7 +158,7 @@ class ForceMPC:
         xi, u_s, target = self._targets(ahead, reference_N)
         q, low, high = self.program(xi, u_s, last)
         first = (self.shift @ state.plan - u_s) / limit
-        theta, dual, status, info = _solved(self.solver, q, low, high, first, state.dual)
+        theta, dual, status, info = solved(self.solver, q, low, high, first, state.dual)
         status = status or self._fault(theta, low, high)
         if status:
             theta, dual = np.zeros_like(q), np.zeros_like(low)
@@ -305,6 +299,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     plant, params
         The design plant, the test stand as a rule, and its parameters; its first input is the motor current.
     spec : MPCSpec
+        Limits and bandwidth.
 
     Raises
     ------
@@ -317,7 +312,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     >>> import seaopt as so
     >>> from seaopt.control import MPCSpec, force_mpc
     >>> mpc = force_mpc(so.plants.high_impedance(), so.plants.thor(), MPCSpec(current_limit_A=9.0))
-    >>> step = mpc.step(mpc.start, reference_N=1000.0, measurement_N=0.0)
+    >>> step = mpc.step(mpc.start, reference_N=2000.0, measurement_N=0.0)
     >>> step.solved, round(step.current_A, 3)
     (True, 9.0)
 
@@ -375,37 +370,6 @@ def _static_gain(plant: Plant, a: Float[np.ndarray, "n n"], gain: float, d: floa
             f"{spec.largest_force_N:g}; raise the one or lower the other"
         )
     return gain
-
-
-def make_solver(prediction: Prediction) -> Any:
-    """Return OSQP set up with the program's matrices, and bounds that have no effect yet."""
-    import osqp  # deferred: scipy.sparse and jinja2 are slow to load
-    from scipy.sparse import csc_matrix
-
-    n = prediction.knots.size
-    rows = np.vstack([np.eye(n), prediction.M])
-    solver = osqp.OSQP(algebra="builtin")
-    wide = np.full(len(rows), 10.0)
-    P = csc_matrix(np.triu(prediction.H))
-    solver.setup(P=P, q=np.zeros(n), A=csc_matrix(rows), l=-wide, u=wide, **SETTINGS)
-    return solver
-
-
-def _solved(
-    solver: Any, q: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
-    first: Float[np.ndarray, " n"], dual: Float[np.ndarray, " m"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], str, Any]:  # fmt: skip
-    """Return the solution, its dual, what went wrong ("" if nothing), and the solver's report."""
-    solver.update(q=q, l=low, u=high)
-    solver.warm_start(x=first, y=dual)
-    result = solver.solve(raise_error=False)
-    if result.info.rho_updates:
-        solver.update_settings(rho=RHO)  # the next step starts as this one did
-    x, y = np.array(result.x), np.array(result.y)
-    wrong = "" if result.info.status == "solved" else str(result.info.status)
-    if not wrong and not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
-        wrong = "solution is not finite"
-    return x, y, wrong, result.info
 
 
 def _transfer_function(

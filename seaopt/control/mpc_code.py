@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.mpc import RHO, VIOLATION, ForceMPC, make_solver
+from seaopt.control.mpc import VIOLATION, ForceMPC
+from seaopt.control.quadratic_program import RHO, make_solver
 from seaopt.errors import FileError
 from seaopt.files import write_text
 
@@ -25,6 +26,7 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
     Parameters
     ----------
     mpc : ForceMPC
+        As `force_mpc` makes it.
     folder : path
         Made if it is not there; files of these names in it are written anew.
     single_precision : bool

@@ -40,8 +40,8 @@ class MPCSpec:
     largest_force_N : float, optional
         A force that the current limit must be able to hold; a limit too low for it is refused.
     noise : NoiseModel, optional
-        Of the Kalman filter; with a drift of the current. If left out, one that makes the filter quick: its sensor noise
-        is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
+        Of the Kalman filter, with a drift of the current. If left out, one that makes the filter quick: its sensor
+        noise is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
 
     Raises
     ------

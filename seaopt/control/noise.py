@@ -4,8 +4,8 @@ Each input of the plant is the known one plus a white noise plus a random walk, 
 
 .. math:: u_k + w_k + d_k, \qquad w_k \sim N(0, s_w^2 / T), \qquad d_{k+1} = d_k + N(0, s_d^2 T)
 
-so that the densities :math:`s_w` and :math:`s_d` do not depend on the sample time, and a noise identified on a log at one
-rate serves a filter at another. Sensor noise is white from sample to sample, at any rate.
+so that the densities :math:`s_w` and :math:`s_d` do not depend on the sample time, and a noise identified on a log at
+one rate serves a filter at another. Sensor noise is white from sample to sample, at any rate.
 """
 
 from __future__ import annotations

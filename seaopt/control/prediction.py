@@ -11,8 +11,8 @@ with g the static gain in N/A, and :math:`\Pi` the cost of going on for ever wit
 plant with its last current as a state): with every sample free and no limit active, the first current is that of the
 linear-quadratic regulator, whatever N. The weight :math:`\rho` is found from the bandwidth that is asked of it.
 
-Currents are free at some knots only, and straight lines between: :math:`\mu = W \theta`. A limit on size or slope of such
-a line holds everywhere if it holds at the knots, so that nothing is lost but freedom.
+Currents are free at some knots only, and straight lines between: :math:`\mu = W \theta`. A limit on size or slope of
+such a line holds everywhere if it holds at the knots, so that nothing is lost but freedom.
 """
 
 from __future__ import annotations
@@ -125,12 +125,12 @@ def regulator_of_bandwidth(
 
 
 def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
-    """Return `moves` samples from 0 to samples - 1, each step about a constant factor longer than the last, at least one.
+    """Return `moves` samples from 0 to samples - 1, each step longer than the last by about a constant factor.
 
     Examples
     --------
     >>> spread_knots(50, 8).tolist()
-    [0, 1, 3, 7, 12, 20, 31, 49]
+    [0, 1, 3, 5, 10, 17, 29, 49]
     >>> spread_knots(5, 5).tolist()
     [0, 1, 2, 3, 4]
 
@@ -183,6 +183,6 @@ def condense(
     H, F = limit**2 * W.T @ hessian @ W, limit * W.T @ cross
     scale = knots.size / float(np.trace(H))
     steps = np.diff(knots, prepend=knots[0] - 1)
-    M = (np.eye(knots.size) - np.eye(knots.size, k=-1)) * limit / (slew_per_sample * steps)[:, None]
-    M = M if np.isfinite(slew_per_sample) else M[:0]
-    return Prediction(knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=M)
+    slopes = (np.eye(knots.size) - np.eye(knots.size, k=-1)) * limit / (slew_per_sample * steps)[:, None]
+    rows = knots.size if np.isfinite(slew_per_sample) else 0
+    return Prediction(knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=slopes[:rows])
