@@ -37,7 +37,7 @@ from seaopt.control.tuner import current_per_force
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import Plant, state_space
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
@@ -337,14 +337,21 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
         delay_samples=spec.delay_samples,
     )  # fmt: skip
     a, b, c = digital.a, digital.b, digital.c
-    found = regulator_of_bandwidth(a, b, c, gain, spec.bandwidth_hz, spec.sample_time_s)
+    weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, values, spec.measured)
+    found = regulator_of_bandwidth(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
-    prediction = condense(a, b, c, gain, found, knots, spec.current_limit_A, spec.slew_per_sample_A)
+    prediction = condense(a, b, weighted, gain, found, knots, spec.current_limit_A, spec.slew_per_sample_A)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec, design=(plant, values), kalman=kalman, regulator=found, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
     )  # fmt: skip
+
+
+def _rate(plant: Plant, params: ParameterSet, measured: str) -> Float[np.ndarray, " nx"]:
+    """Return the row that gives the measured output's time derivative, without the current's own part."""
+    a, _, c, _ = state_space(plant, params)
+    return c[list(plant.outputs).index(measured)] @ a
 
 
 def _drive(plant: Plant) -> str:

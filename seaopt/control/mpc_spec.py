@@ -33,6 +33,9 @@ class MPCSpec:
         Of the controller.
     delay_samples : int
         Whole samples from measurement to output, besides the hold.
+    decay : float
+        Time constant with which the force error should die out, times 2 pi bandwidth_hz, from 0 to below 1: the
+        larger, the less overshoot and the more noise in the current.
     horizon_s : float
         How far it plans.
     moves : int
@@ -56,6 +59,7 @@ class MPCSpec:
     bandwidth_hz: float = 30.0
     sample_rate_hz: float = 1000.0
     delay_samples: int = 1
+    decay: float = 0.8
     horizon_s: float = 0.05
     moves: int = 12
     largest_force_N: float | None = None
@@ -67,6 +71,8 @@ class MPCSpec:
         for name in ("current_slew_A_per_s", "largest_force_N"):
             if getattr(self, name) is not None:
                 self._positive(name)
+        if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
+            raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
         for name, least, most in (("delay_samples", 0, MAX_DELAY_SAMPLES), ("moves", 2, MAX_SAMPLES)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:

@@ -3,13 +3,15 @@ r"""What a force model predictive controller minimises: a condensed quadratic co
 From targets x_s, u_s that hold the reference, :math:`\xi = x - x_s`, :math:`\mu = u - u_s`; over N samples
 
 .. math::
-    J = \sum_{j=0}^{N-1} \Big[ (c\,\xi_j / g)^2 + \rho\,(\mu_j - \mu_{j-1})^2 \Big]
+    J = \sum_{j=0}^{N-1} \Big[ (w\,\xi_j / g)^2 + \rho\,(\mu_j - \mu_{j-1})^2 \Big]
         + \begin{bmatrix} \xi_N \\ \mu_{N-1} \end{bmatrix}^T \Pi \begin{bmatrix} \xi_N \\ \mu_{N-1} \end{bmatrix},
     \qquad \xi_{j+1} = A \xi_j + b \mu_j
 
-with g the static gain in N/A, and :math:`\Pi` the cost of going on for ever without limits (the Riccati solution of the
-plant with its last current as a state): with every sample free and no limit active, the first current is that of the
-linear-quadratic regulator, whatever N. The weight :math:`\rho` is found from the bandwidth that is asked of it.
+with :math:`w\,\xi = F - F_\mathrm{ref} + \tau \dot F`, so that an error which dies out with the time constant
+:math:`\tau` costs nothing and overshoot does; g the static gain in N/A, and :math:`\Pi` the cost of going on for ever
+without limits (the Riccati solution of the plant with its last current as a state): with every sample free and no limit
+active, the first current is that of the linear-quadratic regulator, whatever N. The weight :math:`\rho` is found from
+the bandwidth that is asked of it.
 
 Currents are free at some knots only, and straight lines between: :math:`\mu = W \theta`. A limit on size or slope of
 such a line holds everywhere if it holds at the knots, so that nothing is lost but freedom.
@@ -73,15 +75,15 @@ class Prediction:
 
 
 def regulator(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"], gain: float, rho: float
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float, rho: float
 ) -> Regulator:
-    """Return the linear-quadratic regulator of force error over `gain` and current increments."""
+    """Return the linear-quadratic regulator of w xi over `gain` and current increments."""
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
     nx = b.size
     A, B = np.eye(nx + 1), np.append(b, 1.0)[:, None]
     A[:nx, :nx], A[:nx, nx] = a, b
-    row = np.append(c / gain, 0.0)
+    row = np.append(w / gain, 0.0)
     try:
         Pi = np.asarray(solve_discrete_are(A, B, np.outer(row, row), np.array([[rho]])))
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -93,8 +95,8 @@ def regulator(
 
 
 def regulator_of_bandwidth(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"], gain: float,
-    bandwidth_hz: float, sample_time_s: float,
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
 ) -> Regulator:  # fmt: skip
     """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by bisection on rho."""
     z = np.exp(2j * np.pi * bandwidth_hz * sample_time_s)
@@ -110,18 +112,18 @@ def regulator_of_bandwidth(
         return float(abs(np.append(c, 0.0) @ state))
 
     low, high = (np.log(w) for w in WEIGHTS)
-    fastest = tracking(regulator(a, b, c, gain, np.exp(low)))
+    fastest = tracking(regulator(a, b, w, gain, np.exp(low)))
     if fastest < HALF_POWER:
         raise ControlError(
             f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
         )
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if tracking(regulator(a, b, c, gain, np.exp(middle))) > HALF_POWER:
+        if tracking(regulator(a, b, w, gain, np.exp(middle))) > HALF_POWER:
             low = middle
         else:
             high = middle
-    return regulator(a, b, c, gain, float(np.exp(0.5 * (low + high))))
+    return regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
 
 
 def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
@@ -158,7 +160,7 @@ def interpolation(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "samples n"
 
 
 def condense(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"], gain: float,
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float,
     found: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float,
 ) -> Prediction:  # fmt: skip
     """Return the quadratic program of a horizon; `limit` in A, `slew_per_sample` in A, infinite if there is none."""
@@ -167,7 +169,7 @@ def condense(
     free, forced = np.eye(nx), np.zeros((nx, N))  # xi_j = free xi_0 + forced mu
     hessian, cross = np.zeros((N, N)), np.zeros((N, nx + 1))
     for j in range(N):
-        row, start = c @ forced / gain, c @ free / gain
+        row, start = w @ forced / gain, w @ free / gain
         hessian += np.outer(row, row)
         cross[:, :nx] += np.outer(row, start)
         free, forced = a @ free, a @ forced
