@@ -29,6 +29,7 @@ from seaopt.plants import Plant
 DECADES = 8  # of the input's noise below what would explain the whole output
 SETTLING = 10  # the first tenth of the log is left out: the filter starts at rest
 LEAST = 200  # samples
+UNSEEN = 1e-6  # of what sensors show of their offsets; a part as small as that is the plant's own place
 
 
 def estimate_noise(
@@ -40,6 +41,8 @@ def estimate_noise(
     delay_samples: int = 0,
 ) -> NoiseModel:
     """Return the sensors' noise and offsets, and a white noise on the plant's first input, that explain a log best.
+
+    An offset that the plant's own place would explain, as that of a free body, is left at zero.
 
     Parameters
     ----------
@@ -109,4 +112,5 @@ def _offsets(kalman: Estimator, mean: Float[np.ndarray, " ny"]) -> dict[str, flo
     lead = kalman.A @ kalman.gain
     n = len(kalman.A)
     passed = np.eye(mean.size) - kalman.C @ np.linalg.solve(np.eye(n) - kalman.A + lead @ kalman.C, lead)
-    return dict(zip(kalman.outputs, np.linalg.solve(passed, mean).tolist(), strict=True))
+    found = np.linalg.lstsq(passed, mean, rcond=UNSEEN)[0]
+    return dict(zip(kalman.outputs, found.tolist(), strict=True))
