@@ -163,7 +163,7 @@ def test_designed_on_the_stand_it_holds_on_the_swing(swing, thor, mpc):
     figures = mpc.close(swing, thor).figures()
     assert figures.stable and figures.ms < 2.0
     run = close_loop(mpc.command, mpc.start, swing, thor, np.full(3000, 60.0), sensor_std=2.0)
-    assert np.mean(run.force[-500:]) == pytest.approx(60.0, abs=5.0)
+    assert np.mean(run.force[-500:]) == pytest.approx(60.0, abs=10.0)
     assert np.std(run.force[-500:]) < 5.0
     assert np.degrees(np.max(np.abs(run.state[:, 2]))) > 10.0
 
