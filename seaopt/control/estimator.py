@@ -337,6 +337,8 @@ def _check(
             f"f_c = {complete['f_c'].value:g}: dry friction at rest has no linear model; set f_c = 0 and let "
             "input_noise or input_drift stand for it"
         )
+    if not isinstance(noise, NoiseModel):
+        raise ControlError(f"noise is a {type(noise).__name__}; give a NoiseModel")
     noise.check(plant, outputs)
     if not any([*noise.input_noise.values(), *noise.input_drift.values()]):
         raise ControlError("noise: nothing but the sensors is noisy; give input_noise or input_drift above zero")

@@ -66,6 +66,9 @@ def estimate_noise(
     from scipy.optimize import minimize  # deferred: scipy is slow to load
 
     drive = next(iter(plant.inputs))
+    for name in outputs:
+        if not np.ptp(log[name]) > 0.0:  # NaN too
+            raise ControlError(f"{log.source}: {name} stands still or has missing samples; give a stretch that moves")
     sensors = {name: _third_difference(log[name]) for name in outputs}
     base = NoiseModel(sensor_std=sensors, input_noise={drive: 1.0})
 
@@ -104,8 +107,7 @@ def _late(kalman: Estimator, log: Log) -> Float[np.ndarray, "m ny"]:
 
 def _third_difference(y: Float[np.ndarray, " n"]) -> float:
     """Return the standard deviation of white noise on a smooth signal: third differences have 20 times its variance."""
-    found = float(np.sqrt(np.mean(np.diff(y, 3) ** 2) / 20.0))
-    return max(found, 1e-9 * float(np.max(np.abs(y))), 1e-300)
+    return max(float(np.sqrt(np.mean(np.diff(y, 3) ** 2) / 20.0)), 1e-9 * float(np.ptp(y)))
 
 
 def _offsets(kalman: Estimator, mean: Float[np.ndarray, " ny"]) -> dict[str, float]:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.digital import sample
+from seaopt.control.digital import DigitalPlant, sample
 from seaopt.control.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.law import TransferFunction
 from seaopt.control.loop import Loop
@@ -323,7 +323,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
         )
     digital = sample(plant, values, spec.measured, 1.0, spec.sample_time_s, 0)
-    gain = _static_gain(plant, digital.a, digital.static_gain, digital.d, spec)
+    gain = _static_gain(plant, digital, spec)
     noise = spec.noise or NoiseModel(
         sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={_drive(plant): 1.0},
         input_drift={_drive(plant): 3.0},
@@ -358,17 +358,19 @@ def _drive(plant: Plant) -> str:
     return next(iter(plant.inputs))
 
 
-def _static_gain(plant: Plant, a: Float[np.ndarray, "n n"], gain: float, d: float, spec: MPCSpec) -> float:
+def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
     """Return N/A of the measured force, or say why it cannot be controlled so."""
-    if np.max(np.abs(np.linalg.eigvals(a))) > 1.0 - 1e-9:
+    if np.max(np.abs(np.linalg.eigvals(digital.a))) > 1.0 - 1e-9:
         raise ControlError(
             f"{plant.name} does not come to rest by itself, so that no current belongs to a force; design on the stand"
         )
-    if not np.isfinite(gain) or abs(gain) < 1e-9:
+    gain = float(digital.c @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
+    if abs(gain) < 1e-9:
         raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant current; design on the stand")
-    if d != 0.0:
+    if digital.d != 0.0:
         raise ControlError(
-            f"{spec.measured} of {plant.name} follows the current at once (d = {d:.3g}); control the spring's force"
+            f"{spec.measured} of {plant.name} follows the current at once (d = {digital.d:.3g}); "
+            "control the spring's force"
         )
     held = abs(gain) * spec.current_limit_A
     if spec.largest_force_N is not None and spec.largest_force_N > held:

@@ -117,6 +117,8 @@ def regulator_of_bandwidth(
         raise ControlError(
             f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
         )
+    if tracking(regulator(a, b, w, gain, np.exp(high))) > HALF_POWER:
+        raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
     for _ in range(60):
         middle = 0.5 * (low + high)
         if tracking(regulator(a, b, w, gain, np.exp(middle))) > HALF_POWER:

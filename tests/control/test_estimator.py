@@ -174,6 +174,12 @@ def test_a_sensor_without_noise_is_refused(sensor):
         NoiseModel(sensor_std=sensor)
 
 
+def test_noise_of_a_log_that_stands_still_is_refused(stand, thor):
+    still = so.Log.from_arrays(time=np.arange(500) / 400, I=np.zeros(500), F1=np.ones(500))
+    with pytest.raises(ControlError, match="F1 stands still"):
+        estimate_noise(stand, thor, still)
+
+
 def test_a_log_of_another_rate_or_with_holes_is_refused(stand, thor):
     log, _ = disturbed(stand, thor, 6, 1.0)
     found = estimator(stand, thor, NOISE, sample_time_s=1e-3)

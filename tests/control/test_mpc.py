@@ -110,12 +110,21 @@ def test_few_free_currents_cost_little(stand, thor, mpc):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
-@pytest.mark.parametrize("bandwidth", [15, 30, 60])
+@pytest.mark.parametrize("bandwidth", [2, 15, 30, 60])
 def test_bandwidth_where_no_limit_is_felt(stand, thor, delay, bandwidth):
     mpc = made(stand, thor, bandwidth_hz=bandwidth, delay_samples=delay, moves=20)
     figures = mpc.close(stand, thor).figures()
     assert figures.stable
     assert figures.bandwidth_hz == pytest.approx(bandwidth, rel=0.02)
+
+
+def test_a_plant_with_parts_is_designed_for(thor):
+    """Screw mode, current loop and load cell: eight states or so, and a cell that reads what the spring carries."""
+    plant = so.plants.high_impedance(parts=("screw_mode", "current_loop", "load_cell"))
+    mpc = made(plant, plant.complete(thor), bandwidth_hz=20)
+    assert mpc.close(plant, plant.complete(thor)).figures().stable
+    run = close_loop(mpc.command, mpc.start, plant, plant.complete(thor), np.full(400, 500.0))
+    assert run.force[-1] == pytest.approx(500.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("delay", [0, 2])
@@ -273,6 +282,8 @@ def test_knots_reach_from_end_to_end(samples, moves):
         ({"current_slew_A_per_s": -1.0}, "current_slew_A_per_s"),
         ({"bandwidth_hz": 300.0}, "sample more than four times as fast"),
         ({"delay_samples": -1}, "delay_samples = -1"),
+        ({"bandwidth_hz": 1e-3}, "slower than any weight makes it"),
+        ({"bandwidth_hz": 240.0}, "beyond what any weight gives"),
         ({"decay": 1.0}, "decay = 1.0 is not from 0 to below 1"),
         ({"moves": 60}, "horizon_s = 0.05 is 50 samples"),
         ({"measured": "F9"}, "not an output of high_impedance"),
