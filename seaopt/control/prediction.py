@@ -28,6 +28,7 @@ from seaopt.errors import ControlError
 
 WEIGHTS = (1e-9, 1e9)  # of rho, over the square of the current per force
 HALF_POWER = np.sqrt(0.5)
+BELOW = 1000  # frequencies of the three decades below the bandwidth at which the force must follow
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,33 +100,40 @@ def regulator_of_bandwidth(
     w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
 ) -> Regulator:  # fmt: skip
     """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by bisection on rho."""
-    z = np.exp(2j * np.pi * bandwidth_hz * sample_time_s)
     nx = b.size
     rest = np.linalg.solve(np.eye(nx) - a, b) / gain  # x_s per newton
+    A = np.block([[a, b[:, None]], [np.zeros((1, nx)), np.eye(1)]])
+    B, row = np.append(b, 1.0), np.append(c, 0.0)
+    below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
 
-    def tracking(found: Regulator) -> float:
-        """Return abs(F/F_ref) at the bandwidth, the delay left out, which does not change it."""
-        A = np.block([[a, b[:, None]], [np.zeros((1, nx)), np.eye(1)]])
-        B, K = np.append(b, 1.0), np.append(found.K_x, found.K_u)
-        ahead = found.K_x @ rest + found.K_u / gain
-        state = np.linalg.solve(z * np.eye(nx + 1) - A + np.outer(B, K), B * ahead)
-        return float(abs(np.append(c, 0.0) @ state))
+    def tracking(found: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
+        """Return abs(F/F_ref); the delay, which does not change it, is left out."""
+        z = np.exp(2j * np.pi * f * sample_time_s)[:, None, None]
+        drive = (B * (found.K_x @ rest + found.K_u / gain)).astype(complex)[:, None]
+        closed = A - np.outer(B, np.append(found.K_x, found.K_u))
+        return np.abs(np.linalg.solve(z * np.eye(nx + 1) - closed, drive)[:, :, 0] @ row)
 
     low, high = (np.log(w) for w in WEIGHTS)
-    fastest = tracking(regulator(a, b, w, gain, np.exp(low)))
-    if fastest < HALF_POWER:
+    if tracking(regulator(a, b, w, gain, np.exp(low)))[0] < HALF_POWER:
         raise ControlError(
             f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
         )
-    if tracking(regulator(a, b, w, gain, np.exp(high))) > HALF_POWER:
+    if tracking(regulator(a, b, w, gain, np.exp(high)))[0] > HALF_POWER:
         raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if tracking(regulator(a, b, w, gain, np.exp(middle))) > HALF_POWER:
+        if tracking(regulator(a, b, w, gain, np.exp(middle)))[0] > HALF_POWER:
             low = middle
         else:
             high = middle
-    return regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
+    found = regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
+    dips = np.flatnonzero(tracking(found, below) < 0.99 * HALF_POWER)
+    if dips.size:
+        raise ControlError(
+            f"the force is lost near {below[dips[0]]:.3g} Hz, far below bandwidth_hz = {bandwidth_hz:g}: the plant "
+            "has a zero there that no controller fills; design on the stand"
+        )
+    return found
 
 
 def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:

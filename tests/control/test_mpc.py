@@ -298,6 +298,11 @@ def test_what_cannot_be_is_said_in_one_line(stand, thor, options, said):
     assert "\n" not in str(caught.value)
 
 
+def test_a_plant_whose_zero_swallows_the_force_is_refused(swing, thor):
+    with pytest.raises(ControlError, match=r"the force is lost near 0\.[89].* Hz.*design on the stand"):
+        made(swing, thor)
+
+
 def test_a_plant_without_rest_is_refused(thor):
     plant = so.plants.rotary()
     with pytest.raises(ControlError, match="does not come to rest by itself"):
