@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
-from seaopt.control import Gains, current_per_force, sample
+from seaopt.control import Gains, MPCSpec, NoiseModel, close_loop, current_per_force, estimator, force_mpc, sample
 from seaopt.control.passivity import held, port_of
-from seaopt.control.realisation import realise
+from seaopt.control.realisation import realise, runnable
 from seaopt.estimation import Limits, design_experiment
 
 FOLDER = Path(__file__).resolve().parent / "figures"
@@ -191,6 +191,66 @@ def passivity() -> None:
     save(figure, "passivity")
 
 
+def disturbed(duration_s: float, seed: int):
+    """Return a log of the stand moved by 0.1 A of unknown current noise a sample, and what really happened."""
+    plant, truth, rng = so.plants.high_impedance(), so.plants.thor(), np.random.default_rng(seed)
+    log = so.virtual_log(plant, truth, PAPER_STAND, duration_s=duration_s, rate_hz=400, seed=seed)
+    moved = so.Log.from_arrays(time=log.time, I=log["I"] + 0.1 * rng.normal(size=len(log)))
+    real = so.simulate(plant, truth, moved)
+    return so.Log.from_arrays(time=log.time, I=log["I"], F1=real["F1"] + 2.0 * rng.normal(size=len(log))), real
+
+
+def state_estimator() -> None:
+    plant, truth = so.plants.high_impedance(), so.plants.thor()
+    log, real = disturbed(20, 1)
+    noise = NoiseModel(sensor_std={"F1": 2.0}, input_noise={"I": 0.005})
+    run = estimator(plant, truth, noise, sample_time_s=log.period).run(log)
+    figure, axes = new(["error of the spring's rate", "autocorrelation of the innovations"], "[mm/s]", "time [s]")
+    part = slice(6000, 6160)
+    difference = np.gradient(log["F1"], log.time) / truth["k"].value
+    for values, style, label in (
+        (difference, {"color": "#c0c0c0", "linewidth": 1.0}, "F1 differenced, over k"),
+        (run["spring_rate"], {"color": "#0072b2", "linewidth": 1.2}, "Kalman filter, and twice its std"),
+    ):
+        axes[0].plot(log.time[part], 1e3 * (values - real["qd"])[part], label=label, **style)
+    for sign in (-2, 2):
+        axes[0].axhline(sign * 1e3 * run.std["spring_rate"], color="#0072b2", linewidth=0.7, linestyle=":")
+    for label, colour, params in (
+        ("the plant", "#0072b2", truth), ("J 5 % too large", "#d55e00", truth.update(J=1.05 * truth["J"].value))
+    ):  # fmt: skip
+        found = estimator(plant, params, noise, sample_time_s=log.period).run(log).innovations["F1"][100:]
+        rho = [float(np.mean(found[lag:] * found[: found.size - lag]) / np.mean(found**2)) for lag in range(1, 41)]
+        axes[1].plot(np.arange(1, 41), rho, ".-", color=colour, markersize=4, linewidth=0.8, label=label)
+    for sign in (-1, 1):
+        axes[1].axhline(sign * 2.576 / np.sqrt(len(log)), color="k", linewidth=0.7, linestyle=":")
+    axes[1].set_xlabel("lag [samples]")
+    for axis in axes:
+        axis.legend(frameon=False, fontsize="x-small")
+    save(figure, "state_estimator")
+
+
+def predictive_control() -> None:
+    plant, truth = so.plants.high_impedance(), so.plants.thor()
+    spec = {"bandwidth_hz": 30, "max_sensitivity": 1.6, "max_reference_peak": 1.1, "current_limit_A": 9.0}
+    robust = {"swing": so.plants.moving_output()}
+    law = runnable(so.tune(plant, truth, so.ControllerSpec(**spec), robust_to=robust))
+    mpc = force_mpc(plant, truth, MPCSpec(current_limit_A=9.0))
+    slow = force_mpc(plant, truth, MPCSpec(current_limit_A=9.0, current_slew_A_per_s=500.0))
+    figure, axes = new(["F1 [N]", "current [A]"], "", "time [ms]")
+    reference = np.where(np.arange(90) < 10, 0.0, 1000.0)
+    for label, colour, step, start in (
+        ("pid", "#d55e00", law.step, law.reset()),
+        ("MPC", "#0072b2", mpc.command, mpc.start),
+        ("MPC, 500 A/s", "#009e73", slow.command, slow.start),
+    ):
+        run = close_loop(step, start, plant, truth, reference)
+        axes[0].plot(1e3 * run.time, run.force, color=colour, linewidth=1.3, label=label)
+        axes[1].step(1e3 * run.time, run.current, color=colour, linewidth=1.3, label=label, where="post")
+    axes[0].plot(1e3 * run.time, reference, color="k", linewidth=0.7, linestyle=":")
+    axes[0].legend(frameon=False, fontsize="x-small", loc="lower right")
+    save(figure, "mpc")
+
+
 if __name__ == "__main__":
     force_responses(so.plants.high_impedance, "high_impedance")
     force_responses(so.plants.moving_output, "moving_output")
@@ -200,3 +260,5 @@ if __name__ == "__main__":
     anti_windup()
     passivity()
     experiment_design()
+    state_estimator()
+    predictive_control()

@@ -100,6 +100,15 @@ def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
         assert sentence.split(":")[0] in shown
 
 
+def test_the_estimator_and_the_controller_of_the_mpc_page_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    space: dict = {}
+    exec(re.sub(r"(?m)^print\(.*", "", blocks("mpc.md", "python")[0]), space)
+    assert space["run"].whiteness_p["F1"] > 0.01
+    assert space["loop"].overshoot < 0.03 and space["loop"].settling_time_s(0.05) < 0.04
+    assert (tmp_path / "force_mpc" / "force_mpc.h").exists()
+
+
 def test_every_figure_of_the_docs_is_there():
     for page in DOCS.glob("*.md"):
         for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):

@@ -1,0 +1,18 @@
+/* Lines of reference and measurement (N) in; current (A), solved, iterations and the step's time (s) out. */
+#include <stdio.h>
+#include <time.h>
+
+#include "force_mpc.h"
+
+int main(void) {
+  static force_mpc controller;
+  double reference, measurement;
+  force_mpc_reset(&controller);
+  while (scanf("%lf %lf", &reference, &measurement) == 2) {
+    clock_t began = clock();
+    double current = (double)force_mpc_step(&controller, (OSQPFloat)reference, (OSQPFloat)measurement);
+    double took = (double)(clock() - began) / CLOCKS_PER_SEC;
+    printf("%.17g %d %d %.9f\n", current, controller.solved, controller.iterations, took);
+  }
+  return 0;
+}

@@ -1,0 +1,29 @@
+/* Constrained force control, written by seaopt: one step a sample, no allocation.
+ * Compile the .c files of this folder (example.c is a program around it) and of src, with
+ *     cc -std=c99 -O2 -Iinc/public -Iinc/private -I.
+ * The solver's workspace is static: one controller a program. */
+#ifndef FORCE_MPC_H
+#define FORCE_MPC_H
+
+#include "force_mpc_data.h"
+
+typedef struct {
+  OSQPFloat z[FORCE_MPC_STATES];  /* predicted state, last its disturbance (A) */
+  OSQPFloat past[FORCE_MPC_DELAY + 1]; /* currents on their way, oldest first; the last entry is scratch */
+  OSQPFloat current;              /* last command (A) */
+  OSQPFloat reference;            /* last finite reference (N) */
+  OSQPFloat force;                /* estimate of the measured force (N) */
+  OSQPFloat plan[FORCE_MPC_KNOTS];
+  OSQPFloat dual[FORCE_MPC_ROWS];
+  int solved;                     /* 0: the last command is the safe one, not the solver's */
+  int iterations;
+} force_mpc;
+
+/* At rest at zero. */
+void force_mpc_reset(force_mpc *s);
+
+/* The current (A) to command for a reference and a measured force (N); it is within limits whatever the input.
+ * A measurement that is not finite is predicted; a reference that is not finite leaves the last one. */
+OSQPFloat force_mpc_step(force_mpc *s, OSQPFloat reference, OSQPFloat measurement);
+
+#endif
