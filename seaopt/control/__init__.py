@@ -1,9 +1,9 @@
 """Loop algebra, controller structures, the tuner, the state estimator and predictive control within limits."""
 
-from seaopt.control.closed_loop import ForceRun, close_loop
 from seaopt.control.controller import Controller
 from seaopt.control.digital import DigitalPlant, sample
 from seaopt.control.estimator import Estimator, EstimatorRun, EstimatorState, estimator
+from seaopt.control.force_run import ForceRun, close_loop
 from seaopt.control.innovations import estimate_noise
 from seaopt.control.law import Gains, TransferFunction
 from seaopt.control.loop import Loop, LoopFigures
