@@ -33,11 +33,11 @@ from seaopt.estimation.covariance import (
     Covariance,
     Errors,
     column_chunks,
-    inverse,
     pull_of,
     robust_bread,
 )
 from seaopt.estimation.least_squares import minimise
+from seaopt.estimation.normal import inverse
 from seaopt.estimation.residuals import Linear, Residuals
 from seaopt.estimation.result import Fit, Minimum
 

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.estimation.normal import add_gram
 from seaopt.estimation.residuals import CHUNK, Huber, Linear, Residuals
 from seaopt.simulation import Segment, stream
 
-RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 
@@ -227,16 +227,15 @@ def _correlate(
 
 def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
-    bread = np.zeros((z.size, z.size))
+    normal = np.zeros((1 + z.size, 1 + z.size))
     for e, pieces in enumerate(problem.segments):
         for s in range(len(pieces)):
             for _, columns, used in column_chunks(problem, e, s, z):
                 for o, places in enumerate(problem.columns(e, s)):
-                    chosen = np.flatnonzero(places >= 0)
-                    j = columns[:, o, 1 + chosen] / problem.sigma[e][o]
-                    weight = used[:, o] * _curvature(problem, columns[:, o, 0] / problem.sigma[e][o])
-                    bread[np.ix_(places[chosen], places[chosen])] += (j * weight[:, None]).T @ j
-    return bread
+                    v = columns[:, o] / problem.sigma[e][o]
+                    weight = used[:, o] * _curvature(problem, v[:, 0])
+                    add_gram(normal, (v * weight[:, None]).T @ v, places)
+    return normal[1:, 1:]
 
 
 def _curvature(problem: Residuals, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -350,15 +349,6 @@ def _coloured_part(
 def _real_sum(x: Any, y: Any) -> float:
     """Return the real part of sum conj(x) y."""
     return float(np.sum(x.real * y.real) + np.sum(x.imag * y.imag))
-
-
-def inverse(hessian: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
-    """Return H^-1 over what is seen, and how much of each unknown is not (0 to 1, squared)."""
-    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
-    seen = values > RANK * max(values[-1], 1e-300)
-    found = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / np.outer(scale, scale)
-    return found, np.sum(vectors[:, ~seen] ** 2, axis=1)
 
 
 def with_infinities(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:

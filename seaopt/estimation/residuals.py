@@ -15,7 +15,7 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.normal import add_gram, solved
 from seaopt.estimation.unknowns import Unknowns
 from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, run_passes
 
@@ -184,7 +185,8 @@ class Residuals:
         model, start = self.unknowns.models[e], self.start(e, s, z)[None]
         return run_passes(model, self.segments[e][s], self.point(e, z), start, self.weights(e), **keep)
 
-    def _passes_of(self, e: int, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+    def passes_of(self, e: int, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+        """Run the passes of experiment e."""
         model, point, weights = self.unknowns.models[e], self.point(e, z), self.weights(e)
         pieces = enumerate(self.segments[e])
         return tuple(run_passes(model, piece, point, self.start(e, s, z)[None], weights) for s, piece in pieces)
@@ -200,7 +202,7 @@ class Residuals:
 
     def passes(self, z: Float[np.ndarray, " n"]) -> tuple[tuple[Pass, ...], ...]:
         """Run every pass."""
-        return tuple(self.map(lambda e: self._passes_of(e, z)))
+        return tuple(self.map(lambda e: self.passes_of(e, z)))
 
     def evaluate(self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if the plant overflows."""
@@ -211,25 +213,16 @@ class Residuals:
     def assemble(self, z: Float[np.ndarray, " n"], passes: tuple[tuple[Pass, ...], ...]) -> Evaluation:
         """Return the evaluation that passes at `z` give: other sigmas need no other passes."""
         n, unknowns = z.size, self.unknowns
-        cost, gradient, hessian = 0.0, np.zeros(n), np.zeros((n, n))
+        cost, gradient, hessian = unknowns.prior(z)
         for e, row in enumerate(passes):
-            for s, found in enumerate(row):
-                for o, places in enumerate(self.columns(e, s)):
-                    gram = found.gram[0, o] / self.sigma[e][o] ** 2
-                    cost += float(found.loss[0, o]) / self.sigma[e][o] ** 2
-                    used = np.flatnonzero(places >= 0)
-                    index = places[used]
-                    gradient[index] += gram[0, 1 + used]
-                    hessian[np.ix_(index, index)] += gram[np.ix_(1 + used, 1 + used)]
-        prior = (z - unknowns.start) / unknowns.prior_std
-        cost += 0.5 * float(prior @ prior)
-        gradient += prior / unknowns.prior_std
-        hessian[np.diag_indices(n)] += unknowns.prior_std**-2.0
+            own = self.normal(e, row)
+            gradient, hessian = gradient + own[0, 1:], hessian + own[1:, 1:]
+            cost += sum(float(np.sum(found.loss[0] / self.sigma[e] ** 2)) for found in row)
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
         moved = np.zeros(n)
         if finite and np.any(linear):
-            moved[linear] = -_solved(hessian[np.ix_(linear, linear)], gradient[linear])
+            moved[linear] = -solved(hessian[np.ix_(linear, linear)], gradient[linear], 1e-13)
             cost += 0.5 * float(moved @ gradient)
             gradient = np.where(linear, 0.0, gradient + hessian @ moved)
         squares, counts = self._sums(passes, moved)
@@ -237,6 +230,14 @@ class Residuals:
             z=z + moved, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian, squares=squares,
             counts=counts, undamped=linear, origin=z, passes=passes,
         )  # fmt: skip
+
+    def normal(self, e: int, row: Sequence[Pass]) -> Float[np.ndarray, "n1 n1"]:
+        """Return the normal matrix of [residual, unknowns], in sigma, of an experiment's passes."""
+        total = np.zeros((1 + self.unknowns.start.size,) * 2)
+        for s, found in enumerate(row):
+            for o, places in enumerate(self.columns(e, s)):
+                add_gram(total, found.gram[0, o] / self.sigma[e][o] ** 2, places)
+        return total
 
     @property
     def exactly_linear(self) -> bool:
@@ -278,14 +279,6 @@ def spread_of(values: Float[np.ndarray, " n"]) -> float:
         part = part[np.isfinite(part)] if not np.all(np.isfinite(part)) else part
         count, total, square = count + part.size, total + float(np.sum(part)), square + float(np.sum(part**2))
     return float(np.sqrt(max(square / count - (total / count) ** 2, 0.0)))
-
-
-def _solved(matrix: Float[np.ndarray, "m m"], vector: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return matrix^-1 vector over what is seen; the rest stays where it is."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    seen = values > 1e-13 * max(values[-1], 1e-300)
-    return (vectors[:, seen] @ ((vectors[:, seen].T @ (vector / scale)) / values[seen])) / scale
 
 
 @lru_cache(maxsize=32)

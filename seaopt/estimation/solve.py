@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.covariance import errors, inverse
+from seaopt.estimation.covariance import errors
 from seaopt.estimation.first_guess import first_guess
 from seaopt.estimation.least_squares import DECREMENT, Callback, Solution, minimise
 from seaopt.estimation.methods import Method
+from seaopt.estimation.normal import inverse
 from seaopt.estimation.observer import Observer
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals
 from seaopt.simulation import Point, Segment, run_passes
@@ -323,22 +324,18 @@ def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
     if problem.unknowns.models[e].linear:
         return StepError()
     halved = replace(problem, substeps=tuple(2 * m if i == e else m for i, m in enumerate(problem.substeps)))
-    z, n, worst = here.origin, here.z.size, 0.0
-    gradient, hessian = np.zeros(n), np.diag(problem.unknowns.prior_std**-2.0)
+    z, worst, fine = here.origin, 0.0, halved.passes_of(e, here.origin)
     gain = problem.point(e, z).gain
     sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
     for s, piece in enumerate(problem.segments[e]):
-        coarse, fine = here.passes[e][s], halved.run(e, s, z)
         edges = np.array([0, min(piece.n, WATCHED)])
         one, two = (each.run(e, s, z, edges=edges, outputs=True).outputs for each in (problem, halved))
         assert one is not None and two is not None
         change = float(np.max(np.abs(gain * (one - two)) / sigma)) * 16.0 / 15.0
         worst = max(worst, change if np.isfinite(change) else np.inf)
-        for o, places in enumerate(problem.columns(e, s)):
-            used = np.flatnonzero(places >= 0)
-            index = places[used]
-            gradient[index] += (fine.gram[0, o, 0, 1 + used] - coarse.gram[0, o, 0, 1 + used]) / sigma[o] ** 2
-            hessian[np.ix_(index, index)] += coarse.gram[0, o][np.ix_(1 + used, 1 + used)] / sigma[o] ** 2
+    weighted = problem.with_sigma(tuple(sigma if i == e else own for i, own in enumerate(problem.sigma)))
+    coarse, gradient = weighted.normal(e, here.passes[e]), weighted.normal(e, fine)[0, 1:]
+    gradient, hessian = gradient - coarse[0, 1:], coarse[1:, 1:] + np.diag(problem.unknowns.precision)
     if not (np.isfinite(worst) and np.all(np.isfinite(hessian)) and np.all(np.isfinite(gradient))):
         return StepError(output=np.inf, parameter=np.inf)
     back, _ = inverse(hessian)

@@ -16,7 +16,6 @@ from seaopt.estimation.covariance import (
     Leftover,
     coloured,
     counted,
-    inverse,
     leftover,
     robust_bread,
     with_infinities,
@@ -25,6 +24,7 @@ from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
 from seaopt.estimation.least_squares import Solution
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError
+from seaopt.estimation.normal import inverse
 from seaopt.estimation.residuals import Evaluation, Linear, Residuals, sees_level
 from seaopt.estimation.result import Derived, Fit, Minimum, Nuisance, OutputFit
 from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError, explains_little
@@ -104,7 +104,7 @@ def _covariances(
     problem: Residuals, found: Evaluation, left: list[Leftover] | None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
-    p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-2.0
+    p, prior = problem.unknowns.shared, problem.unknowns.precision
     bread = found.hessian
     if left is not None and not isinstance(problem.loss, Linear):
         bread = robust_bread(problem, found.z) + np.diag(prior)
