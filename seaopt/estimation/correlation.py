@@ -60,6 +60,12 @@ class CrossCorrelation:
         return self.worst > 1.0
 
 
+def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
+    """Return Parzen's lag window at lags 0 to `reach`, where it ends; its spectrum is nowhere negative."""
+    x = np.arange(reach + 1) / max(reach, 1)
+    return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
+
+
 def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
     from scipy.fft import irfft, next_fast_len, rfft  # deferred: scipy is slow to load
@@ -97,8 +103,7 @@ def cross_correlation(
         own_u += _products(v * mask, v * mask, long)[long:] / count
     if own_e[0] <= 0.0 or own_u[0] <= 1e-24 * max(mean_u**2, 1e-300):
         return None
-    x = np.arange(long + 1) / long
-    own_e *= np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
+    own_e *= parzen(long)
     variance = (own_e[0] * own_u[0] + 2.0 * float(own_e[1:] @ own_u[1:])) / count
     size = float(np.sqrt(own_e[0] * own_u[0]))
     deviation = float(np.sqrt(max(variance, 1e-12 * own_e[0] * own_u[0] / count)))

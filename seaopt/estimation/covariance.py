@@ -11,21 +11,21 @@ indefinite. With a robust loss the residuals in B are what the loss makes of the
 loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
-them,
-:math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter, in the
-frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
+them, :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter,
+in the frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
 Long sums are NumPy's own, not the linear-algebra library's, whose threads cost more than such sums on a busy machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.estimation.correlation import parzen
 from seaopt.estimation.normal import add_gram
 from seaopt.estimation.residuals import CHUNK, Huber, Linear, Residuals
 from seaopt.simulation import Segment, stream
@@ -84,27 +84,16 @@ def _leftovers(
     model, point, weights, piece = (
         problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
     )  # fmt: skip
-    drift, filtered = _drift(piece, point.drift), bool(len(weights.sections))
-    first = 0
+    first, filtered = 0, bool(len(weights.sections))
     for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=CHUNK, columns=filtered):
         assert part.outputs is not None
         rows = slice(first, first + len(part.outputs))
         first = rows.stop
         measured = np.column_stack([channel[rows] for channel in piece.y])
-        raw = part.outputs * point.gain + point.offset + drift(rows) - measured
+        drift = piece.drift_basis(rows, point.drift_terms) @ point.drift.T
+        raw = part.outputs * point.gain + point.offset + drift - measured
         size = raw if part.columns is None else part.columns[:, :, 0]
         yield rows, raw, size / problem.sigma[e], counted(piece, weights.settle, rows)
-
-
-def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]) -> Callable[[slice], Any]:
-    """Return the function from rows to drift."""
-    legendre = np.hstack([np.zeros((len(coefficients), 1)), coefficients])
-
-    def values(rows: slice) -> Float[np.ndarray, "m ny"]:
-        tau = piece.drift_span[0] + piece.drift_span[1] * np.arange(rows.start, rows.stop)
-        return np.polynomial.legendre.legval(tau, legendre.T).T if coefficients.shape[1] else np.zeros((1, 1))
-
-    return values
 
 
 def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.ndarray, "n ny"]:
@@ -302,9 +291,7 @@ def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
     count = np.maximum(left.count, 1.0)
     found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
     reach = _reach(found, float(np.max(count)))
-    x = np.arange(reach + 1) / max(reach, 1)
-    parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
-    return (found[:, :, : reach + 1] * parzen).transpose(2, 0, 1)
+    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1)
 
 
 def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:

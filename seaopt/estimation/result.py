@@ -231,11 +231,9 @@ class Fit:
             found = run_passes(model, segment, point, np.array([list(state.values())]), outputs=True).outputs
             assert found is not None
             y[piece] = found * point.gain + point.offset
-            first, step = segment.drift_span
             for o, name in enumerate(experiment.outputs):
-                if own.drift.get(name):
-                    series = np.concatenate([[0.0], own.drift[name]])
-                    y[piece, o] += np.polynomial.legendre.legval(first + step * np.arange(segment.n), series)
+                drift = np.array(own.drift.get(name, ()))
+                y[piece, o] += segment.drift_basis(slice(0, segment.n), drift.size) @ drift
         log = experiment.log
         return Prediction(
             time=log.time,
