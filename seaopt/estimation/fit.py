@@ -110,10 +110,10 @@ def check_choices(method: Any, loss: Any, band_hz: Any) -> None:
 
 def _solved(problem: Residuals, params: ParameterSet, method: Method, callback: Callback | None) -> Solved:
     if isinstance(method, MultipleShooting):
-        return multiple_shooting(problem, params, method, problem.band_hz, callback)
+        return multiple_shooting(problem, params, method, callback)
     if isinstance(method, PredictionError):
-        return prediction_error(problem, method, problem.band_hz, callback)
-    return output_error(problem, method, problem.band_hz, callback)
+        return prediction_error(problem, method, callback)
+    return output_error(problem, method, callback)
 
 
 def _named(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:

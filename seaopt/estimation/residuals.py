@@ -27,7 +27,7 @@ from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.normal import add_gram, solved
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, run_passes
+from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, run_passes, threads
 
 if TYPE_CHECKING:
     from seaopt.estimation.observer import Observer
@@ -193,8 +193,6 @@ class Residuals:
 
     def map(self, call: Callable[[int], Any]) -> list[Any]:
         """Call for every experiment; in threads of their own where they are long enough."""
-        from seaopt.simulation.compiled import threads
-
         count = len(self.experiments)
         if count < 2 or sum(piece.n for row in self.segments for piece in row) < ALONE:
             return [call(e) for e in range(count)]

@@ -204,11 +204,10 @@ def _eliminated(
 
 
 def multiple_shooting(
-    problem: Residuals, params: ParameterSet, method: MultipleShooting, band_hz: tuple[float, float] | None,
-    callback: Callback | None,
-) -> Solved:  # fmt: skip
+    problem: Residuals, params: ParameterSet, method: MultipleShooting, callback: Callback | None
+) -> Solved:
     """Join the shots step by step; then settle by single shooting, or on shots of their own if the plant runs away."""
-    start, _ = best_start(problem, method, band_hz)
+    start, _ = best_start(problem, method)
     plain = replace(problem, band_hz=None, loss=Linear())
     z = start.z
     if method.search and (not np.isfinite(start.cost) or explains_little(problem, start)):

@@ -26,8 +26,8 @@ UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leav
 NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 FURTHER = 5  # guesses of the frequency responses that are tried at most
-WATCHED = 8_000  # samples that are looked at for them
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
+WATCHED = 8_000  # first samples that tell a filter's sizes and places, and the step's error in an output
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,11 +52,9 @@ class Solved:
     step_error: StepError
 
 
-def output_error(
-    problem: Residuals, method: Method, band_hz: tuple[float, float] | None, callback: Callback | None
-) -> Solved:
+def output_error(problem: Residuals, method: Method, callback: Callback | None) -> Solved:
     """Single shooting from the best start that can be found."""
-    best, guessed = best_start(problem, method, band_hz)
+    best, guessed = best_start(problem, method)
     found = settle(problem, best, method.max_iterations, callback) if np.isfinite(best.cost) else None
     if found is not None and not (method.search and _doubtful(found, guessed)):
         return found
@@ -121,14 +119,12 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     raise AssertionError  # the last attempt returns
 
 
-def best_start(
-    problem: Residuals, method: Method, band_hz: tuple[float, float] | None
-) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
+def best_start(problem: Residuals, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses."""
     if not method.search:
         return problem.evaluate(problem.unknowns.start), []
     rng = np.random.default_rng(method.seed)
-    guesses, matched = first_guess(problem.experiments, problem.unknowns, band_hz, rng)
+    guesses, matched = first_guess(problem.experiments, problem.unknowns, problem.band_hz, rng)
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed):
         return guessed, guesses
@@ -345,11 +341,9 @@ def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
     return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
-def prediction_error(
-    problem: Residuals, method: Method, band_hz: tuple[float, float] | None, callback: Callback | None
-) -> Solved:
+def prediction_error(problem: Residuals, method: Method, callback: Callback | None) -> Solved:
     """Prediction errors: first of a filter that hardly trusts the plant, then of one whose noise is estimated."""
-    best, _ = best_start(problem, method, band_hz)
+    best, _ = best_start(problem, method)
     starts = [best.z] if np.isfinite(best.cost) else []
     found: Solved | None = None
     for start in (*starts, problem.unknowns.start):
