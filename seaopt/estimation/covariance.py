@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 from seaopt.estimation.correlation import parzen
 from seaopt.estimation.normal import add_gram
 from seaopt.estimation.residuals import CHUNK, Huber, Linear, Residuals
-from seaopt.simulation import Segment, stream
+from seaopt.simulation import Point, Segment, stream
 
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
@@ -70,17 +70,26 @@ def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]
     for e, pieces in enumerate(problem.segments):
         row: list[Errors] = []
         for s in range(len(pieces)):
-            parts = list(_leftovers(problem, e, s, z))
-            weighted = np.concatenate([np.where(used, part, 0.0) for _, _, part, used in parts])
-            row.append(Errors(weighted=weighted, raw=np.concatenate([raw for _, raw, _, _ in parts])))
+            parts = list(_chunks(problem, e, s, z))
+            weighted = np.concatenate([np.where(part.used, part.weighted, 0.0) for part in parts])
+            row.append(Errors(weighted=weighted, raw=np.concatenate([part.raw for part in parts])))
         found.append(row)
     return found
 
 
-def _leftovers(
-    problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]
-) -> Iterator[tuple[slice, Float[np.ndarray, "m ny"], Float[np.ndarray, "m ny"], Bool[np.ndarray, "m ny"]]]:
-    """Yield rows, model minus measured, filtered residuals in sigma, and which count, chunk by chunk."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Chunk:
+    """Rows of a segment: model minus measured, filtered residuals in sigma, which count, and the measured in a band."""
+
+    rows: slice
+    raw: Float[np.ndarray, "m ny"]
+    weighted: Float[np.ndarray, "m ny"]
+    used: Bool[np.ndarray, "m ny"]
+    in_band: Float[np.ndarray, "m ny"] | None
+
+
+def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[_Chunk]:
+    """Yield what a segment's outputs leave over, chunk by chunk."""
     model, point, weights, piece = (
         problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
     )  # fmt: skip
@@ -92,8 +101,18 @@ def _leftovers(
         measured = np.column_stack([channel[rows] for channel in piece.y])
         drift = piece.drift_basis(rows, point.drift_terms) @ point.drift.T
         raw = part.outputs * point.gain + point.offset + drift - measured
-        size = raw if part.columns is None else part.columns[:, :, 0]
-        yield rows, raw, size / problem.sigma[e], counted(piece, weights.settle, rows)
+        left = raw if part.columns is None else part.columns[:, :, 0]
+        yield _Chunk(
+            rows=rows, raw=raw, weighted=left / problem.sigma[e], used=counted(piece, weights.settle, rows),
+            in_band=None if part.columns is None else _modelled(part.columns, point) - left,
+        )  # fmt: skip
+
+
+def _modelled(columns: Float[np.ndarray, "m ny nc"], point: Point) -> Float[np.ndarray, "m ny"]:
+    """Return the filtered model of what is measured, from the filtered columns of 1, drift's polynomials and output."""
+    own = columns[:, :, -(2 + point.drift_terms) :]
+    drift = np.sum(own[:, :, 1:-1] * point.drift, axis=2)
+    return own[:, :, 0] * point.offset + drift + point.gain * own[:, :, -1]
 
 
 def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.ndarray, "n ny"]:
@@ -138,6 +157,8 @@ class Leftover:
         Of r, over the samples that count.
     used, rest : tuple of Part
         One an output: samples that count but for the filter's settling, and those held out.
+    band : tuple of Part
+        The same in the fit's band, of the samples that count, each segment's mean taken out; empty without a band.
 
     """
 
@@ -146,6 +167,7 @@ class Leftover:
     count: Float[np.ndarray, " ny"]
     used: tuple[Part, ...]
     rest: tuple[Part, ...]
+    band: tuple[Part, ...] = ()
 
     def whiteness(self, o: int, lags: int = 20) -> float:
         """Return the p-value of the Ljung-Box test that r is white (Biometrika 65, 1978)."""
@@ -166,32 +188,49 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
     pieces, ny = problem.segments[e], len(problem.sigma[e])
     lags = _lags(max(piece.n for piece in pieces))
     correlation, total, count = np.zeros((ny, ny, lags + 1)), np.zeros(ny), np.zeros(ny)
-    sums = np.zeros((2, ny, 5))  # used, rest: count, power, sum and squares of the measured less its first, sum of raw
+    banded = bool(len(problem.weights(e).sections))
+    sums = np.zeros((2 + banded, ny, 5))  # used, rest, in the band; see _sums
     for s, piece in enumerate(pieces):
-        tail = np.zeros((ny, 0))
+        tail, here = np.zeros((ny, 0)), np.zeros((2 + banded, ny, 5))
         started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
         origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
-        for rows, raw, weighted, used in _leftovers(problem, e, s, z):
-            pull = np.ascontiguousarray(np.where(used, pull_of(problem, weighted), 0.0).T)
+        for part in _chunks(problem, e, s, z):
+            pull = np.ascontiguousarray(np.where(part.used, pull_of(problem, part.weighted), 0.0).T)
             _correlate(correlation, pull, tail)
             tail = np.concatenate([tail, pull], axis=1)[:, -lags:] if lags else tail
             total += pull.sum(axis=1)
-            count += used.sum(axis=0)
-            kept = counted(piece, 0, rows)
+            count += part.used.sum(axis=0)
+            kept = counted(piece, 0, part.rows)
             for o, channel in enumerate(piece.y):
-                measured = channel[rows] - origin[o]
-                for k, chosen in enumerate((kept[:, o], ~kept[:, o] & np.isfinite(measured) & started)):
-                    values = measured if np.all(chosen) else measured[chosen]
-                    misses = raw[:, o] if np.all(chosen) else raw[chosen, o]
-                    sums[k, o] += values.size, np.sum(misses**2), np.sum(values), np.sum(values**2), np.sum(misses)
-    used, rest = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
+                measured = channel[part.rows] - origin[o]
+                here[0, o] += _sums(kept[:, o], measured, part.raw[:, o])
+                here[1, o] += _sums(~kept[:, o] & np.isfinite(measured) & started, measured, part.raw[:, o])
+                if part.in_band is not None:
+                    left = part.weighted[:, o] * problem.sigma[e][o]
+                    here[2, o] += _sums(part.used[:, o], part.in_band[:, o], left)
+        if banded:  # each segment's filter settles at a level of its own
+            here[2, :, 3] -= here[2, :, 2] ** 2 / np.maximum(here[2, :, 0], 1.0)
+            here[2, :, 2] = 0.0
+        sums += here
+    used, rest, *band = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
     return Leftover(
         correlation=correlation.transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
-        rest=rest,
+        rest=rest, band=band[0] if band else (),
     )  # fmt: skip
 
 
+def _sums(
+    chosen: Bool[np.ndarray, " m"], measured: Float[np.ndarray, " m"], misses: Float[np.ndarray, " m"]
+) -> tuple[float, float, float, float, float]:
+    """Return of the chosen samples: count, power of the misses, sum and squares of the measured, sum of the misses."""
+    if not np.all(chosen):
+        measured, misses = measured[chosen], misses[chosen]
+    square = float(np.sum(measured**2))
+    return measured.size, float(np.sum(misses**2)), float(np.sum(measured)), square, float(np.sum(misses))
+
+
 def _part(n: float, power: float, first: float, square: float, raw: float) -> Part:
+    """Return the part that `_sums` give."""
     count = max(n, 1.0)
     return Part(count=int(n), power=power, spread=square - first**2 / count, bias=raw / count)
 

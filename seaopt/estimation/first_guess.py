@@ -83,7 +83,7 @@ def _first(pair: tuple[float, Any]) -> float:
 def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> list[_Target]:
     log = experiment.log
     active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
-    if len(active) != 1 or len(log.segments) != 1:
+    if len(active) != 1 or len(experiment.stretches) != 1:
         return []
     model = linearised(unknowns.models[e])
     found: list[_Target] = []

@@ -15,7 +15,6 @@ from seaopt.estimation.covariance import (
     Covariance,
     Leftover,
     coloured,
-    counted,
     leftover,
     robust_bread,
     with_infinities,
@@ -240,7 +239,7 @@ def _outputs(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover
             found[experiment.name][name] = OutputFit(
                 fit_percent=used.fit_percent if used.fit_percent is not None else np.nan,
                 holdout_fit_percent=rest.fit_percent,
-                band_fit_percent=_band_fit_percent(problem, e, o, z),
+                band_fit_percent=left[e].band[o].fit_percent if left[e].band else None,
                 one_step_fit_percent=None if problem.observers is None else left[e].used[o].fit_percent,
                 rms_residual=float(np.sqrt(used.power / max(used.count, 1))),
                 sigma=float(problem.sigma[e][o]),
@@ -269,24 +268,3 @@ def _explained(problem: Residuals, outputs: dict[str, dict[str, OutputFit]], lef
             if gain > 0.5 or gain * float(left[e].count[o]) > CHANCE_POWER:
                 return True
     return False
-
-
-def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float | None:
-    """Return the fit of the filtered signals, over the samples that counted; None without a band."""
-    weights = problem.weights(e)
-    if not len(weights.sections):
-        return None
-    residual, signal = 0.0, 0.0
-    point = problem.point(e, z)
-    for s, piece in enumerate(problem.segments[e]):
-        columns = problem.run(e, s, z, columns=True).columns
-        assert columns is not None
-        present = counted(piece, weights.settle)[:, o]
-        own = columns[:, o, -(2 + point.drift_terms) :]  # filtered: 1, drift's polynomials, the model output
-        modelled = own[:, 0] * point.offset[o] + own[:, 1:-1] @ point.drift[o] + point.gain[o] * own[:, -1]
-        if not np.any(present):
-            continue
-        measured = (modelled - columns[:, o, 0])[present]
-        residual += float(np.sum(columns[present, o, 0] ** 2))
-        signal += float(np.sum((measured - np.mean(measured)) ** 2))
-    return 100.0 * (1.0 - float(np.sqrt(residual / max(signal, 1e-300))))

@@ -242,7 +242,7 @@ def _initial(builder: _Builder, experiment: Experiment, linear: bool, forgotten:
     """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones."""
     plant, given = experiment.plant, experiment.initial_state
     known = point("state", plant.states, dict(given) if isinstance(given, Mapping) else None)
-    starts = {stretch.start for stretch in experiment.log.segments}
+    starts = {stretch.start for stretch in experiment.stretches}
     found: list[tuple[Slot, ...]] = []
     for number, piece in enumerate(experiment.pieces):
         if forgotten or (given != "estimate" and piece.start in starts):
