@@ -14,6 +14,7 @@ logged late.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -60,6 +61,13 @@ class CrossCorrelation:
         return self.worst > 1.0
 
 
+def transforms() -> tuple[Any, Any, Any]:
+    """Return SciPy's irfft, next_fast_len and rfft."""
+    from scipy import fft  # deferred: scipy is slow to load
+
+    return fft.irfft, fft.next_fast_len, fft.rfft
+
+
 def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
     """Return Parzen's lag window at lags 0 to `reach`, where it ends; its spectrum is nowhere negative."""
     x = np.arange(reach + 1) / max(reach, 1)
@@ -68,8 +76,7 @@ def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
 
 def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
-    from scipy.fft import irfft, next_fast_len, rfft  # deferred: scipy is slow to load
-
+    irfft, next_fast_len, rfft = transforms()
     used = r != 0.0
     centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
     size = next_fast_len(len(r) + lags + 1, real=True)
@@ -116,8 +123,7 @@ def cross_correlation(
 
 def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:
     """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
-    from scipy.fft import irfft, next_fast_len, rfft  # deferred: scipy is slow to load
-
+    irfft, next_fast_len, rfft = transforms()
     size = next_fast_len(len(a) + lags + 1, real=True)
     whole = np.asarray(irfft(np.asarray(rfft(a, size)) * np.conj(np.asarray(rfft(b, size))), size))
     return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]

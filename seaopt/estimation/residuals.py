@@ -16,7 +16,7 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -25,63 +25,16 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.losses import NAMES, Linear, Loss
 from seaopt.estimation.normal import add_gram, solved
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, run_passes, threads
+from seaopt.simulation import Clock, Pass, Point, Segment, Weights, run_passes, threads
 
 if TYPE_CHECKING:
     from seaopt.estimation.observer import Observer
 
 CHUNK = 80_000  # samples
 ALONE = 8_000  # samples below which experiments are not worth a thread each
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Linear:
-    """Plain least squares."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Huber:
-    """Squares up to `threshold` sigma, absolute values beyond (Huber 1964): outliers pull less.
-
-    Parameters
-    ----------
-    threshold : float
-        In sigma; 1.345 keeps 95 % of the efficiency on Gaussian noise.
-
-    """
-
-    threshold: float = 1.345
-
-    def __post_init__(self) -> None:
-        _check_threshold("Huber", self.threshold)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SoftL1:
-    """Squares near zero that bend smoothly into absolute values: 2 (sqrt(1 + s^2) - 1), s in thresholds.
-
-    Parameters
-    ----------
-    threshold : float
-        In sigma.
-
-    """
-
-    threshold: float = 1.345
-
-    def __post_init__(self) -> None:
-        _check_threshold("SoftL1", self.threshold)
-
-
-def _check_threshold(name: str, value: float) -> None:
-    if not 0.0 < value < np.inf:
-        raise EstimationError(f"{name}(threshold={value:g}): give a positive number of sigmas")
-
-
-Loss = Linear | Huber | SoftL1
-_NAMES: dict[type, RobustLoss] = {Linear: "square", Huber: "huber", SoftL1: "soft_l1"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,7 +89,7 @@ class Residuals:
     segments: tuple[tuple[Segment, ...], ...]
     unknowns: Unknowns
     sigma: tuple[Float[np.ndarray, " _"], ...]
-    loss: Loss = Linear()
+    loss: Loss = field(default_factory=Linear)
     band_hz: tuple[float, float] | None = None
     substeps: tuple[int, ...] = ()
     observers: tuple[Observer, ...] | None = None
@@ -174,7 +127,7 @@ class Residuals:
         if not isinstance(self.loss, Linear):
             knee = self.loss.threshold * self.sigma[e]
         sections, settle = band_filter(self.band_hz, self.experiments[e].log.period)
-        return Weights(sections=sections, settle=settle, knee=knee, loss=_NAMES[type(self.loss)])
+        return Weights(sections=sections, settle=settle, knee=knee, loss=NAMES[type(self.loss)])
 
     def columns(self, e: int, s: int) -> list[Int[np.ndarray, " nc"]]:
         """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""

@@ -23,12 +23,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import errors
 from seaopt.estimation.experiment import Experiment, shot_edges
 from seaopt.estimation.least_squares import Callback, minimise
+from seaopt.estimation.leftover import errors
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import MultipleShooting
 from seaopt.estimation.normal import add_gram
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.residuals import Evaluation, Residuals
 from seaopt.estimation.solve import (
     Solved,
     best_start,

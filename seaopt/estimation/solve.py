@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.covariance import errors
 from seaopt.estimation.first_guess import first_guess
 from seaopt.estimation.least_squares import DECREMENT, Callback, Solution, minimise
+from seaopt.estimation.leftover import errors
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method
 from seaopt.estimation.normal import inverse
 from seaopt.estimation.observer import Observer
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.residuals import Evaluation, Residuals
 from seaopt.simulation import Point, Segment, run_passes
 
 STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma

@@ -11,21 +11,17 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import (
-    Covariance,
-    Leftover,
-    coloured,
-    leftover,
-    robust_bread,
-    with_infinities,
-)
+from seaopt.estimation.covariance import Covariance, coloured, robust_bread, with_infinities
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.findings import Derived, Nuisance, OutputFit
 from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
 from seaopt.estimation.least_squares import Solution
+from seaopt.estimation.leftover import Leftover, leftover
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError
 from seaopt.estimation.normal import inverse
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals, sees_level
-from seaopt.estimation.result import Derived, Fit, Minimum, Nuisance, OutputFit
+from seaopt.estimation.residuals import Evaluation, Residuals, sees_level
+from seaopt.estimation.result import Fit, Minimum
 from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError, explains_little
 from seaopt.estimation.unknowns import Locals, Unknowns
 from seaopt.parameters import ParameterSet

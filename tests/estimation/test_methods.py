@@ -15,8 +15,8 @@ import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
 from seaopt.estimation.fit import _complete, _problem, check_choices
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.observer import kalman_gain
-from seaopt.estimation.residuals import Linear
 from seaopt.estimation.unknowns import collect
 
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
