@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 LAGS = 25
 QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
@@ -66,6 +66,17 @@ def transforms() -> tuple[Any, Any, Any]:
     from scipy import fft  # deferred: scipy is slow to load
 
     return fft.irfft, fft.next_fast_len, fft.rfft
+
+
+def lagged_size(samples: int, lags: int) -> int:
+    """Return a length at which transforms of so many samples tell their products at so many lags, and are quick."""
+    return int(transforms()[1](samples + lags, real=True))
+
+
+def lagged_products(x: Float[np.ndarray, "m n"], size: int) -> Complex[np.ndarray, "m m f"]:
+    """Return the spectra of the sums over t of x_a(t) x_b(t - k): they add up, and irfft gives the sums by lag k."""
+    spectrum = np.asarray(transforms()[2](x, size))
+    return spectrum[:, None] * np.conj(spectrum[None])
 
 
 def parzen(reach: int) -> Float[np.ndarray, " reach1"]:

@@ -13,24 +13,24 @@ loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
 them, :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter,
 in the frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
-Long sums are NumPy's own, not the linear-algebra library's, whose threads cost more than such sums on a busy machine.
+Long sums are NumPy's own, or cut short: threads of the linear-algebra library cost more than they on a busy machine.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Complex, Float
 
-from seaopt.estimation.correlation import parzen, transforms
+from seaopt.estimation.correlation import lagged_size, parzen, transforms
 from seaopt.estimation.leftover import Leftover, column_chunks
 from seaopt.estimation.losses import curvature_of
 from seaopt.estimation.normal import add_gram
-from seaopt.estimation.residuals import Residuals
+from seaopt.estimation.residuals import CHUNK, Residuals
 
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
+SMALL = 512  # samples of a product that the linear-algebra library does on one thread
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 
 
@@ -67,20 +67,72 @@ def coloured(
     p = inverse.shape[1]
     total = np.zeros((p, p))
     for e, (pieces, sums) in enumerate(zip(problem.segments, left, strict=True)):
-        density, ny = correlations(sums), len(problem.sigma[e])
+        r = correlations(sums)
+        reach, chunk = len(r) - 1, max(CHUNK, 4 * len(r))
+        longest = reach + min(chunk, max(piece.n for piece in pieces))
+        whole, again = (_Form.make(r, n) for n in (longest, reach))
         for s in range(len(pieces)):
-            tail = np.zeros((ny, p, density.shape[0] - 1))
-            for _, columns, used in column_chunks(problem, e, s, z):
-                influence = np.empty((ny, p, len(columns)))
-                for o, places in enumerate(problem.columns(e, s)):
-                    chosen = np.flatnonzero(places >= 0)
-                    weights = inverse[places[chosen]] / problem.sigma[e][o]
-                    np.einsum("tc,cp->pt", columns[:, o, 1 + chosen], weights, out=influence[o])
-                if not np.all(used):
-                    influence *= used.T[:, None, :]
-                total += _coloured_part(influence, tail, density)
-                tail = np.concatenate([tail, influence], axis=2)[:, :, influence.shape[2] :]
+            into = _into(problem, e, s, inverse)
+            tail = np.zeros((*into.shape[:2], 0))
+            for _, columns, used in column_chunks(problem, e, s, z, chunk):
+                with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)
+                total += whole(with_tail) - again(tail)
+                tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
     return total
+
+
+def _into(problem: Residuals, e: int, s: int, inverse: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "ny p nc"]:
+    """Return what takes the columns of each output to their influence on the parameters."""
+    rows: list[Float[np.ndarray, "p nc"]] = []
+    for o, places in enumerate(problem.columns(e, s)):
+        moved = np.where(places >= 0, inverse[places].T, 0.0) / problem.sigma[e][o]
+        rows.append(np.hstack([np.zeros((inverse.shape[1], 1)), moved]))
+    return np.array(rows)
+
+
+def _influence(
+    columns: Float[np.ndarray, "m ny nc"], used: Bool[np.ndarray, "m ny"], into: Float[np.ndarray, "ny p nc"]
+) -> Float[np.ndarray, "ny p m"]:
+    """Return the influence of each sample; zero where it does not count."""
+    found = np.empty((*into.shape[:2], len(columns)))
+    for first in range(0, len(columns), SMALL):
+        rows = slice(first, first + SMALL)
+        np.matmul(into, columns[rows].transpose(1, 2, 0), out=found[:, :, rows])
+    return found if np.all(used) else found * used.T[:, None, :]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Form:
+    """The double sum over t and s of a_t' R(t - s) a_s, for stretches of a of limited length."""
+
+    size: int
+    density: Complex[np.ndarray, "ny ny f"]
+
+    @classmethod
+    def make(cls, r: Float[np.ndarray, "lags1 ny ny"], n: int) -> _Form:
+        """Return the form for at most n samples."""
+        reach, size = len(r) - 1, lagged_size(n, len(r))
+        kernel = np.zeros((*r.shape[1:], size))
+        kernel[:, :, : reach + 1] = r.transpose(1, 2, 0)
+        kernel[:, :, size - reach :] = r[:0:-1].transpose(2, 1, 0)  # R(-k) = R(k)'
+        density = np.asarray(transforms()[2](kernel)) * (2.0 / size)
+        density[:, :, 0] *= 0.5
+        if size % 2 == 0:
+            density[:, :, -1] *= 0.5
+        return cls(size=size, density=density)
+
+    def __call__(self, a: Float[np.ndarray, "ny p n"]) -> Float[np.ndarray, "p p"]:
+        """Return the sum."""
+        ny, p, n = a.shape
+        if not n:
+            return np.zeros((p, p))
+        spectrum = np.asarray(transforms()[2](a, self.size))
+        density = self.density[:, :, None]
+        found = np.zeros((p, p))
+        for o in range(ny):
+            filtered = sum(density[o, b] * spectrum[b] for b in range(ny))
+            found += np.einsum("if,jf->ij", spectrum[o].view(float), np.asarray(filtered).view(float))
+        return found
 
 
 def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
@@ -105,38 +157,6 @@ def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
     quiet = np.flatnonzero(np.diff(np.append(before, size.size + run)) > run)
     last = int(before[quiet[0]]) + 1
     return min(max(LEAST, int(WIDER * last)), size.size)
-
-
-def _coloured_part(
-    now: Float[np.ndarray, "ny p n"], before: Float[np.ndarray, "ny p lags"], r: Float[np.ndarray, "lags1 ny ny"]
-) -> Float[np.ndarray, "p p"]:
-    """Return the terms of the double sum in which t is now, and s is now or before (twice, for their mirror image)."""
-    _, next_fast_len, rfft = transforms()
-    ny, p, n = now.shape
-    past = before if np.any(before) else before[:, :, :0]
-    size = next_fast_len(past.shape[2] + n + len(r), real=True)
-    spectrum = rfft(np.concatenate([past, now], axis=2), size)
-    own = spectrum if not past.shape[2] else rfft(np.concatenate([np.zeros_like(past), now], axis=2), size)
-    lagged = np.array(r.transpose(1, 2, 0))
-    lagged[:, :, 0] = 0.0
-    kernel = rfft(lagged, size) * (2.0 / size)
-    kernel[:, :, 0] *= 0.5
-    if size % 2 == 0:
-        kernel[:, :, -1] *= 0.5
-    later, here = np.zeros((p, p)), np.zeros((p, p))
-    for a in range(ny):
-        for b in range(ny):
-            weighted = spectrum[b] * kernel[a, b]
-            for i in range(p):
-                for j in range(p):
-                    later[i, j] += _real_sum(own[a, i], weighted[j])
-                    here[i, j] += r[0, a, b] * float(np.sum(now[a, i] * now[b, j]))
-    return here + later + later.T
-
-
-def _real_sum(x: Any, y: Any) -> float:
-    """Return the real part of sum conj(x) y."""
-    return float(np.sum(x.real * y.real) + np.sum(x.imag * y.imag))
 
 
 def with_infinities(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.correlation import transforms
+from seaopt.estimation.correlation import lagged_products, lagged_size, transforms
 from seaopt.estimation.losses import pull_of
 from seaopt.estimation.residuals import CHUNK, Residuals
 from seaopt.simulation import Point, Segment, stream
@@ -56,13 +56,13 @@ class _Chunk:
     in_band: Float[np.ndarray, "m ny"] | None
 
 
-def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[_Chunk]:
+def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chunk: int = CHUNK) -> Iterator[_Chunk]:
     """Yield what a segment's outputs leave over, chunk by chunk."""
     model, point, weights, piece = (
         problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
     )  # fmt: skip
     first, filtered = 0, bool(len(weights.sections))
-    for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=CHUNK, columns=filtered):
+    for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=chunk, columns=filtered):
         assert part.outputs is not None
         rows = slice(first, first + len(part.outputs))
         first = rows.stop
@@ -155,17 +155,22 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
     """Return what an experiment's residuals come to."""
     pieces, ny = problem.segments[e], len(problem.sigma[e])
     lags = _lags(max(piece.n for piece in pieces))
-    correlation, total, count = np.zeros((ny, ny, lags + 1)), np.zeros(ny), np.zeros(ny)
+    chunk, total, count = max(CHUNK, 4 * lags), np.zeros(ny), np.zeros(ny)
+    sizes = lagged_size(lags + min(chunk, max(piece.n for piece in pieces)), lags), lagged_size(lags, lags)
+    products = [np.zeros((ny, ny, size // 2 + 1), dtype=complex) for size in sizes]  # of tail and chunk, of the tail
     banded = bool(len(problem.weights(e).sections))
     sums = np.zeros((2 + banded, ny, 5))  # used, rest, in the band; see _sums
     for s, piece in enumerate(pieces):
         tail, here = np.zeros((ny, 0)), np.zeros((2 + banded, ny, 5))
         started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
         origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
-        for part in _chunks(problem, e, s, z):
+        for part in _chunks(problem, e, s, z, chunk):
             pull = np.ascontiguousarray(np.where(part.used, pull_of(problem.loss, part.weighted), 0.0).T)
-            _correlate(correlation, pull, tail)
-            tail = np.concatenate([tail, pull], axis=1)[:, -lags:] if lags else tail
+            with_tail = np.concatenate([tail, pull], axis=1)
+            products[0] += lagged_products(with_tail, sizes[0])
+            if tail.size:
+                products[1] += lagged_products(tail, sizes[1])
+            tail = with_tail[:, max(with_tail.shape[1] - lags, 0) :]
             total += pull.sum(axis=1)
             count += part.used.sum(axis=0)
             kept = counted(piece, 0, part.rows)
@@ -180,9 +185,11 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
             here[2, :, 3] -= here[2, :, 2] ** 2 / np.maximum(here[2, :, 0], 1.0)
             here[2, :, 2] = 0.0
         sums += here
+    irfft = transforms()[0]
+    whole, again = (irfft(both, size)[:, :, : lags + 1] for both, size in zip(products, sizes, strict=True))
     used, rest, *band = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
     return Leftover(
-        correlation=correlation.transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
+        correlation=(whole - again).transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
         rest=rest, band=band[0] if band else (),
     )  # fmt: skip
 
@@ -207,25 +214,13 @@ def _lags(n: int) -> int:
     return int(min(max(32, 4 * np.sqrt(n)), n // 4))
 
 
-def _correlate(
-    found: Float[np.ndarray, "ny ny lags1"], now: Float[np.ndarray, "ny n"], tail: Float[np.ndarray, "ny past"]
-) -> None:
-    """Add the sums of now_a(t) before_b(t - k), before being the tail and now."""
-    irfft, next_fast_len, rfft = transforms()
-    lags, shift = found.shape[2] - 1, tail.shape[1]
-    size = next_fast_len(shift + now.shape[1] + lags, real=True)
-    spectrum = rfft(np.concatenate([tail, now], axis=1), size)
-    own = spectrum if shift == 0 else rfft(np.concatenate([np.zeros_like(tail), now], axis=1), size)
-    for a in range(len(now)):
-        for b in range(len(now)):
-            found[a, b] += irfft(own[a] * np.conj(spectrum[b]), size)[: lags + 1]
-
-
-def column_chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[slice, Any, Any]]:
+def column_chunks(
+    problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chunk: int = CHUNK
+) -> Iterator[tuple[slice, Any, Any]]:
     """Yield rows, their columns, and which samples count, chunk by chunk."""
     first, weights, piece = 0, problem.weights(e), problem.segments[e][s]
     arguments = problem.unknowns.models[e], piece, problem.point(e, z), problem.start(e, s, z)
-    for part in stream(*arguments, weights, chunk=CHUNK, columns=True):
+    for part in stream(*arguments, weights, chunk=chunk, columns=True):
         assert part.columns is not None
         rows = slice(first, first + len(part.columns))
         first = rows.stop

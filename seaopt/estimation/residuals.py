@@ -33,7 +33,7 @@ from seaopt.simulation import Clock, Pass, Point, Segment, Weights, run_passes, 
 if TYPE_CHECKING:
     from seaopt.estimation.observer import Observer
 
-CHUNK = 80_000  # samples
+CHUNK = 1 << 14  # samples whose sums stay in a core's cache
 ALONE = 8_000  # samples below which experiments are not worth a thread each
 
 
