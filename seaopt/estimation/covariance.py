@@ -130,8 +130,10 @@ class _Form:
         density = self.density[:, :, None]
         found = np.zeros((p, p))
         for o in range(ny):
-            filtered = sum(density[o, b] * spectrum[b] for b in range(ny))
-            found += np.einsum("if,jf->ij", spectrum[o].view(float), np.asarray(filtered).view(float))
+            filtered: Complex[np.ndarray, "p f"] = np.zeros_like(spectrum[o])
+            for b in range(ny):
+                filtered += density[o, b] * spectrum[b]
+            found += np.einsum("if,jf->ij", spectrum[o].view(float), filtered.view(float))
         return found
 
 

@@ -158,7 +158,7 @@ def _misfit(
         response = (x @ c.T + g[rows, nx + target.input]) * target.shift
         if not np.all(np.isfinite(response)) or np.any(response == 0.0):
             return np.inf, gradient, hessian
-        difference = np.log(response) - target.log_response
+        difference: Any = np.log(response) - target.log_response
         wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
         r = target.weight * wrapped
         cost += 0.5 * float(np.vdot(r, r).real)

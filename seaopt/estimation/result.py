@@ -146,7 +146,8 @@ class Fit:
             substeps=own.substeps,
         )
         for segment, piece, state in zip(experiment.segments(), experiment.pieces, own.initial_state, strict=True):
-            found = run_passes(model, segment, point, np.array([list(state.values())]), outputs=True).outputs
+            start = np.array([list(state.values())])
+            found = run_passes(model, segment, point, start, sums=False, outputs=True).outputs
             assert found is not None
             y[piece] = found * point.gain + point.offset
             for o, name in enumerate(experiment.outputs):

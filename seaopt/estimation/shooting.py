@@ -345,7 +345,7 @@ def _first_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> 
             shots = len(edges) - 1
             nodes = np.zeros((shots, nx))
             if watched is not None:
-                states = watched.run(e, s, z, states=True).states
+                states = watched.run(e, s, z, sums=False, states=True).states
                 assert states is not None
                 nodes = states[edges[:-1]].copy() if np.all(np.isfinite(states)) else nodes
             fixed = all(slot.index is None for slot in problem.unknowns.locals_of[e].initial[s])

@@ -144,6 +144,11 @@ def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
 
 
+def _emptied(room: Any, shape: tuple[int, ...]) -> Any:
+    """Return an array of a shape, in a room that is long enough if there is one: fresh memory costs its first touch."""
+    return np.empty(shape) if room is None or len(room) < shape[0] else room[: shape[0]]
+
+
 class _Memory:
     """Keeps arrays alive while their addresses are in use."""
 
@@ -206,12 +211,17 @@ class Program:
         edges: Int[np.ndarray, " shots1"],
         x0: Float[np.ndarray, "shots nx"],
         *,
+        sums: bool = True,
         outputs: bool = False,
         columns: bool = False,
         states: bool = False,
         resume: Float[np.ndarray, " m"] | None = None,
+        room: Pass | None = None,
     ) -> Pass:
-        """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped."""
+        """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped.
+
+        Outputs and columns are written into the `room` of a pass that is not needed any more, if there is one.
+        """
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
         if x0.shape != (shots, nx) or first < 0 or edges[-1] > self.segment.n or np.any(np.diff(edges) < 0):
@@ -219,8 +229,8 @@ class Program:
         result = Pass(
             gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
             last=np.zeros((shots, nx, layout.states)),
-            outputs=np.empty((n, ny)) if outputs else None,
-            columns=np.empty((n, ny, nc)) if columns and self.segment.y else None,
+            outputs=_emptied(room.outputs if room else None, (n, ny)) if outputs else None,
+            columns=_emptied(room.columns if room else None, (n, ny, nc)) if columns and self.segment.y else None,
             states=np.empty((n, nx)) if states else None,
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
@@ -228,8 +238,8 @@ class Program:
         arguments["from"], arguments["to"] = edges[:-1], edges[1:]
         arguments["start"] = edges[:-1] if resume is None else 0
         arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
-        sums = {"gram": result.gram, "rho": result.loss, "count": result.count, "last": result.last}
-        for name, array in sums.items():
+        filled = {"rho": result.loss, "count": result.count, "last": result.last}
+        for name, array in (filled | {"gram": result.gram} if sums else filled).items():
             arguments[name] = array.ctypes.data + array.strides[0] * np.arange(shots)
         for name in ("outputs", "columns", "states"):
             kept = getattr(result, name)
