@@ -13,35 +13,17 @@ from seaopt.estimation.least_squares import DECREMENT, Callback, Solution, minim
 from seaopt.estimation.leftover import errors
 from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method
-from seaopt.estimation.normal import inverse
 from seaopt.estimation.observer import Observer
 from seaopt.estimation.residuals import Evaluation, Residuals
+from seaopt.estimation.steps import EXACT, WATCHED, Checks, StepError, checked, refined, started, worst_of
 from seaopt.simulation import Point, Segment, run_passes
 
-STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
-STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
-EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
-MAX_SUBSTEPS = 256
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
 NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 FURTHER = 5  # guesses of the frequency responses that are tried at most
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
-WATCHED = 8_000  # first samples that tell a filter's sizes and places, and the step's error in an output
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StepError:
-    """Integration error at the minimum: largest in an output, in sigma, and in a parameter, in standard deviations."""
-
-    output: float = 0.0
-    parameter: float = 0.0
-
-    @property
-    def small(self) -> bool:
-        """Whether it may be left out of account."""
-        return self.output <= STEP_ERROR_SIGMA and self.parameter <= STEP_ERROR_PARAMETER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,9 +66,9 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     if not np.isfinite(start.cost):
         solution = minimise(problem.evaluate, start, unknowns.low, unknowns.high)
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
-    problem, here, error = _refined(problem, start, 0.1)
+    problem, here = started(problem, start)
     decrement = DECREMENT if problem.observers is None else NOISE_DECREMENT
-    checked = (here.z, ())
+    checks: Checks = (None,) * len(problem.experiments)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
             problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement,
@@ -103,10 +85,7 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
             here = problem.assemble(here.origin, here.passes)  # other sigmas need no other passes
         elif not settled:
             here = problem.evaluate(here.z)
-        moved = here.z - checked[0]
-        if not (settled and checked[1] == before and moved @ here.hessian @ moved < 1.0):
-            problem, here, error = _refined(problem, here, STEP_ERROR_SIGMA)
-            checked = here.z, problem.substeps
+        problem, here, checks = refined(problem, here, checks if settled else (None,) * len(checks))
         done, spent = settled and problem.substeps == before, iterations >= max_iterations
         if done or spent or attempt == MAX_ROUNDS - 1:
             solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
@@ -116,7 +95,7 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
             elif not done:
                 message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
                 solution = replace(solution, status="stalled", message=message)
-            return Solved(problem=problem, solution=solution, step_error=error)
+            return Solved(problem=problem, solution=solution, step_error=worst_of(checked(problem, here, checks)))
     raise AssertionError  # the last attempt returns
 
 
@@ -233,7 +212,7 @@ def _observer(
         if not np.all(np.isfinite(correction)):
             return None
         settings = replace(point, clock=replace(point.clock, delay_free=False), correction=correction)
-        states = run_passes(model, short, settings, np.zeros((1, model.nx)), states=True).states
+        states = run_passes(model, short, settings, np.zeros((1, model.nx)), sums=False, states=True).states
         assert states is not None
         if not np.all(np.isfinite(states)):
             return None
@@ -285,61 +264,6 @@ def _median_scales(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[
             [1.4826 * float(np.median(np.abs(r))) * float(s) for r, s in zip(used, problem.sigma[e], strict=True)]
         )
     return found
-
-
-def _refined(problem: Residuals, here: Evaluation, allowed: float) -> tuple[Residuals, Evaluation, StepError]:
-    """Return the problem with steps whose error is below `allowed` sigma, its evaluation there, and that error."""
-    while True:
-        found = problem.map(lambda e, problem=problem, here=here: step_error(problem, e, here))
-        finer = tuple(_steps(m, error, allowed) for m, error in zip(problem.substeps, found, strict=True))
-        if finer == problem.substeps:
-            worst = StepError(
-                output=max(error.output for error in found), parameter=max(error.parameter for error in found)
-            )
-            return problem, here, worst
-        problem = replace(problem, substeps=finer)
-        here = problem.evaluate(here.z)
-
-
-def _steps(steps: int, error: StepError, allowed: float) -> int:
-    """Return how many steps a sample an error asks for."""
-    over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
-    if over <= 1.0 or not np.isfinite(over):
-        return steps
-    finer = steps * min(1.1 * over**0.25, 4.0)  # order four says how much finer
-    return min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
-
-
-@np.errstate(all="ignore")
-def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
-    """Return the integration error of experiment e, from steps of half the length (order four: 16/15 of the change).
-
-    In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
-    below the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's
-    first samples.
-    """
-    if problem.unknowns.models[e].linear:
-        return StepError()
-    halved = replace(problem, substeps=tuple(2 * m if i == e else m for i, m in enumerate(problem.substeps)))
-    z, worst, fine = here.origin, 0.0, halved.passes_of(e, here.origin)
-    gain = problem.point(e, z).gain
-    sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
-    for s, piece in enumerate(problem.segments[e]):
-        edges = np.array([0, min(piece.n, WATCHED)])
-        one, two = (each.run(e, s, z, edges=edges, outputs=True).outputs for each in (problem, halved))
-        assert one is not None and two is not None
-        change = float(np.max(np.abs(gain * (one - two)) / sigma)) * 16.0 / 15.0
-        worst = max(worst, change if np.isfinite(change) else np.inf)
-    weighted = problem.with_sigma(tuple(sigma if i == e else own for i, own in enumerate(problem.sigma)))
-    coarse, gradient = weighted.normal(e, here.passes[e]), weighted.normal(e, fine)[0, 1:]
-    gradient, hessian = gradient - coarse[0, 1:], coarse[1:, 1:] + np.diag(problem.unknowns.precision)
-    if not (np.isfinite(worst) and np.all(np.isfinite(hessian)) and np.all(np.isfinite(gradient))):
-        return StepError(output=np.inf, parameter=np.inf)
-    back, _ = inverse(hessian)
-    p = problem.unknowns.shared
-    std = np.sqrt(np.maximum(np.diag(back)[:p], 1e-300))
-    moved = np.abs(back @ gradient)[:p] * 16.0 / 15.0 / std
-    return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
 def prediction_error(problem: Residuals, method: Method, callback: Callback | None) -> Solved:

@@ -22,7 +22,8 @@ from seaopt.estimation.methods import Method, MultipleShooting, OutputError
 from seaopt.estimation.normal import inverse
 from seaopt.estimation.residuals import Evaluation, Residuals, sees_level
 from seaopt.estimation.result import Fit, Minimum
-from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError, explains_little
+from seaopt.estimation.solve import Solved, explains_little
+from seaopt.estimation.steps import MAX_SUBSTEPS, StepError
 from seaopt.estimation.unknowns import Locals, Unknowns
 from seaopt.parameters import ParameterSet
 
