@@ -67,8 +67,11 @@ def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chun
         rows = slice(first, first + len(part.outputs))
         first = rows.stop
         measured = np.column_stack([channel[rows] for channel in piece.y])
-        drift = piece.drift_basis(rows, point.drift_terms) @ point.drift.T
-        raw = part.outputs * point.gain + point.offset + drift - measured
+        raw = part.outputs * point.gain
+        raw += point.offset
+        raw -= measured
+        if point.drift_terms:
+            raw += piece.drift_basis(rows, point.drift_terms) @ point.drift.T
         left = raw if part.columns is None else part.columns[:, :, 0]
         yield _Chunk(
             rows=rows, raw=raw, weighted=left / problem.sigma[e], used=counted(piece, weights.settle, rows),
@@ -172,7 +175,7 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
                 products[1] += lagged_products(tail, sizes[1])
             tail = with_tail[:, max(with_tail.shape[1] - lags, 0) :]
             total += pull.sum(axis=1)
-            count += part.used.sum(axis=0)
+            count += [np.count_nonzero(column) for column in part.used.T]
             kept = counted(piece, 0, part.rows)
             for o, channel in enumerate(piece.y):
                 measured = channel[part.rows] - origin[o]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -26,6 +27,7 @@ from seaopt.estimation.solve import Solved, explains_little
 from seaopt.estimation.steps import MAX_SUBSTEPS, StepError
 from seaopt.estimation.unknowns import Locals, Unknowns
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 
 CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
 VAGUE = 3.0  # a std of so many times the value is no estimate
@@ -196,27 +198,35 @@ def _nuisance(
     )
 
 
+@lru_cache(maxsize=64)
+def _derived_figures(plant: Plant) -> tuple[Any, dict[str, str]]:
+    """Return the CasADi function p -> (figures, their gradients in rows), and their units by name."""
+    figures = plant.derived_values()
+    values = ca.vertcat(ca.SX(0, 1), *(expression for expression, _ in figures.values()))
+    slopes = ca.densify(ca.jacobian(values, plant.p))
+    return ca.Function("derived", [plant.p], [ca.densify(values), slopes]), {
+        n: unit for n, (_, unit) in figures.items()
+    }
+
+
 def _derived(experiments: tuple[Experiment, ...], fitted: ParameterSet, covariance: Covariance) -> dict[str, Derived]:
     """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g."""
     out: dict[str, Derived] = {}
     for experiment in experiments:
         plant = experiment.plant
-        values = plant.parameter_values(fitted)
+        function, units = _derived_figures(plant)
+        values, slopes = (np.array(found) for found in function(plant.parameter_values(fitted)))
         names = list(plant.parameters)
         free = [name for name in covariance.names if name in names]
         rows = [covariance.names.index(name) for name in free]
         matrix = covariance.matrix[np.ix_(rows, rows)]
-        for name, (expression, unit) in plant.derived_values().items():
-            function: Any = ca.Function(
-                "derived", [plant.p], [expression, ca.densify(ca.gradient(expression, plant.p))]
-            )
-            value, slope = function(values)
-            g = np.array(slope).ravel()[[names.index(item) for item in free]]
+        for i, (name, unit) in enumerate(units.items()):
+            g = slopes[i, [names.index(item) for item in free]]
             used = g != 0.0
             block = matrix[np.ix_(used, used)]
             variance = float(g[used] @ block @ g[used]) if np.all(np.isfinite(block)) else np.inf
             std = float(np.sqrt(max(variance, 0.0)))
-            out.setdefault(name, Derived(value=float(value), unit=unit, std=std))
+            out.setdefault(name, Derived(value=float(values[i, 0]), unit=unit, std=std))
     return out
 
 
