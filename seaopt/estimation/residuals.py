@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from seaopt.estimation.observer import Observer
 
 CHUNK = 1 << 14  # samples whose sums stay in a core's cache
+WATCHED = 8_000  # first samples that tell the integration error in an output, and a filter's sizes and places
 ALONE = 8_000  # samples below which experiments are not worth a thread each
 
 
@@ -139,10 +140,13 @@ class Residuals:
         return run_passes(model, self.segments[e][s], self.point(e, z), start, self.weights(e), **keep)
 
     def passes_of(self, e: int, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
-        """Run the passes of experiment e."""
+        """Run the passes of experiment e; those of a nonlinear plant keep the outputs of the first samples."""
         model, point, weights = self.unknowns.models[e], self.point(e, z), self.weights(e)
-        pieces = enumerate(self.segments[e])
-        return tuple(run_passes(model, piece, point, self.start(e, s, z)[None], weights) for s, piece in pieces)
+        shown = 0 if model.linear else WATCHED
+        return tuple(
+            run_passes(model, piece, point, self.start(e, s, z)[None], weights, outputs=shown > 0, shown=shown)
+            for s, piece in enumerate(self.segments[e])
+        )
 
     def map(self, call: Callable[[int], Any]) -> list[Any]:
         """Call for every experiment; in threads of their own where they are long enough."""

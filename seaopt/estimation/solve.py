@@ -14,8 +14,8 @@ from seaopt.estimation.leftover import errors
 from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method
 from seaopt.estimation.observer import Observer
-from seaopt.estimation.residuals import Evaluation, Residuals
-from seaopt.estimation.steps import EXACT, WATCHED, Checks, StepError, checked, refined, started, worst_of
+from seaopt.estimation.residuals import WATCHED, Evaluation, Residuals
+from seaopt.estimation.steps import EXACT, Checks, StepError, checked, refined, started, worst_of
 from seaopt.simulation import Point, Segment, run_passes
 
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step

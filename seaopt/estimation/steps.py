@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.normal import inverse
-from seaopt.estimation.residuals import Evaluation, Residuals
+from seaopt.estimation.residuals import WATCHED, Evaluation, Residuals
+from seaopt.simulation import Pass
 
 STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
 STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
@@ -17,7 +19,6 @@ MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trus
 NEARBY = 10.0  # standard deviations, over which a step error does not change
 MAX_SUBSTEPS = 256
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
-WATCHED = 8_000  # first samples that tell a filter's sizes and places, and the step's error in an output
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,13 +49,23 @@ Checks = tuple[Check | None, ...]  # one an experiment
 def started(problem: Residuals, start: Evaluation) -> tuple[Residuals, Evaluation]:
     """Return the problem with steps that do for a first search, and its evaluation there."""
     while True:
-        found = problem.map(lambda e, p=problem, z=start.origin: _output_error(p, e, z))
-        errors = [StepError(output=error) for error in found]
-        finer = tuple(_steps(m, error, FIRST_STEP_ERROR) for m, error in zip(problem.substeps, errors, strict=True))
+        finer = tuple(problem.map(lambda e, p=problem, here=start: _first_steps(p, e, here)))
         if finer == problem.substeps:
             return problem, start
         problem = replace(problem, substeps=finer)
         start = problem.evaluate(start.z)
+
+
+def _first_steps(problem: Residuals, e: int, here: Evaluation) -> int:
+    """Return the steps that an experiment's first samples ask for."""
+    if problem.unknowns.models[e].linear:
+        return problem.substeps[e]
+    halved, fine = _halved(problem, e), []
+    for s, piece in enumerate(problem.segments[e]):
+        edges = np.array([0, min(piece.n, WATCHED)])
+        fine.append(halved.run(e, s, here.origin, edges=edges, sums=False, outputs=True))
+    error = _output_error(problem, e, here.origin, here.passes[e], fine)
+    return _steps(problem.substeps[e], StepError(output=error), FIRST_STEP_ERROR)
 
 
 def refined(problem: Residuals, here: Evaluation, checks: Checks) -> tuple[Residuals, Evaluation, Checks]:
@@ -115,7 +126,7 @@ def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
     if problem.unknowns.models[e].linear:
         return StepError()
     fine = _halved(problem, e).passes_of(e, here.origin)
-    worst = _output_error(problem, e, here.origin)
+    worst = _output_error(problem, e, here.origin, here.passes[e], fine)
     sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
     weighted = problem.with_sigma(tuple(sigma if i == e else own for i, own in enumerate(problem.sigma)))
     coarse, gradient = weighted.normal(e, here.passes[e]), weighted.normal(e, fine)[0, 1:]
@@ -135,17 +146,14 @@ def _halved(problem: Residuals, e: int) -> Residuals:
 
 
 @np.errstate(all="ignore")
-def _output_error(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> float:
+def _output_error(
+    problem: Residuals, e: int, z: Float[np.ndarray, " n"], coarse: Sequence[Pass], fine: Sequence[Pass]
+) -> float:
     """Return the largest integration error in an output of experiment e, in sigma; see `step_error`."""
-    if problem.unknowns.models[e].linear:
-        return 0.0
-    gain, worst = problem.point(e, z).gain, 0.0
-    sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
-    for s, piece in enumerate(problem.segments[e]):
-        edges = np.array([0, min(piece.n, WATCHED)])
-        pair = (problem, _halved(problem, e))
-        one, two = (each.run(e, s, z, edges=edges, sums=False, outputs=True).outputs for each in pair)
-        assert one is not None and two is not None
-        change = float(np.max(np.abs(gain * (one - two)) / sigma)) * 16.0 / 15.0
+    scale = problem.point(e, z).gain / np.maximum(problem.sigma[e], EXACT * problem.spread[e])
+    worst = 0.0
+    for one, two in zip(coarse, fine, strict=True):
+        assert one.outputs is not None and two.outputs is not None
+        change = float(np.max(np.abs(scale * (one.outputs - two.outputs)))) * 16.0 / 15.0
         worst = max(worst, change if np.isfinite(change) else np.inf)
     return worst

@@ -34,11 +34,11 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     return np.dtype([
         ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
         ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole),
-        ("start", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer), ("correction", pointer),
-        ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer), ("sos", pointer),
-        ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer), ("rho", pointer),
-        ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer), ("last", pointer),
-        ("carry", pointer),
+        ("start", whole), ("shown", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer),
+        ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer),
+        ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
+        ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
+        ("last", pointer), ("carry", pointer),
     ])  # fmt: skip
 
 
@@ -213,6 +213,7 @@ class Program:
         *,
         sums: bool = True,
         outputs: bool = False,
+        shown: int | None = None,
         columns: bool = False,
         states: bool = False,
         resume: Float[np.ndarray, " m"] | None = None,
@@ -220,22 +221,24 @@ class Program:
     ) -> Pass:
         """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped.
 
-        Outputs and columns are written into the `room` of a pass that is not needed any more, if there is one.
+        Outputs are those of the first samples `shown`, of all if it is left out. Outputs and columns are written into
+        the `room` of a pass that is not needed any more, if there is one.
         """
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
+        rows = n if shown is None else min(shown, n)
         if x0.shape != (shots, nx) or first < 0 or edges[-1] > self.segment.n or np.any(np.diff(edges) < 0):
             raise SimulationError(f"{shots} shots of {nx} states over {self.segment.n} samples: x0 or edges do not fit")
         result = Pass(
             gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
             last=np.zeros((shots, nx, layout.states)),
-            outputs=_emptied(room.outputs if room else None, (n, ny)) if outputs else None,
+            outputs=_emptied(room.outputs if room else None, (rows, ny)) if outputs else None,
             columns=_emptied(room.columns if room else None, (n, ny, nc)) if columns and self.segment.y else None,
             states=np.empty((n, nx)) if states else None,
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
         arguments = np.repeat(self.base, shots)
-        arguments["from"], arguments["to"] = edges[:-1], edges[1:]
+        arguments["from"], arguments["to"], arguments["shown"] = edges[:-1], edges[1:], rows
         arguments["start"] = edges[:-1] if resume is None else 0
         arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
         filled = {"rho": result.loss, "count": result.count, "last": result.last}

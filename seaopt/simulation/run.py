@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,6 +26,7 @@ def run_passes(
     edges: Int[np.ndarray, " shots1"] | None = None,
     sums: bool = True,
     outputs: bool = False,
+    shown: int | None = None,
     columns: bool = False,
     states: bool = False,
 ) -> Pass:
@@ -42,6 +44,8 @@ def run_passes(
         Whether Gram matrices, losses, counts and derivatives are wanted: a simulation alone is several times quicker.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
+    shown : int, optional
+        Keep the outputs of so many first samples only; of one shot.
 
     Returns
     -------
@@ -53,8 +57,9 @@ def run_passes(
     rows = edges if edges is not None else np.array([0, segment.n])
     program = Program.make(model, segment, point, chosen)
     if program is not None:
-        return program.run(rows, x0, sums=sums, outputs=outputs, columns=columns, states=states)
-    return interpreted_passes(model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states)
+        return program.run(rows, x0, sums=sums, outputs=outputs, shown=shown, columns=columns, states=states)
+    found = interpreted_passes(model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states)
+    return found if shown is None or found.outputs is None else replace(found, outputs=found.outputs[:shown].copy())
 
 
 def stream(
