@@ -136,7 +136,7 @@ def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
     """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
     candidates = np.flatnonzero(good)
     grid = np.geomspace(f[candidates[0]], f[candidates[-1]], POINTS)
-    nearest = np.abs(np.log(f[candidates][None, :] / grid[:, None])).argmin(axis=1)
+    nearest = np.abs(np.log(f[candidates]) - np.log(grid)[:, None]).argmin(axis=1)
     return candidates[np.unique(nearest)]
 
 
