@@ -1,7 +1,7 @@
 """Least squares on the time-domain logs: parameters, their uncertainty, what the data cannot tell, what to measure."""
 
 from seaopt.estimation.bootstrap import Bootstrap, bootstrap
-from seaopt.estimation.compare import Ranking, compare
+from seaopt.estimation.compare import compare
 from seaopt.estimation.covariance import Covariance
 from seaopt.estimation.design import (
     Chirps,
@@ -14,12 +14,14 @@ from seaopt.estimation.design import (
 )
 from seaopt.estimation.diagnostics import Diagnostics, diagnose
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.findings import Derived, Nuisance, OutputFit, Prediction
 from seaopt.estimation.fit import fit
 from seaopt.estimation.identifiability import Identifiability
+from seaopt.estimation.losses import Huber, Linear, SoftL1
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
 from seaopt.estimation.profile import Profile, profile
-from seaopt.estimation.residuals import Huber, Linear, SoftL1
-from seaopt.estimation.result import Derived, Fit, Nuisance, OutputFit, Prediction
+from seaopt.estimation.ranking import Ranking
+from seaopt.estimation.result import Fit
 
 __all__ = [
     "Bootstrap", "Chirps", "Comparison", "Covariance", "Derived", "Design", "Diagnostics", "Experiment", "Fit",

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.correlation import LAGS, CrossCorrelation
-from seaopt.estimation.covariance import Errors
 from seaopt.estimation.forecasts import Percent, in_band, used_and_held_out
 from seaopt.estimation.least_squares import minimise
+from seaopt.estimation.leftover import Errors
 from seaopt.estimation.leverage import PRIORS, Leverage
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit

@@ -29,16 +29,12 @@ from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.correlation import autocorrelation
-from seaopt.estimation.covariance import (
-    Covariance,
-    Errors,
-    column_chunks,
-    inverse,
-    pull_of,
-    robust_bread,
-)
+from seaopt.estimation.covariance import Covariance, robust_bread
 from seaopt.estimation.least_squares import minimise
-from seaopt.estimation.residuals import Linear, Residuals
+from seaopt.estimation.leftover import Errors, column_chunks
+from seaopt.estimation.losses import Linear, pull_of
+from seaopt.estimation.normal import inverse
+from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit, Minimum
 
 LEAST = 20  # draws, below which a covariance says nothing
@@ -248,7 +244,7 @@ def _steps(
     if not isinstance(problem.loss, Linear):
         hessian = robust_bread(problem, z) + np.diag(prior**2)
     back = inverse(hessian)[0][:, :p]
-    pulls = [[pull_of(problem, error.weighted) for error in row] for row in left]
+    pulls = [[pull_of(problem.loss, error.weighted) for error in row] for row in left]
     pools = [_pool([r[use] for r, use in zip(row, _rows(e), strict=True)]) for row, e in zip(pulls, left, strict=True)]
     starts = _starts(problem, lengths, pools, draws, rng)
     moved = (rng.normal(size=(draws, z.size)) * prior) @ back

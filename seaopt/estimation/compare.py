@@ -21,9 +21,7 @@ word: the preferred fit must not predict them worse, in free run, than one it be
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -32,8 +30,9 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.correlation import autocorrelation
-from seaopt.estimation.covariance import Errors
 from seaopt.estimation.forecasts import Percent, fit_percent, free_run, in_band, used_and_held_out
+from seaopt.estimation.leftover import Errors
+from seaopt.estimation.ranking import Band, Ranked, Ranking
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit
 
@@ -41,132 +40,6 @@ MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0  # differences of BIC (Kass and Ra
 WORSE = 1.02  # ratio of held-out residuals that contradicts the likelihood
 OCTAVES = 12  # at most, below the Nyquist frequency
 LINES = 4  # lines of the spectrum that the lowest octave has at least
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ranked:
-    """One fit in a ranking.
-
-    Parameters
-    ----------
-    name : str
-        Its label.
-    aic, bic : float
-        With every sample counted.
-    effective_bic : float
-        With the effective number of samples, up to a constant that all fits share.
-    unknowns : int
-        Sigmas included.
-    free_run : mapping of experiment to mapping of output to Percent
-        Fit of the simulation, over the samples used and those held out.
-    held_out_ratio : float or None
-        Held-out residual over that of the first in the ranking, geometric mean over outputs; None if nothing is held
-        out.
-
-    """
-
-    name: str
-    aic: float
-    bic: float
-    effective_bic: float
-    unknowns: int
-    free_run: Mapping[str, Mapping[str, Percent]]
-    held_out_ratio: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Band:
-    """Power of the residuals in one octave of one output: mean squares by fit, in the output's unit squared."""
-
-    experiment: str
-    output: str
-    unit: str
-    low_hz: float
-    high_hz: float
-    power: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class Ranking:
-    """What `compare` returns; ``print(ranking)`` is a report.
-
-    Parameters
-    ----------
-    rows : tuple of Ranked
-        Best first, by effective BIC.
-    preferred : str or None
-        The first's name; None if undecided.
-    evidence : str
-        For it, against the next: "very strong", "strong", "positive" or "undecided".
-    samples, effective_samples : int, float
-        Of all outputs.
-    bands : tuple of Band
-        Residual power per octave, of every output.
-    sentences : tuple of str
-        The verdict, and why.
-    fits : mapping of name to Fit
-        In the order of `rows`.
-
-    """
-
-    rows: tuple[Ranked, ...]
-    preferred: str | None
-    evidence: str
-    samples: int
-    effective_samples: float
-    bands: tuple[Band, ...]
-    sentences: tuple[str, ...]
-    fits: Mapping[str, Fit] = field(repr=False)
-
-    @property
-    def decisive(self) -> bool:
-        """Whether the evidence is very strong: a difference of BIC beyond 10, and no objection by held-out samples."""
-        return self.evidence == "very strong"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content as numbers, lists and text."""
-        return {
-            "preferred": self.preferred, "evidence": self.evidence, "samples": self.samples,
-            "effective_samples": self.effective_samples, "sentences": list(self.sentences),
-            "ranking": [
-                {
-                    "name": row.name, "aic": row.aic, "bic": row.bic, "effective_bic": row.effective_bic,
-                    "unknowns": row.unknowns, "held_out_ratio": row.held_out_ratio,
-                    "free_run": {
-                        name: {output: {"used": p.used, "held_out": p.held_out} for output, p in outputs.items()}
-                        for name, outputs in row.free_run.items()
-                    },
-                }
-                for row in self.rows
-            ],
-            "bands": [
-                {"experiment": band.experiment, "output": band.output, "low_hz": band.low_hz, "high_hz": band.high_hz,
-                 "unit": f"({band.unit})^2", "power": dict(band.power)}
-                for band in self.bands
-            ],
-        }  # fmt: skip
-
-    def __repr__(self) -> str:
-        lines = [f"Ranking: {self.sentences[0]}"]
-        lines += [f"  {sentence}" for sentence in self.sentences[1:]]
-        first = self.rows[0]
-        lines.append(
-            f"  {'':24} {'effective BIC':>14} {'BIC':>12} {'AIC':>12} {'unknowns':>9}  free run (held out) [%]"
-        )
-        for row in self.rows:
-            percents = ", ".join(
-                f"{name}.{output} {p.used:.2f}" + ("" if p.held_out is None else f" ({p.held_out:.2f})")
-                for name, outputs in row.free_run.items()
-                for output, p in outputs.items()
-            )
-            away = [row.effective_bic - first.effective_bic, row.bic - first.bic, row.aic - first.aic]
-            lines.append(
-                f"  {row.name:24} {away[0]:>+14.6g} {away[1]:>+12.6g} {away[2]:>+12.6g} {row.unknowns:>9}  {percents}"
-            )
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
 
 
 def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:

@@ -14,9 +14,10 @@ logged late.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 LAGS = 25
 QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
@@ -60,10 +61,33 @@ class CrossCorrelation:
         return self.worst > 1.0
 
 
+def transforms() -> tuple[Any, Any, Any]:
+    """Return SciPy's irfft, next_fast_len and rfft."""
+    from scipy import fft  # deferred: scipy is slow to load
+
+    return fft.irfft, fft.next_fast_len, fft.rfft
+
+
+def lagged_size(samples: int, lags: int) -> int:
+    """Return a length at which transforms of so many samples tell their products at so many lags, and are quick."""
+    return int(transforms()[1](samples + lags, real=True))
+
+
+def lagged_products(x: Float[np.ndarray, "m n"], size: int) -> Complex[np.ndarray, "m m f"]:
+    """Return the spectra of the sums over t of x_a(t) x_b(t - k): they add up, and irfft gives the sums by lag k."""
+    spectrum = np.asarray(transforms()[2](x, size))
+    return spectrum[:, None] * np.conj(spectrum[None])
+
+
+def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
+    """Return Parzen's lag window at lags 0 to `reach`, where it ends; its spectrum is nowhere negative."""
+    x = np.arange(reach + 1) / max(reach, 1)
+    return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
+
+
 def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
-    from scipy.fft import irfft, next_fast_len, rfft  # deferred: scipy is slow to load
-
+    irfft, next_fast_len, rfft = transforms()
     used = r != 0.0
     centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
     size = next_fast_len(len(r) + lags + 1, real=True)
@@ -97,8 +121,7 @@ def cross_correlation(
         own_u += _products(v * mask, v * mask, long)[long:] / count
     if own_e[0] <= 0.0 or own_u[0] <= 1e-24 * max(mean_u**2, 1e-300):
         return None
-    x = np.arange(long + 1) / long
-    own_e *= np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
+    own_e *= parzen(long)
     variance = (own_e[0] * own_u[0] + 2.0 * float(own_e[1:] @ own_u[1:])) / count
     size = float(np.sqrt(own_e[0] * own_u[0]))
     deviation = float(np.sqrt(max(variance, 1e-12 * own_e[0] * own_u[0] / count)))
@@ -111,8 +134,7 @@ def cross_correlation(
 
 def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:
     """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
-    from scipy.fft import irfft, next_fast_len, rfft  # deferred: scipy is slow to load
-
+    irfft, next_fast_len, rfft = transforms()
     size = next_fast_len(len(a) + lags + 1, real=True)
     whole = np.asarray(irfft(np.asarray(rfft(a, size)) * np.conj(np.asarray(rfft(b, size))), size))
     return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]

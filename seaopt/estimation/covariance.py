@@ -11,26 +11,26 @@ indefinite. With a robust loss the residuals in B are what the loss makes of the
 loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
-them,
-:math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter, in the
-frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
-Long sums are NumPy's own, not the linear-algebra library's, whose threads cost more than such sums on a busy machine.
+them, :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter,
+in the frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
+Long sums are NumPy's own, or cut short: threads of the linear-algebra library cost more than they on a busy machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
-from seaopt.estimation.residuals import CHUNK, Huber, Linear, Residuals
-from seaopt.simulation import Segment, stream
+from seaopt.estimation.correlation import lagged_size, parzen, transforms
+from seaopt.estimation.leftover import Leftover, column_chunks
+from seaopt.estimation.losses import curvature_of
+from seaopt.estimation.normal import add_gram
+from seaopt.estimation.residuals import CHUNK, Residuals
 
-RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
+SMALL = 512  # samples of a product that the linear-algebra library does on one thread
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 
 
@@ -47,222 +47,17 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[i, i], 0.0)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Errors:
-    """What one segment's outputs leave over.
-
-    Parameters
-    ----------
-    weighted : array, shape (n, ny)
-        Filtered residuals in sigma; zero where a sample does not count.
-    raw : array, shape (n, ny)
-        Model minus measured, neither filtered nor weighted; NaN where missing.
-
-    """
-
-    weighted: Float[np.ndarray, "n ny"]
-    raw: Float[np.ndarray, "n ny"]
-
-
-def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]:
-    """Return the residuals of every experiment and segment."""
-    found: list[list[Errors]] = []
-    for e, pieces in enumerate(problem.segments):
-        row: list[Errors] = []
-        for s in range(len(pieces)):
-            parts = list(_leftovers(problem, e, s, z))
-            weighted = np.concatenate([np.where(used, part, 0.0) for _, _, part, used in parts])
-            row.append(Errors(weighted=weighted, raw=np.concatenate([raw for _, raw, _, _ in parts])))
-        found.append(row)
-    return found
-
-
-def _leftovers(
-    problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]
-) -> Iterator[tuple[slice, Float[np.ndarray, "m ny"], Float[np.ndarray, "m ny"], Bool[np.ndarray, "m ny"]]]:
-    """Yield rows, model minus measured, filtered residuals in sigma, and which count, chunk by chunk."""
-    model, point, weights, piece = (
-        problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
-    )  # fmt: skip
-    drift, filtered = _drift(piece, point.drift), bool(len(weights.sections))
-    first = 0
-    for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=CHUNK, columns=filtered):
-        assert part.outputs is not None
-        rows = slice(first, first + len(part.outputs))
-        first = rows.stop
-        measured = np.column_stack([channel[rows] for channel in piece.y])
-        raw = part.outputs * point.gain + point.offset + drift(rows) - measured
-        size = raw if part.columns is None else part.columns[:, :, 0]
-        yield rows, raw, size / problem.sigma[e], counted(piece, weights.settle, rows)
-
-
-def _drift(piece: Segment, coefficients: Float[np.ndarray, "ny nd"]) -> Callable[[slice], Any]:
-    """Return the function from rows to drift."""
-    legendre = np.hstack([np.zeros((len(coefficients), 1)), coefficients])
-
-    def values(rows: slice) -> Float[np.ndarray, "m ny"]:
-        tau = piece.drift_span[0] + piece.drift_span[1] * np.arange(rows.start, rows.stop)
-        return np.polynomial.legendre.legval(tau, legendre.T).T if coefficients.shape[1] else np.zeros((1, 1))
-
-    return values
-
-
-def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.ndarray, "n ny"]:
-    """Return which samples take part in the cost."""
-    chosen = rows if rows is not None else slice(0, piece.n)
-    present = np.column_stack([np.isfinite(channel[chosen]) for channel in piece.y])
-    if piece.keep:
-        present &= np.column_stack([mask[chosen] > 0 for mask in piece.keep])
-    present[: max(settle - chosen.start, 0)] = False
-    return present
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Part:
-    """Sums over samples of one output: how many, power and mean of model minus measured, spread of the measured."""
-
-    count: int
-    power: float
-    spread: float
-    bias: float = 0.0
-
-    @property
-    def fit_percent(self) -> float | None:
-        """100 (1 - |y - yhat| / |y - mean(y)|); None of no samples."""
-        return 100.0 * (1.0 - float(np.sqrt(self.power / max(self.spread, 1e-300)))) if self.count else None
-
-    def levelled(self, bias: float) -> Part:
-        """Return the sums with an offset taken out of model minus measured."""
-        power = self.power - self.count * bias * (2.0 * self.bias - bias)
-        return replace(self, power=max(power, 0.0), bias=self.bias - bias)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Leftover:
-    """What an experiment's residuals come to, in the memory of a chunk.
-
-    Parameters
-    ----------
-    correlation : array, shape (lags + 1, ny, ny)
-        Sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals.
-    mean, count : array, shape (ny,)
-        Of r, over the samples that count.
-    used, rest : tuple of Part
-        One an output: samples that count but for the filter's settling, and those held out.
-
-    """
-
-    correlation: Float[np.ndarray, "lags1 ny ny"]
-    mean: Float[np.ndarray, " ny"]
-    count: Float[np.ndarray, " ny"]
-    used: tuple[Part, ...]
-    rest: tuple[Part, ...]
-
-    def whiteness(self, o: int, lags: int = 20) -> float:
-        """Return the p-value of the Ljung-Box test that r is white (Biometrika 65, 1978)."""
-        from scipy.special import gammaincc  # deferred: scipy.stats takes a second
-
-        n = float(self.count[o])
-        lags = min(lags, len(self.correlation) - 1, int(n / 5))
-        power = self.correlation[0, o, o] - n * self.mean[o] ** 2
-        if lags < 1 or power <= 0.0:
-            return 1.0
-        rho = (self.correlation[1 : lags + 1, o, o] - n * self.mean[o] ** 2) / power
-        statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-        return float(gammaincc(lags / 2, statistic / 2))
-
-
-def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover:
-    """Return what an experiment's residuals come to."""
-    pieces, ny = problem.segments[e], len(problem.sigma[e])
-    lags = _lags(max(piece.n for piece in pieces))
-    correlation, total, count = np.zeros((ny, ny, lags + 1)), np.zeros(ny), np.zeros(ny)
-    sums = np.zeros((2, ny, 5))  # used, rest: count, power, sum and squares of the measured less its first, sum of raw
-    for s, piece in enumerate(pieces):
-        tail = np.zeros((ny, 0))
-        started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
-        origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
-        for rows, raw, weighted, used in _leftovers(problem, e, s, z):
-            pull = np.ascontiguousarray(np.where(used, pull_of(problem, weighted), 0.0).T)
-            _correlate(correlation, pull, tail)
-            tail = np.concatenate([tail, pull], axis=1)[:, -lags:] if lags else tail
-            total += pull.sum(axis=1)
-            count += used.sum(axis=0)
-            kept = counted(piece, 0, rows)
-            for o, channel in enumerate(piece.y):
-                measured = channel[rows] - origin[o]
-                for k, chosen in enumerate((kept[:, o], ~kept[:, o] & np.isfinite(measured) & started)):
-                    values = measured if np.all(chosen) else measured[chosen]
-                    misses = raw[:, o] if np.all(chosen) else raw[chosen, o]
-                    sums[k, o] += values.size, np.sum(misses**2), np.sum(values), np.sum(values**2), np.sum(misses)
-    used, rest = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
-    return Leftover(
-        correlation=correlation.transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
-        rest=rest,
-    )  # fmt: skip
-
-
-def _part(n: float, power: float, first: float, square: float, raw: float) -> Part:
-    count = max(n, 1.0)
-    return Part(count=int(n), power=power, spread=square - first**2 / count, bias=raw / count)
-
-
-def _lags(n: int) -> int:
-    return int(min(max(32, 4 * np.sqrt(n)), n // 4))
-
-
-def _correlate(
-    found: Float[np.ndarray, "ny ny lags1"], now: Float[np.ndarray, "ny n"], tail: Float[np.ndarray, "ny past"]
-) -> None:
-    """Add the sums of now_a(t) before_b(t - k), before being the tail and now."""
-    irfft, next_fast_len, rfft = _transforms()
-    lags, shift = found.shape[2] - 1, tail.shape[1]
-    size = next_fast_len(shift + now.shape[1] + lags, real=True)
-    spectrum = rfft(np.concatenate([tail, now], axis=1), size)
-    own = spectrum if shift == 0 else rfft(np.concatenate([np.zeros_like(tail), now], axis=1), size)
-    for a in range(len(now)):
-        for b in range(len(now)):
-            found[a, b] += irfft(own[a] * np.conj(spectrum[b]), size)[: lags + 1]
-
-
 def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
-    bread = np.zeros((z.size, z.size))
+    normal = np.zeros((1 + z.size, 1 + z.size))
     for e, pieces in enumerate(problem.segments):
         for s in range(len(pieces)):
             for _, columns, used in column_chunks(problem, e, s, z):
                 for o, places in enumerate(problem.columns(e, s)):
-                    chosen = np.flatnonzero(places >= 0)
-                    j = columns[:, o, 1 + chosen] / problem.sigma[e][o]
-                    weight = used[:, o] * _curvature(problem, columns[:, o, 0] / problem.sigma[e][o])
-                    bread[np.ix_(places[chosen], places[chosen])] += (j * weight[:, None]).T @ j
-    return bread
-
-
-def _curvature(problem: Residuals, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    if isinstance(problem.loss, Huber):
-        return (np.abs(r) <= problem.loss.threshold).astype(float)
-    if isinstance(problem.loss, Linear):
-        return np.ones_like(r)
-    return (1.0 + (r / problem.loss.threshold) ** 2) ** -1.5
-
-
-def pull_of(problem: Residuals, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
-    """Return the loss's derivative at each residual."""
-    if isinstance(problem.loss, Huber):
-        return np.clip(r, -problem.loss.threshold, problem.loss.threshold)
-    return r if isinstance(problem.loss, Linear) else r / np.sqrt(1.0 + (r / problem.loss.threshold) ** 2)
-
-
-def column_chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"]) -> Iterator[tuple[slice, Any, Any]]:
-    """Yield rows, their columns, and which samples count, chunk by chunk."""
-    first, weights, piece = 0, problem.weights(e), problem.segments[e][s]
-    arguments = problem.unknowns.models[e], piece, problem.point(e, z), problem.start(e, s, z)
-    for part in stream(*arguments, weights, chunk=CHUNK, columns=True):
-        assert part.columns is not None
-        rows = slice(first, first + len(part.columns))
-        first = rows.stop
-        yield rows, part.columns, counted(piece, weights.settle, rows)
+                    v = columns[:, o] / problem.sigma[e][o]
+                    weight = used[:, o] * curvature_of(problem.loss, v[:, 0])
+                    add_gram(normal, (v * weight[:, None]).T @ v, places)
+    return normal[1:, 1:]
 
 
 def coloured(
@@ -272,26 +67,74 @@ def coloured(
     p = inverse.shape[1]
     total = np.zeros((p, p))
     for e, (pieces, sums) in enumerate(zip(problem.segments, left, strict=True)):
-        density, ny = correlations(sums), len(problem.sigma[e])
+        r = correlations(sums)
+        reach, chunk = len(r) - 1, max(CHUNK, 4 * len(r))
+        longest = reach + min(chunk, max(piece.n for piece in pieces))
+        whole, again = (_Form.make(r, n) for n in (longest, reach))
         for s in range(len(pieces)):
-            tail = np.zeros((ny, p, density.shape[0] - 1))
-            for _, columns, used in column_chunks(problem, e, s, z):
-                influence = np.empty((ny, p, len(columns)))
-                for o, places in enumerate(problem.columns(e, s)):
-                    chosen = np.flatnonzero(places >= 0)
-                    weights = inverse[places[chosen]] / problem.sigma[e][o]
-                    np.einsum("tc,cp->pt", columns[:, o, 1 + chosen], weights, out=influence[o])
-                if not np.all(used):
-                    influence *= used.T[:, None, :]
-                total += _coloured_part(influence, tail, density)
-                tail = np.concatenate([tail, influence], axis=2)[:, :, influence.shape[2] :]
+            into = _into(problem, e, s, inverse)
+            tail = np.zeros((*into.shape[:2], 0))
+            for _, columns, used in column_chunks(problem, e, s, z, chunk):
+                with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)
+                total += whole(with_tail) - again(tail)
+                tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
     return total
 
 
-def _transforms() -> tuple[Any, Any, Any]:
-    from scipy import fft  # deferred: 0.1 s
+def _into(problem: Residuals, e: int, s: int, inverse: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "ny p nc"]:
+    """Return what takes the columns of each output to their influence on the parameters."""
+    rows: list[Float[np.ndarray, "p nc"]] = []
+    for o, places in enumerate(problem.columns(e, s)):
+        moved = np.where(places >= 0, inverse[places].T, 0.0) / problem.sigma[e][o]
+        rows.append(np.hstack([np.zeros((inverse.shape[1], 1)), moved]))
+    return np.array(rows)
 
-    return fft.irfft, fft.next_fast_len, fft.rfft
+
+def _influence(
+    columns: Float[np.ndarray, "m ny nc"], used: Bool[np.ndarray, "m ny"], into: Float[np.ndarray, "ny p nc"]
+) -> Float[np.ndarray, "ny p m"]:
+    """Return the influence of each sample; zero where it does not count."""
+    found = np.empty((*into.shape[:2], len(columns)))
+    for first in range(0, len(columns), SMALL):
+        rows = slice(first, first + SMALL)
+        np.matmul(into, columns[rows].transpose(1, 2, 0), out=found[:, :, rows])
+    return found if np.all(used) else found * used.T[:, None, :]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Form:
+    """The double sum over t and s of a_t' R(t - s) a_s, for stretches of a of limited length."""
+
+    size: int
+    density: Complex[np.ndarray, "ny ny f"]
+
+    @classmethod
+    def make(cls, r: Float[np.ndarray, "lags1 ny ny"], n: int) -> _Form:
+        """Return the form for at most n samples."""
+        reach, size = len(r) - 1, lagged_size(n, len(r))
+        kernel = np.zeros((*r.shape[1:], size))
+        kernel[:, :, : reach + 1] = r.transpose(1, 2, 0)
+        kernel[:, :, size - reach :] = r[:0:-1].transpose(2, 1, 0)  # R(-k) = R(k)'
+        density = np.asarray(transforms()[2](kernel)) * (2.0 / size)
+        density[:, :, 0] *= 0.5
+        if size % 2 == 0:
+            density[:, :, -1] *= 0.5
+        return cls(size=size, density=density)
+
+    def __call__(self, a: Float[np.ndarray, "ny p n"]) -> Float[np.ndarray, "p p"]:
+        """Return the sum."""
+        ny, p, n = a.shape
+        if not n:
+            return np.zeros((p, p))
+        spectrum = np.asarray(transforms()[2](a, self.size))
+        density = self.density[:, :, None]
+        found = np.zeros((p, p))
+        for o in range(ny):
+            filtered: Complex[np.ndarray, "p f"] = np.zeros_like(spectrum[o])
+            for b in range(ny):
+                filtered += density[o, b] * spectrum[b]
+            found += np.einsum("if,jf->ij", spectrum[o].view(float), filtered.view(float))
+        return found
 
 
 def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
@@ -303,9 +146,7 @@ def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
     count = np.maximum(left.count, 1.0)
     found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
     reach = _reach(found, float(np.max(count)))
-    x = np.arange(reach + 1) / max(reach, 1)
-    parzen = np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
-    return (found[:, :, : reach + 1] * parzen).transpose(2, 0, 1)
+    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1)
 
 
 def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
@@ -318,47 +159,6 @@ def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
     quiet = np.flatnonzero(np.diff(np.append(before, size.size + run)) > run)
     last = int(before[quiet[0]]) + 1
     return min(max(LEAST, int(WIDER * last)), size.size)
-
-
-def _coloured_part(
-    now: Float[np.ndarray, "ny p n"], before: Float[np.ndarray, "ny p lags"], r: Float[np.ndarray, "lags1 ny ny"]
-) -> Float[np.ndarray, "p p"]:
-    """Return the terms of the double sum in which t is now, and s is now or before (twice, for their mirror image)."""
-    _, next_fast_len, rfft = _transforms()
-    ny, p, n = now.shape
-    past = before if np.any(before) else before[:, :, :0]
-    size = next_fast_len(past.shape[2] + n + len(r), real=True)
-    spectrum = rfft(np.concatenate([past, now], axis=2), size)
-    own = spectrum if not past.shape[2] else rfft(np.concatenate([np.zeros_like(past), now], axis=2), size)
-    lagged = np.array(r.transpose(1, 2, 0))
-    lagged[:, :, 0] = 0.0
-    kernel = rfft(lagged, size) * (2.0 / size)
-    kernel[:, :, 0] *= 0.5
-    if size % 2 == 0:
-        kernel[:, :, -1] *= 0.5
-    later, here = np.zeros((p, p)), np.zeros((p, p))
-    for a in range(ny):
-        for b in range(ny):
-            weighted = spectrum[b] * kernel[a, b]
-            for i in range(p):
-                for j in range(p):
-                    later[i, j] += _real_sum(own[a, i], weighted[j])
-                    here[i, j] += r[0, a, b] * float(np.sum(now[a, i] * now[b, j]))
-    return here + later + later.T
-
-
-def _real_sum(x: Any, y: Any) -> float:
-    """Return the real part of sum conj(x) y."""
-    return float(np.sum(x.real * y.real) + np.sum(x.imag * y.imag))
-
-
-def inverse(hessian: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
-    """Return H^-1 over what is seen, and how much of each unknown is not (0 to 1, squared)."""
-    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    values, vectors = np.linalg.eigh(hessian / np.outer(scale, scale))
-    seen = values > RANK * max(values[-1], 1e-300)
-    found = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / np.outer(scale, scale)
-    return found, np.sum(vectors[:, ~seen] ** 2, axis=1)
 
 
 def with_infinities(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:

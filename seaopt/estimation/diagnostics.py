@@ -14,8 +14,8 @@ import numpy as np
 
 from seaopt.estimation.advice import OutputDiagnostics, sentences
 from seaopt.estimation.correlation import LAGS, QUANTILE, CrossCorrelation, autocorrelation, cross_correlation
-from seaopt.estimation.covariance import Errors, leftover
 from seaopt.estimation.forecasts import Percent, fit_percent, free_run, one_step
+from seaopt.estimation.leftover import Errors, leftover
 from seaopt.estimation.leverage import Leverage, leverage
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit, Minimum

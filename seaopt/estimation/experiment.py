@@ -63,10 +63,17 @@ class Experiment:
         Cut each segment into so many that start from states of their own: for a plant that runs away in simulation, at
         the price of what the joints would tell.
 
+    Attributes
+    ----------
+    stretches : tuple of slice
+        The log's samples between gaps.
+
     Raises
     ------
     EstimationError
         The log has no measured output or lacks an input, a unit has the wrong dimension, or a name is unknown.
+    LogError
+        The log is not uniformly sampled.
 
     """
 
@@ -83,6 +90,7 @@ class Experiment:
     hold: Hold = "zero"
     gaps: Literal["split", "error"] = "split"
     shots: int = 1
+    stretches: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -107,6 +115,7 @@ class Experiment:
                     f"experiment {self.name}: output {name} has no finite sample; leave it out of outputs"
                 )
         self._check_units()
+        object.__setattr__(self, "stretches", tuple(self.log.segments))
         self._check_settings()
 
     def _check_units(self) -> None:
@@ -162,15 +171,15 @@ class Experiment:
             raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
         if self.gaps not in ("split", "error"):
             raise EstimationError(f'experiment {self.name}: gaps = "{self.gaps}" is not known; use "split" or "error"')
-        if self.gaps == "error" and len(self.log.segments) > 1:
-            count = _counted(len(self.log.segments) - 1, "gap")
+        if self.gaps == "error" and len(self.stretches) > 1:
+            count = _counted(len(self.stretches) - 1, "gap")
             raise EstimationError(
                 f'experiment {self.name}: the log has {count} and gaps = "error"; '
                 'use gaps = "split", or slice_s to choose a stretch'
             )
 
     def __repr__(self) -> str:
-        count = _counted(len(self.log.segments), "segment")
+        count = _counted(len(self.stretches), "segment")
         return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
@@ -180,7 +189,7 @@ class Experiment:
         time, first, whole = self.log.time, float(self.log.time[0]), self.log.duration_s
         used = (time <= first + (1.0 - holdout) * whole).astype(np.uint8) if holdout else None
         step = 2.0 * self.log.period / whole
-        stretches = [whole for whole in self.log.segments for _ in self._cuts(whole)[1:]]
+        stretches = [whole for whole in self.stretches for _ in self._cuts(whole)[1:]]
         return [
             Segment(
                 u=tuple(channel[stretch.start : piece.stop] for channel in u),
@@ -196,7 +205,7 @@ class Experiment:
     @property
     def pieces(self) -> list[slice]:
         """The stretches that are simulated each from a state of its own."""
-        return [slice(a, b) for whole in self.log.segments for a, b in pairwise(self._cuts(whole))]
+        return [slice(a, b) for whole in self.stretches for a, b in pairwise(self._cuts(whole))]
 
     def _cuts(self, stretch: slice) -> list[int]:
         """Return the rows at which a stretch is cut into shots, its ends included."""

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.frequency import h1
+from seaopt.frequency import FrequencyResponse, h1
 from seaopt.simulation import Model, linearised
 
 CANDIDATES = 128
@@ -29,16 +29,19 @@ LONGEST = 1 << 14  # samples a stretch: resolution enough for a guess
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Target:
-    """A measured response of one input-output pair, and the linearised model of it."""
+    """The measured responses of an experiment's outputs to its input, and the linearised model of them.
+
+    Rows are frequencies, columns outputs; the weight is zero where an output has no response to be matched.
+    """
 
     model: Model
     index: list[int]
     input: int
-    output: int
+    outputs: list[int]
     s: Complex[np.ndarray, " m"]
-    shift: Complex[np.ndarray, " m"]
-    log_response: Complex[np.ndarray, " m"]
-    weight: Float[np.ndarray, " m"]
+    shift: Complex[np.ndarray, "m ny"]
+    log_response: Complex[np.ndarray, "m ny"]
+    weight: Float[np.ndarray, "m ny"]
 
 
 def first_guess(
@@ -51,7 +54,8 @@ def first_guess(
 
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
     """
-    targets = [target for e in range(len(experiments)) for target in _targets(experiments[e], unknowns, e, band_hz)]
+    found_targets = (_target(experiment, unknowns, e, band_hz) for e, experiment in enumerate(experiments))
+    targets = [target for target in found_targets if target is not None]
     if not targets:
         return [], False
     start = unknowns.start[: unknowns.shared]
@@ -59,7 +63,7 @@ def first_guess(
     prior = unknowns.prior_std[: unknowns.shared]
     spread = np.isinf(prior) & (start != 0.0)
     found = [_refine(targets, start, low, high, spread)]
-    enough = 0.5 * EXPLAINED**2 * 2 * sum(target.s.size for target in targets)
+    enough = 0.5 * EXPLAINED**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
     if found[0][0] > enough:
         candidates = [
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
@@ -80,13 +84,12 @@ def _first(pair: tuple[float, Any]) -> float:
     return pair[0]
 
 
-def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> list[_Target]:
+def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> _Target | None:
     log = experiment.log
     active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
-    if len(active) != 1 or len(log.segments) != 1:
-        return []
-    model = linearised(unknowns.models[e])
-    found: list[_Target] = []
+    if len(active) != 1 or len(experiment.stretches) != 1:
+        return None
+    chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, " m"]]] = {}
     for o, output in enumerate(experiment.outputs):
         if not np.all(np.isfinite(log[output])):
             continue
@@ -97,24 +100,29 @@ def _targets(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[
         low, high = band_hz if band_hz is not None else (0.0, np.inf)
         f = estimate.frequency_hz
         good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
-        if np.count_nonzero(good) < 8:
-            continue
-        chosen = _log_spaced(f, good)
-        delay = unknowns.locals_of[e].delay.value + (0.5 * log.period if experiment.hold == "zero" else 0.0)
-        s = 2j * np.pi * f[chosen]
-        found.append(
-            _Target(
-                model=model,
-                index=[unknowns.names.index(name) for name in model.free],
-                input=list(experiment.plant.inputs).index(active[0]),
-                output=o,
-                s=s,
-                shift=unknowns.locals_of[e].gain[o].value * np.exp(-s * delay),
-                log_response=np.log(estimate.response[chosen]),
-                weight=1.0 / np.maximum(estimate.relative_std[chosen], 0.02),
-            )
-        )
-    return found
+        if np.count_nonzero(good) >= 8:
+            chosen[o] = estimate, _log_spaced(f, good)
+    if not chosen:
+        return None
+    rows = np.unique(np.concatenate([own for _, own in chosen.values()]))
+    estimates = [estimate for estimate, _ in chosen.values()]
+    used = np.column_stack([np.isin(rows, own) for _, own in chosen.values()])
+    response = np.column_stack([estimate.response[rows] for estimate in estimates])
+    spread = np.column_stack([np.maximum(estimate.relative_std[rows], 0.02) for estimate in estimates])
+    delay = unknowns.locals_of[e].delay.value + (0.5 * log.period if experiment.hold == "zero" else 0.0)
+    s = 2j * np.pi * estimates[0].frequency_hz[rows]
+    gain = np.array([unknowns.locals_of[e].gain[o].value for o in chosen])
+    model = linearised(unknowns.models[e])
+    return _Target(
+        model=model,
+        index=[unknowns.names.index(name) for name in model.free],
+        input=list(experiment.plant.inputs).index(active[0]),
+        outputs=list(chosen),
+        s=s,
+        shift=np.exp(-s * delay)[:, None] * gain,
+        log_response=np.log(np.where(used, response, 1.0)),
+        weight=np.where(used, 1.0 / spread, 0.0),
+    )
 
 
 def _stretch(n: int) -> int:
@@ -128,7 +136,7 @@ def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
     """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
     candidates = np.flatnonzero(good)
     grid = np.geomspace(f[candidates[0]], f[candidates[-1]], POINTS)
-    nearest = np.abs(np.log(f[candidates][None, :] / grid[:, None])).argmin(axis=1)
+    nearest = np.abs(np.log(f[candidates]) - np.log(grid)[:, None]).argmin(axis=1)
     return candidates[np.unique(nearest)]
 
 
@@ -138,32 +146,27 @@ def _misfit(
     """Return half the squared misfit, and its gradient and Gauss-Newton Hessian if asked."""
     cost, gradient, hessian = 0.0, np.zeros(theta.size), np.zeros((theta.size, theta.size))
     for target in targets:
-        nx = target.model.nx
+        nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
         g, dg = target.model.matrices(theta[target.index])
-        a, b = g[:nx, :nx], g[:nx, nx + target.input]
-        c, d = g[nx + target.output, :nx], g[nx + target.output, nx + target.input]
-        inner = target.s[:, None, None] * np.eye(nx) - a
+        b, db = g[:nx, nx + target.input], dg[:, :nx, nx + target.input]
+        c, dc = g[rows, :nx], dg[:, rows, :nx]
         try:
-            x = np.linalg.solve(inner, np.broadcast_to(b[:, None], (target.s.size, nx, 1)))[:, :, 0]
+            back = np.linalg.inv(target.s[:, None, None] * np.eye(nx) - g[:nx, :nx])
         except np.linalg.LinAlgError:
             return np.inf, gradient, hessian
-        response = (x @ c + d) * target.shift
+        x = back @ b
+        response = (x @ c.T + g[rows, nx + target.input]) * target.shift
         if not np.all(np.isfinite(response)) or np.any(response == 0.0):
             return np.inf, gradient, hessian
-        difference = np.log(response) - target.log_response
+        difference: Any = np.log(response) - target.log_response
         wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
         r = target.weight * wrapped
         cost += 0.5 * float(np.vdot(r, r).real)
         if derivatives:
-            ct = np.linalg.solve(inner.transpose(0, 2, 1), np.broadcast_to(c[:, None], (target.s.size, nx, 1)))[:, :, 0]
-            columns = [
-                (x @ m[nx + target.output, :nx] + m[nx + target.output, nx + target.input])
-                + np.einsum("mi,ij,mj->m", ct, m[:nx, :nx], x)
-                + ct @ m[:nx, nx + target.input]
-                for m in dg
-            ]
-            j = (target.weight / response * target.shift)[:, None] * np.array(columns).T
-            gradient[target.index] += (j.conj().T @ r).real
+            moved = back @ ((dg[:, :nx, :nx] @ x.T).transpose(2, 1, 0) + db.T)
+            slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
+            j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
+            gradient[target.index] += (j.conj().T @ r.ravel()).real
             hessian[np.ix_(target.index, target.index)] += (j.conj().T @ j).real
     return cost, gradient, hessian
 

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import counted
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.least_squares import Callback
+from seaopt.estimation.leftover import counted
+from seaopt.estimation.losses import Huber, Linear, Loss, SoftL1
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
-from seaopt.estimation.residuals import Huber, Linear, Loss, Residuals, SoftL1, spread_of
+from seaopt.estimation.residuals import Residuals, spread_of
 from seaopt.estimation.result import Fit
 from seaopt.estimation.shooting import multiple_shooting
 from seaopt.estimation.solve import Solved, output_error, prediction_error
@@ -110,10 +111,10 @@ def check_choices(method: Any, loss: Any, band_hz: Any) -> None:
 
 def _solved(problem: Residuals, params: ParameterSet, method: Method, callback: Callback | None) -> Solved:
     if isinstance(method, MultipleShooting):
-        return multiple_shooting(problem, params, method, problem.band_hz, callback)
+        return multiple_shooting(problem, params, method, callback)
     if isinstance(method, PredictionError):
-        return prediction_error(problem, method, problem.band_hz, callback)
-    return output_error(problem, method, problem.band_hz, callback)
+        return prediction_error(problem, method, callback)
+    return output_error(problem, method, callback)
 
 
 def _named(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:

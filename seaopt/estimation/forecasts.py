@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.covariance import Errors, counted, errors
+from seaopt.estimation.leftover import Errors, counted, errors
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Minimum
 from seaopt.estimation.solve import with_observers

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.covariance import RANK
+from seaopt.estimation.normal import RANK, eliminated
 from seaopt.estimation.residuals import Residuals
 from seaopt.simulation import Segment, run_passes
 
@@ -57,7 +57,7 @@ def identifiability(
     `values` are the unknowns' own, to which changes along an unseen direction are relative.
     """
     p = len(names)
-    left, own = reduced(hessian, p), np.diag(hessian)[:p]
+    left, own = eliminated(hessian, p), np.diag(hessian)[:p]
     size = np.sqrt(np.where(own > 0.0, own, 1.0))
     eigenvalues, vectors = np.linalg.eigh(left / np.outer(size, size))
     largest = max(float(eigenvalues[-1]), 1e-300)
@@ -82,23 +82,13 @@ def identifiability(
     )
 
 
-def reduced(hessian: Float[np.ndarray, "n n"], p: int) -> Float[np.ndarray, "p p"]:
-    """Return the Schur complement of all but the first p unknowns."""
-    if hessian.shape[0] == p:
-        return hessian.copy()
-    rest = hessian[p:, p:]
-    scale = np.sqrt(np.maximum(np.diag(rest), 1e-300))
-    inverse = np.linalg.pinv(rest / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
-    return hessian[:p, :p] - hessian[:p, p:] @ inverse @ hessian[p:, :p]
-
-
 def structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
     """Return how many directions of the parameters a rich input would show on the outputs that were measured.
 
     The input is white noise of the log's own size on every input that the log excites, from rest and without noise.
     """
     p = problem.unknowns.shared
-    information = np.diag(problem.unknowns.prior_std[:p] ** -2.0)
+    information = np.diag(problem.unknowns.precision[:p])
     rng = np.random.default_rng(0)
     for e, model in enumerate(problem.unknowns.models):
         index = np.array(problem.unknowns.theta_index(model), dtype=int)

@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from seaopt.bench import Excitation, excite
 from seaopt.errors import EstimationError, suggestion
-from seaopt.estimation.covariance import inverse, with_infinities
+from seaopt.estimation.covariance import with_infinities
+from seaopt.estimation.normal import inverse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.simulation import Clock, Model, Pass, Point, Segment, make_model, run_passes

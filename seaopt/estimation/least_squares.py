@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.estimation.normal import newton_decrement, solved
 from seaopt.estimation.residuals import Evaluation
 
 Status = Literal["converged", "max_iterations", "stalled"]
@@ -134,11 +135,7 @@ def _held(here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray
 
 
 def _decrement(here: Evaluation, held: Bool[np.ndarray, " n"]) -> float:
-    free = ~held
-    size = _norms(here)[free]
-    values, vectors = np.linalg.eigh(here.hessian[np.ix_(free, free)] / np.outer(size, size))
-    seen = values > 1e-12 * max(values[-1], 1e-300) if values.size else np.zeros(0, dtype=bool)
-    return float(np.sum((vectors.T @ (here.gradient[free] / size))[seen] ** 2 / values[seen]))
+    return newton_decrement(here.hessian[np.ix_(~held, ~held)], here.gradient[~held], 1e-12)
 
 
 def _step(
@@ -149,10 +146,8 @@ def _step(
     h, g = here.hessian, here.gradient
     matrix, gradient, response = h[np.ix_(bound, bound)], g[bound], np.zeros((0, 0))
     if np.any(follow):
-        own = h[np.ix_(follow, follow)]
-        size = np.sqrt(np.maximum(np.diag(own), 1e-300))
-        back = np.linalg.pinv(own / np.outer(size, size), rcond=1e-13, hermitian=True) / np.outer(size, size)
-        response = back @ np.column_stack([g[follow], h[np.ix_(follow, bound)]])
+        right = np.column_stack([g[follow], h[np.ix_(follow, bound)]])
+        response = solved(h[np.ix_(follow, follow)], right, 1e-13)
         matrix = matrix - h[np.ix_(bound, follow)] @ response[:, 1:]
         gradient = gradient - h[np.ix_(bound, follow)] @ response[:, 0]
     step = np.zeros(held.size)

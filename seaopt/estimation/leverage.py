@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.identifiability import reduced
+from seaopt.estimation.normal import eliminated, inverse
 from seaopt.estimation.result import Minimum
 
 PRIORS = "priors"
@@ -36,36 +36,28 @@ def leverage(minimum: Minimum) -> dict[str, Leverage]:
     parts = {
         experiment.name: _information(minimum, e) for e, experiment in enumerate(problem.experiments)
     }  # fmt: skip
-    prior = unknowns.prior_std[:p] ** -2.0
+    prior = unknowns.precision[:p]
     if np.any(prior > 0.0):
         parts[PRIORS] = np.diag(prior)
     whole = np.sum(list(parts.values()), axis=0)
-    size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    back = np.linalg.pinv(whole / np.outer(size, size), rcond=1e-10, hermitian=True)
+    back, _ = inverse(whole, 1e-10)
     found: dict[str, Leverage] = {}
     for name, part in parts.items():
-        scaled = part / np.outer(size, size)
-        shares = np.diag(back @ scaled @ back) / np.maximum(np.diag(back), 1e-300)
+        shares = np.diag(back @ part @ back) / np.maximum(np.diag(back), 1e-300)
         found[name] = Leverage(
             parameters=dict(zip(unknowns.names[:p], shares.tolist(), strict=True)),
-            whole=float(np.trace(scaled @ back)) / p,
+            whole=float(np.trace(part @ back)) / p,
         )
     return found
 
 
 def _information(minimum: Minimum, e: int) -> Float[np.ndarray, "p p"]:
     """Return an experiment's information on the plants' parameters, its own unknowns eliminated."""
-    problem, unknowns, n = minimum.problem, minimum.problem.unknowns, minimum.z.size
-    hessian = np.zeros((n, n))
-    own = np.zeros(n, dtype=bool)
-    for s in range(len(problem.segments[e])):
-        found = problem.run(e, s, minimum.z)
-        for o, places in enumerate(problem.columns(e, s)):
-            used = np.flatnonzero(places >= 0)
-            index = places[used]
-            own[index] = True
-            hessian[np.ix_(index, index)] += found.gram[0, o][np.ix_(1 + used, 1 + used)] / problem.sigma[e][o] ** 2
-    rest = own & (np.arange(n) >= unknowns.shared)
-    hessian[rest, rest] += unknowns.prior_std[rest] ** -2.0
-    kept = np.concatenate([np.arange(unknowns.shared), np.flatnonzero(rest)])
-    return reduced(hessian[np.ix_(kept, kept)], unknowns.shared)
+    problem, p = minimum.problem, minimum.problem.unknowns.shared
+    passes = problem.passes_of(e, minimum.z)
+    hessian = problem.normal(e, passes)[1:, 1:]
+    touched = np.unique(np.concatenate([places for s in range(len(passes)) for places in problem.columns(e, s)]))
+    rest = touched[touched >= p]
+    hessian[rest, rest] += problem.unknowns.precision[rest]
+    kept = np.concatenate([np.arange(p), rest])
+    return eliminated(hessian[np.ix_(kept, kept)], p)

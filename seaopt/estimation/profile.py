@@ -25,6 +25,7 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.least_squares import minimise
+from seaopt.estimation.normal import solved
 from seaopt.estimation.result import Fit, Minimum
 
 CLOSE = 2e-3  # of tau: near enough for an end of the interval to be interpolated
@@ -263,12 +264,9 @@ class _Curve:
 def _direction(hessian: Float[np.ndarray, "n n"], index: int) -> Float[np.ndarray, " n"]:
     """Return how the others follow when one unknown moves by one: to first order, their best values."""
     others = np.arange(len(hessian)) != index
-    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    normal = hessian / np.outer(scale, scale)
-    step = np.zeros(len(hessian))
-    step[others] = -np.linalg.pinv(normal[np.ix_(others, others)], rcond=1e-12, hermitian=True) @ normal[others, index]
-    step[index] = 1.0
-    return step * scale[index] / scale
+    step = np.ones(len(hessian))
+    step[others] = -solved(hessian[np.ix_(others, others)], hessian[others, index], 1e-12)
+    return step
 
 
 def _reached(taus: list[float], values: list[float], target: float) -> float:

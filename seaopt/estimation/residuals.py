@@ -15,8 +15,8 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -25,62 +25,17 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.losses import NAMES, Linear, Loss
+from seaopt.estimation.normal import add_gram, solved
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.simulation import Clock, Pass, Point, RobustLoss, Segment, Weights, run_passes
+from seaopt.simulation import Clock, Pass, Point, Segment, Weights, run_passes, threads
 
 if TYPE_CHECKING:
     from seaopt.estimation.observer import Observer
 
-CHUNK = 80_000  # samples
+CHUNK = 1 << 14  # samples whose sums stay in a core's cache
+WATCHED = 8_000  # first samples that tell the integration error in an output, and a filter's sizes and places
 ALONE = 8_000  # samples below which experiments are not worth a thread each
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Linear:
-    """Plain least squares."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Huber:
-    """Squares up to `threshold` sigma, absolute values beyond (Huber 1964): outliers pull less.
-
-    Parameters
-    ----------
-    threshold : float
-        In sigma; 1.345 keeps 95 % of the efficiency on Gaussian noise.
-
-    """
-
-    threshold: float = 1.345
-
-    def __post_init__(self) -> None:
-        _check_threshold("Huber", self.threshold)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SoftL1:
-    """Squares near zero that bend smoothly into absolute values: 2 (sqrt(1 + s^2) - 1), s in thresholds.
-
-    Parameters
-    ----------
-    threshold : float
-        In sigma.
-
-    """
-
-    threshold: float = 1.345
-
-    def __post_init__(self) -> None:
-        _check_threshold("SoftL1", self.threshold)
-
-
-def _check_threshold(name: str, value: float) -> None:
-    if not 0.0 < value < np.inf:
-        raise EstimationError(f"{name}(threshold={value:g}): give a positive number of sigmas")
-
-
-Loss = Linear | Huber | SoftL1
-_NAMES: dict[type, RobustLoss] = {Linear: "square", Huber: "huber", SoftL1: "soft_l1"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,7 +90,7 @@ class Residuals:
     segments: tuple[tuple[Segment, ...], ...]
     unknowns: Unknowns
     sigma: tuple[Float[np.ndarray, " _"], ...]
-    loss: Loss = Linear()
+    loss: Loss = field(default_factory=Linear)
     band_hz: tuple[float, float] | None = None
     substeps: tuple[int, ...] = ()
     observers: tuple[Observer, ...] | None = None
@@ -173,7 +128,7 @@ class Residuals:
         if not isinstance(self.loss, Linear):
             knee = self.loss.threshold * self.sigma[e]
         sections, settle = band_filter(self.band_hz, self.experiments[e].log.period)
-        return Weights(sections=sections, settle=settle, knee=knee, loss=_NAMES[type(self.loss)])
+        return Weights(sections=sections, settle=settle, knee=knee, loss=NAMES[type(self.loss)])
 
     def columns(self, e: int, s: int) -> list[Int[np.ndarray, " nc"]]:
         """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""
@@ -184,15 +139,17 @@ class Residuals:
         model, start = self.unknowns.models[e], self.start(e, s, z)[None]
         return run_passes(model, self.segments[e][s], self.point(e, z), start, self.weights(e), **keep)
 
-    def _passes_of(self, e: int, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+    def passes_of(self, e: int, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+        """Run the passes of experiment e; those of a nonlinear plant keep the outputs of the first samples."""
         model, point, weights = self.unknowns.models[e], self.point(e, z), self.weights(e)
-        pieces = enumerate(self.segments[e])
-        return tuple(run_passes(model, piece, point, self.start(e, s, z)[None], weights) for s, piece in pieces)
+        shown = 0 if model.linear else WATCHED
+        return tuple(
+            run_passes(model, piece, point, self.start(e, s, z)[None], weights, outputs=shown > 0, shown=shown)
+            for s, piece in enumerate(self.segments[e])
+        )
 
     def map(self, call: Callable[[int], Any]) -> list[Any]:
         """Call for every experiment; in threads of their own where they are long enough."""
-        from seaopt.simulation.compiled import threads
-
         count = len(self.experiments)
         if count < 2 or sum(piece.n for row in self.segments for piece in row) < ALONE:
             return [call(e) for e in range(count)]
@@ -200,7 +157,7 @@ class Residuals:
 
     def passes(self, z: Float[np.ndarray, " n"]) -> tuple[tuple[Pass, ...], ...]:
         """Run every pass."""
-        return tuple(self.map(lambda e: self._passes_of(e, z)))
+        return tuple(self.map(lambda e: self.passes_of(e, z)))
 
     def evaluate(self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if the plant overflows."""
@@ -211,25 +168,16 @@ class Residuals:
     def assemble(self, z: Float[np.ndarray, " n"], passes: tuple[tuple[Pass, ...], ...]) -> Evaluation:
         """Return the evaluation that passes at `z` give: other sigmas need no other passes."""
         n, unknowns = z.size, self.unknowns
-        cost, gradient, hessian = 0.0, np.zeros(n), np.zeros((n, n))
+        cost, gradient, hessian = unknowns.prior(z)
         for e, row in enumerate(passes):
-            for s, found in enumerate(row):
-                for o, places in enumerate(self.columns(e, s)):
-                    gram = found.gram[0, o] / self.sigma[e][o] ** 2
-                    cost += float(found.loss[0, o]) / self.sigma[e][o] ** 2
-                    used = np.flatnonzero(places >= 0)
-                    index = places[used]
-                    gradient[index] += gram[0, 1 + used]
-                    hessian[np.ix_(index, index)] += gram[np.ix_(1 + used, 1 + used)]
-        prior = (z - unknowns.start) / unknowns.prior_std
-        cost += 0.5 * float(prior @ prior)
-        gradient += prior / unknowns.prior_std
-        hessian[np.diag_indices(n)] += unknowns.prior_std**-2.0
+            own = self.normal(e, row)
+            gradient, hessian = gradient + own[0, 1:], hessian + own[1:, 1:]
+            cost += sum(float(np.sum(found.loss[0] / self.sigma[e] ** 2)) for found in row)
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
         moved = np.zeros(n)
         if finite and np.any(linear):
-            moved[linear] = -_solved(hessian[np.ix_(linear, linear)], gradient[linear])
+            moved[linear] = -solved(hessian[np.ix_(linear, linear)], gradient[linear], 1e-13)
             cost += 0.5 * float(moved @ gradient)
             gradient = np.where(linear, 0.0, gradient + hessian @ moved)
         squares, counts = self._sums(passes, moved)
@@ -237,6 +185,14 @@ class Residuals:
             z=z + moved, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian, squares=squares,
             counts=counts, undamped=linear, origin=z, passes=passes,
         )  # fmt: skip
+
+    def normal(self, e: int, row: Sequence[Pass]) -> Float[np.ndarray, "n1 n1"]:
+        """Return the normal matrix of [residual, unknowns], in sigma, of an experiment's passes."""
+        total = np.zeros((1 + self.unknowns.start.size,) * 2)
+        for s, found in enumerate(row):
+            for o, places in enumerate(self.columns(e, s)):
+                add_gram(total, found.gram[0, o] / self.sigma[e][o] ** 2, places)
+        return total
 
     @property
     def exactly_linear(self) -> bool:
@@ -278,14 +234,6 @@ def spread_of(values: Float[np.ndarray, " n"]) -> float:
         part = part[np.isfinite(part)] if not np.all(np.isfinite(part)) else part
         count, total, square = count + part.size, total + float(np.sum(part)), square + float(np.sum(part**2))
     return float(np.sqrt(max(square / count - (total / count) ** 2, 0.0)))
-
-
-def _solved(matrix: Float[np.ndarray, "m m"], vector: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return matrix^-1 vector over what is seen; the rest stays where it is."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    seen = values > 1e-13 * max(values[-1], 1e-300)
-    return (vectors[:, seen] @ ((vectors[:, seen].T @ (vector / scale)) / values[seen])) / scale
 
 
 @lru_cache(maxsize=32)

@@ -23,11 +23,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import errors
 from seaopt.estimation.experiment import Experiment, shot_edges
 from seaopt.estimation.least_squares import Callback, minimise
+from seaopt.estimation.leftover import errors
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import MultipleShooting
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.normal import add_gram
+from seaopt.estimation.residuals import Evaluation, Residuals
 from seaopt.estimation.solve import (
     Solved,
     best_start,
@@ -87,7 +89,7 @@ class Shooting:
         shots = self._followed(z, here, damping)
         n = z.size
         unknowns = self.problem.unknowns
-        cost, gradient, hessian, pending = 0.0, np.zeros(n), np.zeros((n, n)), 0.0
+        (cost, gradient, hessian), pending = unknowns.prior(z), 0.0
         own: list[tuple[Any, ...]] = []
         slope: list[tuple[Any, ...]] = []
         gaps: list[tuple[Any, ...]] = []
@@ -101,10 +103,6 @@ class Shooting:
             slope.append(tuple(part.slope for part in parts))
             gaps.append(tuple(part.gaps for part in parts))
             passes.append(tuple(part.found for part in parts))
-        prior = (z - unknowns.start) / unknowns.prior_std
-        cost += 0.5 * float(prior @ prior)
-        gradient = gradient + prior / unknowns.prior_std
-        hessian[np.diag_indices(n)] += unknowns.prior_std**-2.0
         initial = [
             slot.index for places in unknowns.locals_of for r in places.initial for slot in r if slot.index is not None
         ]
@@ -138,11 +136,8 @@ class Shooting:
         normal = np.zeros((count, 1 + n + nx, 1 + n + nx))  # of [residual, z, node], one a shot
         for o, places in enumerate(problem.columns(e, s)):
             is_node = (np.arange(places.size) >= shared) & (np.arange(places.size) < shared + nx)
-            where = np.where(is_node, 1 + n + np.arange(places.size) - shared, 1 + places)
-            used = np.flatnonzero(is_node | (places >= 0))
-            index, columns = np.concatenate([[0], where[used]]), np.concatenate([[0], 1 + used])
-            gram = found.gram[:, o] / problem.sigma[e][o] ** 2
-            normal[np.ix_(np.arange(count), index, index)] += gram[np.ix_(np.arange(count), columns, columns)]
+            where = np.where(is_node, n + np.arange(places.size) - shared, places)
+            add_gram(normal, found.gram[:, o] / problem.sigma[e][o] ** 2, where)
         cost = float(np.sum(found.loss / problem.sigma[e] ** 2))
         gaps = found.last[:-1, :, 0] - shots.nodes[1:]
         pulled = gaps + shots.shift
@@ -210,11 +205,10 @@ def _eliminated(
 
 
 def multiple_shooting(
-    problem: Residuals, params: ParameterSet, method: MultipleShooting, band_hz: tuple[float, float] | None,
-    callback: Callback | None,
-) -> Solved:  # fmt: skip
+    problem: Residuals, params: ParameterSet, method: MultipleShooting, callback: Callback | None
+) -> Solved:
     """Join the shots step by step; then settle by single shooting, or on shots of their own if the plant runs away."""
-    start, _ = best_start(problem, method, band_hz)
+    start, _ = best_start(problem, method)
     plain = replace(problem, band_hz=None, loss=Linear())
     z = start.z
     if method.search and (not np.isfinite(start.cost) or explains_little(problem, start)):
@@ -351,7 +345,7 @@ def _first_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> 
             shots = len(edges) - 1
             nodes = np.zeros((shots, nx))
             if watched is not None:
-                states = watched.run(e, s, z, states=True).states
+                states = watched.run(e, s, z, sums=False, states=True).states
                 assert states is not None
                 nodes = states[edges[:-1]].copy() if np.all(np.isfinite(states)) else nodes
             fixed = all(slot.index is None for slot in problem.unknowns.locals_of[e].initial[s])

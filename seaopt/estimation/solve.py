@@ -8,38 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.covariance import errors, inverse
 from seaopt.estimation.first_guess import first_guess
 from seaopt.estimation.least_squares import DECREMENT, Callback, Solution, minimise
+from seaopt.estimation.leftover import errors
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method
 from seaopt.estimation.observer import Observer
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals
+from seaopt.estimation.residuals import WATCHED, Evaluation, Residuals
+from seaopt.estimation.steps import EXACT, Checks, StepError, checked, refined, started, worst_of
 from seaopt.simulation import Point, Segment, run_passes
 
-STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
-STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
-EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
-MAX_SUBSTEPS = 256
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
 NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 FURTHER = 5  # guesses of the frequency responses that are tried at most
-WATCHED = 8_000  # samples that are looked at for them
 PLACES = 48  # over which a nonlinear plant is linearised for its filter
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StepError:
-    """Integration error at the minimum: largest in an output, in sigma, and in a parameter, in standard deviations."""
-
-    output: float = 0.0
-    parameter: float = 0.0
-
-    @property
-    def small(self) -> bool:
-        """Whether it may be left out of account."""
-        return self.output <= STEP_ERROR_SIGMA and self.parameter <= STEP_ERROR_PARAMETER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,11 +35,9 @@ class Solved:
     step_error: StepError
 
 
-def output_error(
-    problem: Residuals, method: Method, band_hz: tuple[float, float] | None, callback: Callback | None
-) -> Solved:
+def output_error(problem: Residuals, method: Method, callback: Callback | None) -> Solved:
     """Single shooting from the best start that can be found."""
-    best, guessed = best_start(problem, method, band_hz)
+    best, guessed = best_start(problem, method)
     found = settle(problem, best, method.max_iterations, callback) if np.isfinite(best.cost) else None
     if found is not None and not (method.search and _doubtful(found, guessed)):
         return found
@@ -84,9 +66,9 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     if not np.isfinite(start.cost):
         solution = minimise(problem.evaluate, start, unknowns.low, unknowns.high)
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
-    problem, here, error = _refined(problem, start, 0.1)
+    problem, here = started(problem, start)
     decrement = DECREMENT if problem.observers is None else NOISE_DECREMENT
-    checked = (here.z, ())
+    checks: Checks = (None,) * len(problem.experiments)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
             problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement,
@@ -103,10 +85,7 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
             here = problem.assemble(here.origin, here.passes)  # other sigmas need no other passes
         elif not settled:
             here = problem.evaluate(here.z)
-        moved = here.z - checked[0]
-        if not (settled and checked[1] == before and moved @ here.hessian @ moved < 1.0):
-            problem, here, error = _refined(problem, here, STEP_ERROR_SIGMA)
-            checked = here.z, problem.substeps
+        problem, here, checks = refined(problem, here, checks if settled else (None,) * len(checks))
         done, spent = settled and problem.substeps == before, iterations >= max_iterations
         if done or spent or attempt == MAX_ROUNDS - 1:
             solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
@@ -116,18 +95,16 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
             elif not done:
                 message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
                 solution = replace(solution, status="stalled", message=message)
-            return Solved(problem=problem, solution=solution, step_error=error)
+            return Solved(problem=problem, solution=solution, step_error=worst_of(checked(problem, here, checks)))
     raise AssertionError  # the last attempt returns
 
 
-def best_start(
-    problem: Residuals, method: Method, band_hz: tuple[float, float] | None
-) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
+def best_start(problem: Residuals, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses."""
     if not method.search:
         return problem.evaluate(problem.unknowns.start), []
     rng = np.random.default_rng(method.seed)
-    guesses, matched = first_guess(problem.experiments, problem.unknowns, band_hz, rng)
+    guesses, matched = first_guess(problem.experiments, problem.unknowns, problem.band_hz, rng)
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed):
         return guessed, guesses
@@ -235,7 +212,7 @@ def _observer(
         if not np.all(np.isfinite(correction)):
             return None
         settings = replace(point, clock=replace(point.clock, delay_free=False), correction=correction)
-        states = run_passes(model, short, settings, np.zeros((1, model.nx)), states=True).states
+        states = run_passes(model, short, settings, np.zeros((1, model.nx)), sums=False, states=True).states
         assert states is not None
         if not np.all(np.isfinite(states)):
             return None
@@ -289,70 +266,9 @@ def _median_scales(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[
     return found
 
 
-def _refined(problem: Residuals, here: Evaluation, allowed: float) -> tuple[Residuals, Evaluation, StepError]:
-    """Return the problem with steps whose error is below `allowed` sigma, its evaluation there, and that error."""
-    while True:
-        found = problem.map(lambda e, problem=problem, here=here: step_error(problem, e, here))
-        finer = tuple(_steps(m, error, allowed) for m, error in zip(problem.substeps, found, strict=True))
-        if finer == problem.substeps:
-            worst = StepError(
-                output=max(error.output for error in found), parameter=max(error.parameter for error in found)
-            )
-            return problem, here, worst
-        problem = replace(problem, substeps=finer)
-        here = problem.evaluate(here.z)
-
-
-def _steps(steps: int, error: StepError, allowed: float) -> int:
-    """Return how many steps a sample an error asks for."""
-    over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
-    if over <= 1.0 or not np.isfinite(over):
-        return steps
-    finer = steps * min(1.1 * over**0.25, 4.0)  # order four says how much finer
-    return min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
-
-
-@np.errstate(all="ignore")
-def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
-    """Return the integration error of experiment e, from steps of half the length (order four: 16/15 of the change).
-
-    In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
-    below the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's
-    first samples.
-    """
-    if problem.unknowns.models[e].linear:
-        return StepError()
-    halved = replace(problem, substeps=tuple(2 * m if i == e else m for i, m in enumerate(problem.substeps)))
-    z, n, worst = here.origin, here.z.size, 0.0
-    gradient, hessian = np.zeros(n), np.diag(problem.unknowns.prior_std**-2.0)
-    gain = problem.point(e, z).gain
-    sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
-    for s, piece in enumerate(problem.segments[e]):
-        coarse, fine = here.passes[e][s], halved.run(e, s, z)
-        edges = np.array([0, min(piece.n, WATCHED)])
-        one, two = (each.run(e, s, z, edges=edges, outputs=True).outputs for each in (problem, halved))
-        assert one is not None and two is not None
-        change = float(np.max(np.abs(gain * (one - two)) / sigma)) * 16.0 / 15.0
-        worst = max(worst, change if np.isfinite(change) else np.inf)
-        for o, places in enumerate(problem.columns(e, s)):
-            used = np.flatnonzero(places >= 0)
-            index = places[used]
-            gradient[index] += (fine.gram[0, o, 0, 1 + used] - coarse.gram[0, o, 0, 1 + used]) / sigma[o] ** 2
-            hessian[np.ix_(index, index)] += coarse.gram[0, o][np.ix_(1 + used, 1 + used)] / sigma[o] ** 2
-    if not (np.isfinite(worst) and np.all(np.isfinite(hessian)) and np.all(np.isfinite(gradient))):
-        return StepError(output=np.inf, parameter=np.inf)
-    back, _ = inverse(hessian)
-    p = problem.unknowns.shared
-    std = np.sqrt(np.maximum(np.diag(back)[:p], 1e-300))
-    moved = np.abs(back @ gradient)[:p] * 16.0 / 15.0 / std
-    return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
-
-
-def prediction_error(
-    problem: Residuals, method: Method, band_hz: tuple[float, float] | None, callback: Callback | None
-) -> Solved:
+def prediction_error(problem: Residuals, method: Method, callback: Callback | None) -> Solved:
     """Prediction errors: first of a filter that hardly trusts the plant, then of one whose noise is estimated."""
-    best, _ = best_start(problem, method, band_hz)
+    best, _ = best_start(problem, method)
     starts = [best.z] if np.isfinite(best.cost) else []
     found: Solved | None = None
     for start in (*starts, problem.unknowns.start):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -11,25 +12,22 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import (
-    Covariance,
-    Leftover,
-    coloured,
-    counted,
-    inverse,
-    leftover,
-    robust_bread,
-    with_infinities,
-)
+from seaopt.estimation.covariance import Covariance, coloured, robust_bread, with_infinities
 from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.findings import Derived, Nuisance, OutputFit
 from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
 from seaopt.estimation.least_squares import Solution
+from seaopt.estimation.leftover import Leftover, leftover
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError
-from seaopt.estimation.residuals import Evaluation, Linear, Residuals, sees_level
-from seaopt.estimation.result import Derived, Fit, Minimum, Nuisance, OutputFit
-from seaopt.estimation.solve import MAX_SUBSTEPS, Solved, StepError, explains_little
+from seaopt.estimation.normal import inverse
+from seaopt.estimation.residuals import Evaluation, Residuals, sees_level
+from seaopt.estimation.result import Fit, Minimum
+from seaopt.estimation.solve import Solved, explains_little
+from seaopt.estimation.steps import MAX_SUBSTEPS, StepError
 from seaopt.estimation.unknowns import Locals, Unknowns
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 
 CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
 VAGUE = 3.0  # a std of so many times the value is no estimate
@@ -104,7 +102,7 @@ def _covariances(
     problem: Residuals, found: Evaluation, left: list[Leftover] | None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
-    p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-2.0
+    p, prior = problem.unknowns.shared, problem.unknowns.precision
     bread = found.hessian
     if left is not None and not isinstance(problem.loss, Linear):
         bread = robust_bread(problem, found.z) + np.diag(prior)
@@ -200,27 +198,35 @@ def _nuisance(
     )
 
 
+@lru_cache(maxsize=64)
+def _derived_figures(plant: Plant) -> tuple[Any, dict[str, str]]:
+    """Return the CasADi function p -> (figures, their gradients in rows), and their units by name."""
+    figures = plant.derived_values()
+    values = ca.vertcat(ca.SX(0, 1), *(expression for expression, _ in figures.values()))
+    slopes = ca.densify(ca.jacobian(values, plant.p))
+    return ca.Function("derived", [plant.p], [ca.densify(values), slopes]), {
+        n: unit for n, (_, unit) in figures.items()
+    }
+
+
 def _derived(experiments: tuple[Experiment, ...], fitted: ParameterSet, covariance: Covariance) -> dict[str, Derived]:
     """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g."""
     out: dict[str, Derived] = {}
     for experiment in experiments:
         plant = experiment.plant
-        values = plant.parameter_values(fitted)
+        function, units = _derived_figures(plant)
+        values, slopes = (np.array(found) for found in function(plant.parameter_values(fitted)))
         names = list(plant.parameters)
         free = [name for name in covariance.names if name in names]
         rows = [covariance.names.index(name) for name in free]
         matrix = covariance.matrix[np.ix_(rows, rows)]
-        for name, (expression, unit) in plant.derived_values().items():
-            function: Any = ca.Function(
-                "derived", [plant.p], [expression, ca.densify(ca.gradient(expression, plant.p))]
-            )
-            value, slope = function(values)
-            g = np.array(slope).ravel()[[names.index(item) for item in free]]
+        for i, (name, unit) in enumerate(units.items()):
+            g = slopes[i, [names.index(item) for item in free]]
             used = g != 0.0
             block = matrix[np.ix_(used, used)]
             variance = float(g[used] @ block @ g[used]) if np.all(np.isfinite(block)) else np.inf
             std = float(np.sqrt(max(variance, 0.0)))
-            out.setdefault(name, Derived(value=float(value), unit=unit, std=std))
+            out.setdefault(name, Derived(value=float(values[i, 0]), unit=unit, std=std))
     return out
 
 
@@ -240,7 +246,7 @@ def _outputs(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover
             found[experiment.name][name] = OutputFit(
                 fit_percent=used.fit_percent if used.fit_percent is not None else np.nan,
                 holdout_fit_percent=rest.fit_percent,
-                band_fit_percent=_band_fit_percent(problem, e, o, z),
+                band_fit_percent=left[e].band[o].fit_percent if left[e].band else None,
                 one_step_fit_percent=None if problem.observers is None else left[e].used[o].fit_percent,
                 rms_residual=float(np.sqrt(used.power / max(used.count, 1))),
                 sigma=float(problem.sigma[e][o]),
@@ -269,24 +275,3 @@ def _explained(problem: Residuals, outputs: dict[str, dict[str, OutputFit]], lef
             if gain > 0.5 or gain * float(left[e].count[o]) > CHANCE_POWER:
                 return True
     return False
-
-
-def _band_fit_percent(problem: Residuals, e: int, o: int, z: Float[np.ndarray, " n"]) -> float | None:
-    """Return the fit of the filtered signals, over the samples that counted; None without a band."""
-    weights = problem.weights(e)
-    if not len(weights.sections):
-        return None
-    residual, signal = 0.0, 0.0
-    point = problem.point(e, z)
-    for s, piece in enumerate(problem.segments[e]):
-        columns = problem.run(e, s, z, columns=True).columns
-        assert columns is not None
-        present = counted(piece, weights.settle)[:, o]
-        own = columns[:, o, -(2 + point.drift_terms) :]  # filtered: 1, drift's polynomials, the model output
-        modelled = own[:, 0] * point.offset[o] + own[:, 1:-1] @ point.drift[o] + point.gain[o] * own[:, -1]
-        if not np.any(present):
-            continue
-        measured = (modelled - columns[:, o, 0])[present]
-        residual += float(np.sum(columns[present, o, 0] ** 2))
-        signal += float(np.sum((measured - np.mean(measured)) ** 2))
-    return 100.0 * (1.0 - float(np.sqrt(residual / max(signal, 1e-300))))

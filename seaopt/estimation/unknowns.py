@@ -79,6 +79,16 @@ class Unknowns:
     locals_of: tuple[Locals, ...]
     models: tuple[Model, ...]
 
+    @property
+    def precision(self) -> Float[np.ndarray, " n"]:
+        """What the priors know of each unknown: 1/std^2, zero where there is none."""
+        return self.prior_std**-2.0
+
+    def prior(self, z: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+        """Return the priors' part of the cost at `z`, of its gradient and of its Hessian."""
+        away = (z - self.start) / self.prior_std
+        return 0.5 * float(away @ away), away / self.prior_std, np.diag(self.precision)
+
     def theta(self, model: Model, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, " np"]:
         """Return a model's free parameters at `z`."""
         return z[self.theta_index(model)]
@@ -232,7 +242,7 @@ def _initial(builder: _Builder, experiment: Experiment, linear: bool, forgotten:
     """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones."""
     plant, given = experiment.plant, experiment.initial_state
     known = point("state", plant.states, dict(given) if isinstance(given, Mapping) else None)
-    starts = {stretch.start for stretch in experiment.log.segments}
+    starts = {stretch.start for stretch in experiment.stretches}
     found: list[tuple[Slot, ...]] = []
     for number, piece in enumerate(experiment.pieces):
         if forgotten or (given != "estimate" and piece.start in starts):

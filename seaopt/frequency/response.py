@@ -122,5 +122,7 @@ def _spectra(
     values: Float[np.ndarray, " n"], starts: Int[np.ndarray, " d"], window: Float[np.ndarray, " length"]
 ) -> Complex[np.ndarray, "d m"]:
     """Return the spectra above zero of windowed stretches without their means."""
-    pieces = np.stack([values[start : start + window.size] for start in starts])
-    return np.fft.rfft((pieces - pieces.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:]
+    pieces = np.stack([values[start : start + window.size] for start in starts], dtype=float)
+    pieces -= pieces.mean(axis=1, keepdims=True)
+    pieces *= window  # in place: fresh memory costs more than the transform
+    return np.fft.rfft(pieces, axis=1)[:, 1:]

@@ -1,5 +1,6 @@
 """Discretisation, integrators and compiled kernels: a plant and a log in, outputs and sensitivities out."""
 
+from seaopt.simulation.compiled import threads
 from seaopt.simulation.discretisation import Clock, Hold, transition
 from seaopt.simulation.model import Model, depends_on_time, linearised, make_model
 from seaopt.simulation.passes import Layout, Pass, Point, RobustLoss, Segment, Weights, layout_of
@@ -8,5 +9,5 @@ from seaopt.simulation.simulate import simulate
 
 __all__ = [
     "Clock", "Hold", "Layout", "Model", "Pass", "Point", "RobustLoss", "Segment", "Weights", "depends_on_time",
-    "layout_of", "linearised", "make_model", "run_passes", "simulate", "stream", "transition",
+    "layout_of", "linearised", "make_model", "run_passes", "simulate", "stream", "threads", "transition",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The compiled passes: pass.c around CasADi's generated step, or around the exact matrices of a linear plant."""
+"""The compiled passes: pass.c around CasADi's generated rate and output, or the exact matrices of a linear plant."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     return np.dtype([
         ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
         ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole),
-        ("start", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer), ("correction", pointer),
-        ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer), ("sos", pointer),
-        ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer), ("rho", pointer),
-        ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer), ("last", pointer),
-        ("carry", pointer),
+        ("start", whole), ("shown", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer),
+        ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer),
+        ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
+        ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
+        ("last", pointer), ("carry", pointer),
     ])  # fmt: skip
 
 
@@ -115,10 +115,8 @@ def kernel(model: Model, layout: Layout, delayed: bool) -> Any:
     if key not in model.functions:
         library = load_library(kernel_source(model, layout, delayed))
         if library is not None:
-            library.seaopt_passes.argtypes, library.seaopt_passes.restype = (
-                [ctypes.c_void_p, ctypes.c_long],
-                ctypes.c_int,
-            )
+            library.seaopt_passes.argtypes = [ctypes.c_void_p, ctypes.c_long]
+            library.seaopt_passes.restype = ctypes.c_int
             library.carry_size.restype = ctypes.c_long
         model.functions[key] = library
     return model.functions[key]
@@ -128,10 +126,10 @@ def _padded(count: int) -> int:
     return (count + 3) // 4 * 4
 
 
-def _linear_data(model: Model, point: Point, layout: Layout, delayed: bool) -> Float[np.ndarray, " m"]:
+def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray, " m"]:
     """Return D and A of pass.c: rows of [x+; y], forced with derivatives last, and by the state."""
     blocks = transition(model, point.theta, point.clock)
-    nx, nu, rows = model.nx, model.nu, model.nx + model.ny
+    nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _delayed(model, point)
     used = [*range(nx + nu * (1 + delayed))] + ([nx + 2 * nu] if _has_constant(model) else [])
     d = np.zeros((rows, len(used), _padded(layout.states)))
     d[:, :, : blocks.shape[0]] = blocks[:, :, used].transpose(1, 2, 0)
@@ -144,6 +142,11 @@ def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     foh = float(clock.hold == "first")
     constants = np.array(rate_functions(model).prepare(model.parameters(point.theta))).ravel()
     return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
+
+
+def _emptied(room: Any, shape: tuple[int, ...]) -> Any:
+    """Return an array of a shape, in a room that is long enough if there is one: fresh memory costs its first touch."""
+    return np.empty(shape) if room is None or len(room) < shape[0] else room[: shape[0]]
 
 
 class _Memory:
@@ -165,13 +168,12 @@ class _Memory:
 class Program:
     """The passes of one segment at one point, ready to run."""
 
-    def __init__(self, model: Model, segment: Segment, point: Point, weights: Weights, library: Any) -> None:
-        self.model, self.segment, self.library = model, segment, library
-        self.layout = layout_of(model.nx, model.ny, model.np, point)
+    def __init__(
+        self, model: Model, segment: Segment, point: Point, weights: Weights, layout: Layout, library: Any
+    ) -> None:
+        self.model, self.segment, self.layout, self.library = model, segment, layout, library
         self.memory = memory = _Memory()
-        data = (
-            _linear_data(model, point, self.layout, _delayed(model, point)) if model.linear else _settings(model, point)
-        )
+        data = _linear_data(model, point, layout) if model.linear else _settings(model, point)
         ny = model.ny
         base = np.zeros(1, dtype=_arguments(model.nu, ny))
         base["length"] = segment.n
@@ -193,8 +195,9 @@ class Program:
     @classmethod
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
         """Return the program, or None where there is no compiler."""
-        library = kernel(model, layout_of(model.nx, model.ny, model.np, point), _delayed(model, point))
-        return None if library is None else cls(model, segment, point, weights, library)
+        layout = layout_of(model.nx, model.ny, model.np, point)
+        library = kernel(model, layout, _delayed(model, point))
+        return None if library is None else cls(model, segment, point, weights, layout, library)
 
     def _correction(self, point: Point) -> int:
         if point.correction is None:
@@ -208,38 +211,42 @@ class Program:
         edges: Int[np.ndarray, " shots1"],
         x0: Float[np.ndarray, "shots nx"],
         *,
+        sums: bool = True,
         outputs: bool = False,
+        shown: int | None = None,
         columns: bool = False,
         states: bool = False,
         resume: Float[np.ndarray, " m"] | None = None,
+        room: Pass | None = None,
     ) -> Pass:
-        """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped."""
+        """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped.
+
+        Outputs are those of the first samples `shown`, of all if it is left out. Outputs and columns are written into
+        the `room` of a pass that is not needed any more, if there is one.
+        """
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
+        rows = n if shown is None else min(shown, n)
         if x0.shape != (shots, nx) or first < 0 or edges[-1] > self.segment.n or np.any(np.diff(edges) < 0):
             raise SimulationError(f"{shots} shots of {nx} states over {self.segment.n} samples: x0 or edges do not fit")
         result = Pass(
             gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
             last=np.zeros((shots, nx, layout.states)),
-            outputs=np.empty((n, ny)) if outputs else None,
-            columns=np.empty((n, ny, nc)) if columns and self.segment.y else None,
+            outputs=_emptied(room.outputs if room else None, (rows, ny)) if outputs else None,
+            columns=_emptied(room.columns if room else None, (n, ny, nc)) if columns and self.segment.y else None,
             states=np.empty((n, nx)) if states else None,
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
         arguments = np.repeat(self.base, shots)
-        arguments["from"], arguments["to"] = edges[:-1], edges[1:]
+        arguments["from"], arguments["to"], arguments["shown"] = edges[:-1], edges[1:], rows
         arguments["start"] = edges[:-1] if resume is None else 0
         arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
-        for name, array in (
-            ("gram", result.gram),
-            ("rho", result.loss),
-            ("count", result.count),
-            ("last", result.last),
-        ):
+        filled = {"rho": result.loss, "count": result.count, "last": result.last}
+        for name, array in (filled | {"gram": result.gram} if sums else filled).items():
             arguments[name] = array.ctypes.data + array.strides[0] * np.arange(shots)
-        for name, array in (("outputs", outputs), ("columns", columns), ("states", states)):
-            if array and getattr(result, name) is not None:
-                kept = getattr(result, name)
+        for name in ("outputs", "columns", "states"):
+            kept = getattr(result, name)
+            if kept is not None:
                 arguments[name] = kept.ctypes.data + kept.strides[0] * (edges[:-1] - first)
         if resume is not None:
             arguments["carry"] = resume.ctypes.data
@@ -259,9 +266,8 @@ class Program:
         pool = threads()
         bounds = np.linspace(0, count, workers() + 1).astype(int)
         size = arguments.dtype.itemsize
-        jobs = [
-            pool.submit(call, arguments.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds) if b > a
-        ]
+        spans = [(int(a), int(b - a)) for a, b in pairwise(bounds) if b > a]
+        jobs = [pool.submit(call, arguments.ctypes.data + first * size, many) for first, many in spans]
         for job in jobs:
             job.result()
 

@@ -314,7 +314,7 @@ def _folded_trace(
     w, data = np.column_stack([_times(segment, point, rows), held[piece, :-1]]), _data(model, point)
     if point.correction is not None:
         measured, present = _measured(segment, rows)
-        w = np.hstack([w, measured, present, _legendre(segment, rows, layout.drift_terms)])
+        w = np.hstack([w, measured, present, segment.drift_basis(piece, layout.drift_terms)])
         known = (point.offset, point.gain, point.drift, point.correction)
         data = np.concatenate([data, *(np.asarray(item).ravel() for item in known)])
     fold, output = _program(model, point, layout, (w.shape[1], data.size))
@@ -346,7 +346,7 @@ def _columns(
 ) -> tuple[Float[np.ndarray, "n ny nc"], Any]:  # fmt: skip
     """Return v of every sample, and which samples count."""
     measured, present = _measured(segment, rows)
-    basis = _legendre(segment, rows, point.drift_terms)
+    basis = segment.drift_basis(slice(*rows), point.drift_terms)
     drift = basis @ point.drift.T if point.drift_terms else 0.0
     v = np.zeros((len(y), layout.ny, layout.columns))
     v[:, :, 0] = point.gain * y + point.offset + drift - measured
@@ -364,10 +364,3 @@ def _columns(
         v = np.asarray(sosfilt(sos, v, axis=0))
     present[: weights.settle] = False
     return v, present
-
-
-def _legendre(segment: Segment, rows: tuple[int, int], terms: int) -> Float[np.ndarray, "n nd"]:
-    """Return Legendre's polynomials 1 to `terms` at each sample's drift coordinate."""
-    first, step = segment.drift_span
-    tau = first + step * np.arange(rows[0], rows[1])
-    return np.polynomial.legendre.legvander(tau, terms)[:, 1:]

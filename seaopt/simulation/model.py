@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -46,7 +47,7 @@ class Model:
     f: Any
     h: Any
     linear: bool
-    functions: dict[str, Any] = field(default_factory=dict, repr=False)
+    functions: dict[str, Any] = field(default_factory=dict, repr=False)  # made of the expressions, once each
 
     @property
     def nx(self) -> int:
@@ -108,19 +109,27 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
         if name not in plant.outputs:
             raise PlantError(f'plant {plant.name} has no output "{name}"; {suggestion(name, plant.outputs)}')
     values = dict(zip(plant.parameters, plant.parameter_values(params), strict=True))
-    symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if values else {}
     names = tuple(name for name in free if name in values)
+    zero = tuple(name for name in values if name not in names and values[name] == 0.0)
+    model = _structure(plant, names, chosen, zero)
+    known = [name for name in values if name not in names and name not in zero]
+    return replace(model, constants=np.array([values[name] for name in known]))
+
+
+@lru_cache(maxsize=64)
+def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], zero: tuple[str, ...]) -> Model:
+    """Return a model without its constants; models that differ in those alone share what is made of it."""
+    symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
     theta = ca.vertcat(*(symbols[name] for name in names)) if names else ca.SX(0, 1)
-    zero = [name for name in values if name not in names and values[name] == 0.0]
-    known = [name for name in values if name not in names and values[name] != 0.0]
-    rows = [list(plant.outputs).index(name) for name in chosen]
+    known = [symbol for name, symbol in symbols.items() if name not in names and name not in zero]
+    rows = [list(plant.outputs).index(name) for name in outputs]
     f, h = plant.dynamics, plant.output[rows]
     if zero:
         f, h = ca.substitute([f, h], [ca.vertcat(*(symbols[name] for name in zero))], [ca.DM.zeros(len(zero))])
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
     return Model(
-        plant=plant, free=names, outputs=chosen, t=plant.t, x=plant.x, u=u, theta=theta,
-        p=ca.vertcat(theta, *(symbols[name] for name in known)), constants=np.array([values[name] for name in known]),
+        plant=plant, free=names, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta,
+        p=ca.vertcat(theta, *known), constants=np.zeros(len(known)),
         f=f, h=h, linear=_is_linear(f, h, plant.t, plant.x, u),
     )  # fmt: skip
 
@@ -134,6 +143,12 @@ def linearised(model: Model) -> Model:
     """Return the model linearised at zero state and input."""
     if model.linear:
         return model
+    if "linearised" not in model.functions:
+        model.functions["linearised"] = _linearised(model)
+    return replace(model.functions["linearised"], constants=model.constants)
+
+
+def _linearised(model: Model) -> Model:
     point = ca.vertcat(model.x, model.u)
     both = ca.vertcat(model.f, model.h)
     slope, constant = ca.substitute(

@@ -22,6 +22,7 @@ typedef struct {
     long lag_a, lag_b;             /* rows of u in force: u[k - lag_a], u[k - lag_b]; clamped to the log */
     long settle;                   /* rows from `start` that are left out while the filter settles */
     long start;                    /* first row of the stretch; later than `from` is not allowed */
+    long shown;                    /* rows from `from` whose outputs are kept */
     double t0;                     /* time of row 0 */
     double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
     const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
@@ -33,13 +34,14 @@ typedef struct {
     long sections;
     long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
     const double *knee;            /* NY: where a robust loss leaves the square */
-    double *gram;                  /* NY x NC x NC, added to */
-    double *rho;                   /* NY: sum of losses, added to */
-    double *count;                 /* NY: samples counted, added to */
-    double *outputs;               /* (to - from) x NY or NULL */
+    double *gram;                  /* NY x NC x NC, added to, or NULL: no sums are made */
+    double *rho;                   /* NY: sum of losses, added to; unless gram is NULL */
+    double *count;                 /* NY: samples counted, added to; unless gram is NULL */
+    double *outputs;               /* shown x NY or NULL */
     double *columns;               /* (to - from) x NY x NC or NULL */
     double *states;                /* (to - from) x NX or NULL */
-    double *last;                  /* NX x NJ: Z one step after the last row, or NULL */
+    double *last;                  /* NX x NJ: Z one step after the last row, or NULL; without sums and columns its
+                                      derivatives are not made */
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
 } seaopt_pass_args;
 
@@ -50,6 +52,8 @@ typedef struct {
 } state;
 
 #define BLOCK 16
+#define ALL (NJP / 4) /* vectors of a row of Z; with one alone derivatives are not made, but for what shares it with x */
+#define INLINE static inline __attribute__((always_inline)) /* so that `wide` is a constant */
 
 /* All that a sample touches stands close together. */
 typedef struct {
@@ -77,11 +81,11 @@ static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {
 #define NF (NX + NI)
 
 /* Rows of [x+; y] with all derivatives: A Z + D [x; forcing]. */
-static inline void rows(const double *restrict model, const double (*restrict z)[NJP], const double *restrict w, int first, int count,
-                        double (*restrict out)[NJP]) {
+INLINE void rows(const double *restrict model, const double (*restrict z)[NJP], const double *restrict w, int first, int count,
+                 double (*restrict out)[NJP], int wide) {
     const double *A = model + (NX + NY) * NF * NJP + first * NX, *D = model + first * NF * NJP;
     for (int r = 0; r < count; r++) {
-        for (int j = 0; j < NJP / 4; j++) {
+        for (int j = 0; j < wide; j++) {
             vec sum = {0.0, 0.0, 0.0, 0.0};
             for (int i = 0; i < NX; i++) sum += A[r * NX + i] * ((const vec *)z[i])[j];
             for (int i = 0; i < NF; i++) sum += w[i] * ((const vec *)(D + (r * NF + i) * NJP))[j];
@@ -102,18 +106,18 @@ static inline void forcing(const hot *q, const seaopt_pass_args *a, long k, doub
     if (NI > NU * (1 + DELAYED)) w[NF - 1] = 1.0;
 }
 
-static inline void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict y)[NJP]) {
+INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict y)[NJP], int wide) {
     double w[NF + 1];
     forcing(q, a, k, w);
-    rows(q->model, (const double (*)[NJP])q->z, w, NX, NY, y);
+    rows(q->model, (const double (*)[NJP])q->z, w, NX, NY, y, wide);
 }
 
-static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
+INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
     double w[NF + 1];
     forcing(q, a, k, w);
-    rows(q->model, (const double (*)[NJP])q->z, w, 0, NX, q->next);
+    rows(q->model, (const double (*)[NJP])q->z, w, 0, NX, q->next, wide);
     for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NJP / 4; j++) ((vec *)q->z[i])[j] = ((vec *)q->next[i])[j];
+        for (int j = 0; j < wide; j++) ((vec *)q->z[i])[j] = ((vec *)q->next[i])[j];
 }
 #else
 /* In front of this file stand CasADi's functions
@@ -123,20 +127,22 @@ static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
 #define SETTINGS 4
 
 /* K = [f, f_x Z + f_p] at the state Z. */
-static inline void slope(hot *q, double t, const double *u, const double *c, const double (*restrict z)[NJP], double (*restrict k)[NJP]) {
+INLINE void slope(hot *q, double t, const double *u, const double *c, const double (*restrict z)[NJP], double (*restrict k)[NJP],
+                  int wide) {
     double x[NX], f[NX], fx[NNZ_FX + 1], fp[NNZ_FP + 1];
     const double *arg[SZ_ARG] = {&t, x, u, c};
-    double *res[SZ_RES] = {f, fx, fp};
+    double *res[SZ_RES] = {f, wide == ALL ? fx : 0, wide == ALL ? fp : 0};
     for (int i = 0; i < NX; i++) x[i] = z[i][0];
     seaopt_rate(arg, res, 0, q->work, 0);
-    seaopt_rate_chain(fx, fp, z, k);
+    if (wide == ALL) seaopt_rate_chain(fx, fp, z, k);
+    else for (int i = 0; i < NX; i++) ((vec *)k[i])[0] = (vec){0.0, 0.0, 0.0, 0.0};
     for (int i = 0; i < NX; i++) k[i][0] = f[i];
 }
 
 typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
 
 /* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. */
-static inline void one_step(hot *q, double t, const double *u0, const double *u1, const double *c, double h, double dh) {
+INLINE void one_step(hot *q, double t, const double *u0, const double *u1, const double *c, double h, double dh, int wide) {
     static const double reach[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
     hot_columns k, z, sum;
     double u[NU];
@@ -146,33 +152,33 @@ static inline void one_step(hot *q, double t, const double *u0, const double *u1
         const double part = reach[stage] * h;
         if (stage)
             for (int i = 0; i < NX; i++) {
-                for (int j = 0; j < NJP / 4; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
+                for (int j = 0; j < wide; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
                 if (DELAYED) z[i][1 + NQ] += reach[stage] * dh * k[i][0];
             }
         for (int i = 0; i < NU; i++) u[i] = u0[i] + reach[stage] * (u1[i] - u0[i]);
-        slope(q, t + part, u, c, (const double (*)[NJP])z, k);
+        slope(q, t + part, u, c, (const double (*)[NJP])z, k, wide);
         for (int i = 0; i < NX; i++) {
-            for (int j = 0; j < NJP / 4; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
+            for (int j = 0; j < wide; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
             if (DELAYED) sum[i][1 + NQ] += weight[stage] * dh * k[i][0];
         }
     }
     memcpy(q->z, sum, sizeof sum);
 }
 
-static inline void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP]) {
+INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP], int wide) {
     const double *m = a->model;
     double x[NX], u[NU], y[NY], c[NNZ_HX + 1], d[NNZ_HP + 1], t = a->t0 + k * m[1];
     at(a, k, m[2] > 0.0 ? a->lag_b : a->lag_a, u);
     const double *arg[SZ_ARG] = {&t, x, u, m + SETTINGS};
-    double *res[SZ_RES] = {y, c, d};
+    double *res[SZ_RES] = {y, wide == ALL ? c : 0, wide == ALL ? d : 0};
     for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
     seaopt_output(arg, res, 0, q->work, 0);
-    seaopt_output_chain(c, d, (const double (*)[NJP])q->z, out);
+    if (wide == ALL) seaopt_output_chain(c, d, (const double (*)[NJP])q->z, out);
     for (int o = 0; o < NY; o++) out[o][0] = y[o];
 }
 
 /* With a fractional delay the older input u_b acts first, for m[2] seconds, then u_a. */
-static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
+INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
     const double *m = a->model;
     const long steps = (long)m[0];
     const int foh = m[3] > 0.5;
@@ -191,7 +197,7 @@ static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
                 u0[c] = base + slope * i;
                 u1[c] = base + slope * (i + 1);
             }
-            one_step(q, t, u0, u1, m + SETTINGS, h, dh);
+            one_step(q, t, u0, u1, m + SETTINGS, h, dh, wide);
             t += h;
         }
     }
@@ -199,7 +205,8 @@ static inline void advance(hot *q, const seaopt_pass_args *a, long k) {
 #endif
 
 /* Residual and derivatives of output o: gain y + offset + drift - measured. */
-static inline void residual(const seaopt_pass_args *a, int o, const double *restrict y, double measured, double tau, double *restrict v) {
+INLINE void residual(const seaopt_pass_args *a, int o, const double *restrict y, double measured, double tau, double *restrict v,
+                     int wide) {
     const double gain = a->gain[o];
     double basis[ND + 1], older = 1.0, value = gain * y[0] + a->offset[o] - measured;
     for (int d = 0; d < ND; d++) { /* Legendre's recurrence */
@@ -207,9 +214,10 @@ static inline void residual(const seaopt_pass_args *a, int o, const double *rest
         if (d > 0) older = basis[d - 1];
         value += a->drift[o * ND + d] * basis[d];
     }
-    for (int j = 0; j < NJP / 4; j++) ((vec *)v)[j] = gain * ((const vec *)y)[j];
-    for (int j = NJP; j < NCP; j++) v[j] = 0.0;
+    for (int j = 0; j < wide; j++) ((vec *)v)[j] = gain * ((const vec *)y)[j];
     v[0] = value;
+    if (wide < ALL) return;
+    for (int j = NJP; j < NCP; j++) v[j] = 0.0;
     double *own = v + NS + (CORRECT ? o * OWN : 0);
     own[0] += 1.0;
     for (int d = 0; d < ND; d++) own[1 + d] += basis[d];
@@ -332,7 +340,7 @@ static void deliver(hot *q, const seaopt_pass_args *a) {
     }
     if (a->last)
         for (int i = 0; i < NX; i++) memcpy(a->last + i * NJ, q->z[i], NJ * sizeof(double));
-    for (int o = 0; o < NY; o++) {
+    for (int o = 0; a->gram && o < NY; o++) {
         a->rho[o] += q->rho[o];
         a->count[o] += q->count[o];
         for (int r = 0; r < NC; r++)
@@ -340,38 +348,38 @@ static void deliver(hot *q, const seaopt_pass_args *a) {
     }
 }
 
-static void one_pass(const seaopt_pass_args *a) {
+INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     hot here, *const q = &here;
     begin(q, a);
     for (long k = a->from; k < a->to; k++) {
         int present[NY];
-        observe(q, a, k, q->y);
+        observe(q, a, k, q->y, wide);
         if (a->states)
             for (int i = 0; i < NX; i++) a->states[(k - a->from) * NX + i] = q->z[i][0];
-        if (a->outputs)
+        if (a->outputs && k - a->from < a->shown)
             for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = q->y[o][0];
         double *v[NY];
         for (int o = 0; a->y[0] && o < NY; o++) {
             const double measured = a->y[o][k];
             v[o] = q->v[o][q->waiting[o]];
             present[o] = isfinite(measured) && !(a->keep[o] && !a->keep[o][k]);
-            if (present[o]) residual(a, o, q->y[o], measured, a->tau0 + k * a->dtau, v[o]);
+            if (present[o]) residual(a, o, q->y[o], measured, a->tau0 + k * a->dtau, v[o], wide);
             else memset(v[o], 0, NCP * sizeof(double));
         }
-        advance(q, a, k);
+        advance(q, a, k, wide);
 #if CORRECT
         for (int o = 0; o < NY; o++)
             if (a->y[0] && present[o])
                 for (int i = 0; i < NX; i++) {
                     const double *g = a->correction + (i * NY + o) * NJP;
-                    for (int j = 1; j < NJP; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];
+                    for (int j = 1; j < 4 * wide; j++) q->z[i][j] -= g[0] * v[o][j] + g[j] * v[o][0];
                     q->z[i][0] -= g[0] * v[o][0];
                 }
 #endif
-        for (int o = 0; a->y[0] && o < NY; o++) {
+        for (int o = 0; a->y[0] && wide == ALL && o < NY; o++) {
             if (a->sections) filtered(a, v[o], q->filter[o]);
             if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
-            if (present[o] && k >= a->start + a->settle) accumulate(a, q, o);
+            if (a->gram && present[o] && k >= a->start + a->settle) accumulate(a, q, o);
         }
     }
     deliver(q, a);
@@ -379,7 +387,10 @@ static void one_pass(const seaopt_pass_args *a) {
 
 EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     const unsigned long mode = flush_denormals();
-    for (long i = 0; i < count; i++) one_pass(list + i);
+    for (long i = 0; i < count; i++) {
+        if (ALL == 1 || list[i].gram || list[i].columns) one_pass(list + i, ALL);
+        else one_pass(list + i, 1);
+    }
     restore_denormals(mode);
     return 0;
 }

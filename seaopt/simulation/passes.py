@@ -90,6 +90,11 @@ class Segment:
         """Input samples at the samples of the outputs."""
         return tuple(channel[self.lead :] for channel in self.u)
 
+    def drift_basis(self, rows: slice, terms: int) -> Float[np.ndarray, "m nd"]:
+        """Return Legendre's polynomials 1 to `terms` at the drift coordinate of a slice of samples."""
+        tau = self.drift_span[0] + self.drift_span[1] * np.arange(rows.start, rows.stop)
+        return np.polynomial.legendre.legvander(tau, terms)[:, 1:]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Point:

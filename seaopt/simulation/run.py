@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,7 +24,9 @@ def run_passes(
     weights: Weights | None = None,
     *,
     edges: Int[np.ndarray, " shots1"] | None = None,
+    sums: bool = True,
     outputs: bool = False,
+    shown: int | None = None,
     columns: bool = False,
     states: bool = False,
 ) -> Pass:
@@ -37,8 +40,12 @@ def run_passes(
         State at each shot's first sample.
     edges : array of int, shape (shots + 1,), optional
         First rows of the shots, and one past the last; the whole segment in one shot if left out.
+    sums : bool
+        Whether Gram matrices, losses, counts and derivatives are wanted: a simulation alone is several times quicker.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
+    shown : int, optional
+        Keep the outputs of so many first samples only; of one shot.
 
     Returns
     -------
@@ -50,8 +57,9 @@ def run_passes(
     rows = edges if edges is not None else np.array([0, segment.n])
     program = Program.make(model, segment, point, chosen)
     if program is not None:
-        return program.run(rows, x0, outputs=outputs, columns=columns, states=states)
-    return interpreted_passes(model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states)
+        return program.run(rows, x0, sums=sums, outputs=outputs, shown=shown, columns=columns, states=states)
+    found = interpreted_passes(model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states)
+    return found if shown is None or found.outputs is None else replace(found, outputs=found.outputs[:shown].copy())
 
 
 def stream(
@@ -64,7 +72,10 @@ def stream(
     chunk: int = CHUNK,
     columns: bool = False,
 ) -> Iterator[Pass]:
-    """Yield the outputs, and the columns if asked, of one segment chunk by chunk, in the memory of one chunk."""
+    """Yield the outputs, and the columns if asked, of one segment chunk by chunk, in the memory of one chunk.
+
+    A chunk's arrays are written over by the next. There are no sums.
+    """
     chosen = weights if weights is not None else Weights.plain(model.ny)
     program = Program.make(model, segment, point, chosen)
     if program is None:
@@ -75,10 +86,11 @@ def stream(
             chunk,
         )
         return
-    carry = program.carry()
+    carry, part = program.carry(), None
     for start in range(0, segment.n, chunk):
         rows = np.array([start, min(start + chunk, segment.n)])
-        yield program.run(rows, x0[None], outputs=True, columns=columns, resume=carry)
+        part = program.run(rows, x0[None], sums=False, outputs=True, columns=columns, resume=carry, room=part)
+        yield part
 
 
 def _cut(whole: Pass, chunk: int) -> Iterator[Pass]:

@@ -140,7 +140,7 @@ def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clo
             clock=clock,
             substeps=substeps,
         )
-        return run_passes(model, segment, point, x0[None], outputs=True, states=True)
+        return run_passes(model, segment, point, x0[None], sums=False, outputs=True, states=True)
 
     result = run(1)
     substeps = 1

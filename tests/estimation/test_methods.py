@@ -15,8 +15,8 @@ import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
 from seaopt.estimation.fit import _complete, _problem, check_choices
+from seaopt.estimation.losses import Linear
 from seaopt.estimation.observer import kalman_gain
-from seaopt.estimation.residuals import Linear
 from seaopt.estimation.unknowns import collect
 
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
@@ -213,7 +213,8 @@ def test_what_is_linear_is_eliminated_exactly(stand, thor):
 
 def test_the_step_error_is_that_of_the_parameters(swing, thor):
     """A crude step biases J; the stated error is the bias, found by a fit with a fine one."""
-    from seaopt.estimation.solve import settle, step_error
+    from seaopt.estimation.solve import settle
+    from seaopt.estimation.steps import step_error
 
     truth = thor.update(f_c=40.0, v_s=1e-3, d=0.1)
     bench = experiment(swing, noisy(swing, truth), offset=False, initial_state="rest", sigma={"F1": 2.0, "F2": 2.0})

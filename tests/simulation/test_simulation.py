@@ -248,10 +248,24 @@ def test_gram_is_the_product_of_the_columns(thor):
 def test_a_stream_is_the_whole(options, thor):
     model, segment, point, weights, x0 = passes("stand", thor, **options)
     whole = run_passes(model, segment, point, x0, weights, outputs=True, columns=True)
-    pieces = list(stream(model, segment, point, x0[0], weights, chunk=123, columns=True))
-    assert len(pieces) == 6
-    np.testing.assert_allclose(np.vstack([piece.columns for piece in pieces]), whole.columns, rtol=1e-12)
-    np.testing.assert_allclose(np.vstack([piece.outputs for piece in pieces]), whole.outputs, rtol=1e-12)
+    parts = stream(model, segment, point, x0[0], weights, chunk=123, columns=True)
+    columns, outputs = zip(*((part.columns.copy(), part.outputs.copy()) for part in parts), strict=True)
+    assert len(columns) == 6
+    np.testing.assert_allclose(np.vstack(columns), whole.columns, rtol=1e-12)
+    np.testing.assert_allclose(np.vstack(outputs), whole.outputs, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["stand", "swing"])
+@pytest.mark.parametrize("corrected", [False, True])
+def test_a_simulation_alone_is_that_with_sums(name, corrected, thor):
+    model, segment, point, weights, x0 = passes(name, thor, corrected=corrected)
+    whole = run_passes(model, segment, point, x0, weights, outputs=True, states=True)
+    alone = run_passes(model, segment, point, x0, weights, sums=False, outputs=True, states=True)
+    for found, expected in ((alone.outputs, whole.outputs), (alone.states, whole.states)):
+        scale = np.max(np.abs(expected), axis=0)
+        np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-11)
+    first = run_passes(model, segment, point, x0, weights, outputs=True, shown=9).outputs
+    np.testing.assert_array_equal(first, whole.outputs[:9])
 
 
 def test_bad_input_is_refused(stand, swing, thor):
