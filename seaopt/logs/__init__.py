@@ -1,6 +1,7 @@
 """Raw files to `Log`."""
 
 from seaopt.logs.log import Log
-from seaopt.logs.read import Column, header_unit, read_log, write_log
+from seaopt.logs.read import Column, header_unit, read_log, read_table, write_log
+from seaopt.logs.table import Table
 
-__all__ = ["Column", "Log", "header_unit", "read_log", "write_log"]
+__all__ = ["Column", "Log", "Table", "header_unit", "read_log", "read_table", "write_log"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 from collections.abc import Mapping
@@ -15,7 +16,8 @@ from jaxtyping import Float
 from seaopt.errors import LogError, SeaoptError, suggestion
 from seaopt.files import write_text
 from seaopt.logs.log import Log
-from seaopt.signals import Signal
+from seaopt.logs.table import Table
+from seaopt.signals import Origin, Signal
 from seaopt.units import factor, si_unit
 
 if TYPE_CHECKING:
@@ -45,17 +47,79 @@ def header_unit(header: str) -> str | None:
     return found["unit"].strip() if found else None
 
 
-def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str | Column]) -> Log:
-    r"""Read a CSV file with a header line.
+def read_table(
+    path: str | Path, *, time: str | Column | None = None, channels: Mapping[str, str | Column] | None = None
+) -> Table:
+    r"""Read a file as it is: time may repeat or run backwards, and a channel may be empty.
 
     Parameters
     ----------
     path : path
         The file; the delimiter (comma, semicolon, tab) is the one its header uses.
-    time : str or Column
-        Header of the time column.
-    channels : mapping of channel name to str or Column
-        Which column is which channel: names of the plant's inputs and outputs, as a rule.
+    time : str or Column, optional
+        Header of the time column; where it is left out, the one column that is named like a time.
+    channels : mapping of channel name to str or Column, optional
+        Which column is which channel; where it is left out, every column of numbers, named by its header without the
+        unit's brackets.
+
+    Raises
+    ------
+    LogError
+        The file is missing, empty or not text, a column is missing or doubled, or a cell is not a number.
+    UnitError
+        A unit is unknown or of the wrong dimension.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "chirp.csv"
+    >>> _ = file.write_text("time [ms],cur [mA],note\n0.0,100,a\n2.5,150,b\n")
+    >>> table = read_table(file)
+    >>> table.time.tolist(), {name: (signal.values.tolist(), signal.unit) for name, signal in table.signals.items()}
+    ([0.0, 0.0025], {'cur': ([0.1, 0.15], 'A')})
+
+    """
+    source = Path(path)
+    text = _read_text(source)
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    first, _, rows = text.partition("\n")
+    if not rows.strip():
+        raise LogError(f"{source}: 0 rows below the header; record the log again")
+    headers, delimiter = _headers(first.rstrip("\r"))
+    if channels is not None and "time" in channels:
+        raise LogError(f'{source}: a channel is named "time"; rename it, time is the clock')
+    clock = _as_column(time) if time is not None else Column(column=_time_column(source, headers))
+    notes: list[str] = []
+    if channels is None:
+        given = _every_column(source, headers, delimiter, rows, clock.column, notes)
+    else:
+        given = {name: _as_column(item) for name, item in channels.items()}
+    wanted = {"time": clock} | given
+    for name, column in wanted.items():
+        _check_column(source, name, column.column, headers)
+    units = {name: _unit_of(source, column) for name, column in wanted.items()}
+    if factor_error := _wrong_time_unit(source, units["time"]):
+        raise factor_error
+    table = _parse(source, text, headers, delimiter, {column.column for column in wanted.values()})
+    if table.height < 2:
+        raise LogError(f"{source}: too few rows ({table.height}) below the header; a log needs at least 2")
+    arrays = {name: _numbers(source, table, column.column) for name, column in wanted.items()}
+    signals = {
+        name: _signal(name, arrays[name], units[name], str(path), digest, column) for name, column in given.items()
+    }
+    seconds = arrays["time"] * factor(units["time"], "s")
+    return Table(time=seconds, signals=signals, source=str(path), notes=tuple(notes))
+
+
+def read_log(
+    path: str | Path, *, time: str | Column | None = None, channels: Mapping[str, str | Column] | None = None
+) -> Log:
+    r"""Read a file, and check that it is a log.
+
+    Parameters
+    ----------
+    path, time, channels
+        As in `read_table`; channels are named as the plant's inputs and outputs, as a rule.
 
     Returns
     -------
@@ -65,8 +129,7 @@ def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str
     Raises
     ------
     LogError
-        The file is missing, empty or not text, a column is missing or doubled, a cell is not a number, or time
-        does not increase.
+        What `read_table` raises, a channel holds no number, or time does not increase.
     UnitError
         A unit is unknown or of the wrong dimension.
 
@@ -79,33 +142,11 @@ def read_log(path: str | Path, *, time: str | Column, channels: Mapping[str, str
     [0.1, 0.15]
 
     """
-    source = Path(path)
-    text = _read_text(source)
-    first, _, rows = text.partition("\n")
-    if not rows.strip():
-        raise LogError(f"{source}: 0 rows below the header; record the log again")
-    headers, delimiter = _headers(first.rstrip("\r"))
-    wanted = {"time": _as_column(time)} | {name: _as_column(given) for name, given in channels.items()}
-    if "time" in channels:
-        raise LogError(f'{source}: a channel is named "time"; rename it, time is the clock')
-    for name, column in wanted.items():
-        _check_column(source, name, column.column, headers)
-    units = {name: _unit_of(source, column) for name, column in wanted.items()}
-    if factor_error := _wrong_time_unit(source, units["time"]):
-        raise factor_error
-    table = _parse(source, text, headers, delimiter, {column.column for column in wanted.values()})
-    if table.height < 2:
-        raise LogError(f"{source}: too few rows ({table.height}) below the header; a log needs at least 2")
-    arrays = {name: _numbers(source, table, column.column) for name, column in wanted.items()}
-    clock = arrays.pop("time") * factor(units.pop("time"), "s")
-    signals = {
-        name: Signal(name=name, values=values * factor(units[name], si_unit(units[name])), unit=si_unit(units[name]))
-        for name, values in arrays.items()
-    }
-    for name, signal in signals.items():
+    table = read_table(path, time=time, channels=channels)
+    for signal in table.signals.values():
         if not np.any(np.isfinite(signal.values)):
-            raise LogError(f'{source}: column "{wanted[name].column}" holds no number; choose another column')
-    return Log(time=clock, signals=signals, source=str(path))
+            raise LogError(f'{table.source}: column "{signal.origin.column}" holds no number; choose another column')
+    return Log(time=table.time, signals=table.signals, source=table.source)
 
 
 def write_log(log: Log, path: str | Path) -> Path:
@@ -116,6 +157,67 @@ def write_log(log: Log, path: str | Path) -> Path:
     for name, signal in log.signals.items():
         columns[f"{name} [{signal.unit}]" if signal.unit else name] = signal.values
     return write_text(path, pl.DataFrame(columns).write_csv())
+
+
+_TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit"})
+
+
+def _time_column(source: Path, headers: list[str]) -> str:
+    """Return the one header that is named like a time."""
+    found = [header for header in headers if _bare(header).casefold() in _TIME_NAMES]
+    if len(found) != 1:
+        why = "no column is" if not found else f"{len(found)} columns are"
+        raise LogError(f"{source}: {why} named like a time; give time=, one of the columns: {', '.join(headers)}")
+    return found[0]
+
+
+def _bare(header: str) -> str:
+    found = _BRACKETS.match(header)
+    return found["name"].strip() if found else header
+
+
+def _every_column(
+    source: Path, headers: list[str], delimiter: str, rows: str, clock: str, notes: list[str]
+) -> dict[str, Column]:
+    """Return a channel for every column whose first filled cell is a number; brackets that hold no unit are a name."""
+    table = _parse(source, "\n" + "\n".join(rows.splitlines()[:1000]), headers, delimiter, set(headers) - {clock})
+    numeric = [header for header in headers if header != clock and _is_numeric(table[header])]
+    skipped = [header for header in headers if header != clock and header not in numeric]
+    if skipped:
+        notes.append(f"columns that hold no numbers were left out: {', '.join(skipped)}")
+    if not all(_is_unit(header_unit(header)) for header in numeric):
+        notes.append("brackets in the headers that are no units were taken as names; no unit is known")
+        return {header: Column(column=header, unit="") for header in numeric}
+    bare = [_bare(header) for header in numeric]
+    return {
+        name if bare.count(name) == 1 else header: Column(column=header, unit=header_unit(header) or "")
+        for name, header in zip(bare, numeric, strict=True)
+    }
+
+
+def _is_numeric(cells: pl.Series) -> bool:
+    filled = [cell.strip() for cell in cells.drop_nulls() if cell.strip()]
+    try:
+        float(filled[0] if filled else "x")
+    except ValueError:
+        return False
+    return True
+
+
+def _is_unit(unit: str | None) -> bool:
+    if unit is None:
+        return True
+    try:
+        si_unit(unit)
+    except SeaoptError:
+        return False
+    return True
+
+
+def _signal(name: str, values: Float[np.ndarray, " n"], unit: str, path: str, digest: str, column: Column) -> Signal:
+    to = si_unit(unit)
+    origin = Origin(file=path, sha256=digest, column=column.column, conversion=f"{unit} to {to}" if unit != to else "")
+    return Signal(name=name, values=values * factor(unit, to), unit=to, origin=origin)
 
 
 def _as_column(given: str | Column) -> Column:
