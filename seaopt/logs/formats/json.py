@@ -23,14 +23,14 @@ Record = Mapping[str, Any]
 
 def open_json(path: Path) -> Source:
     """List the keys of a JSON log; nested objects become dotted paths, lists carry an index."""
-    columns, notes, length = _columns(path, None)
+    columns, notes, length = _columns(path)
     fields = tuple(
         Field(name=name, kind=found, length=length, unit=header_unit(name)) for name, found in columns.items()
     )
     return Source(path=path, format="JSON", fields=fields, load=partial(_load, path), notes=tuple(notes))
 
 
-def _columns(path: Path, _: None) -> tuple[dict[str, str], list[str], int]:
+def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
     """Return each key with its kind, what the header says, and the number of entries."""
     notes: list[str] = []
     columns: dict[str, str] = {}

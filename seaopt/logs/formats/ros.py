@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bz2
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -179,7 +179,7 @@ def _seconds(stamps: list[int], start: int) -> Float[np.ndarray, " n"]:
 
 
 @contextmanager
-def _bag(path: Path) -> Iterator[Bag]:
+def _bag(path: Path) -> Generator[Bag]:
     from rosbags.rosbag1 import Reader
 
     with Reader(path) as reader:
@@ -188,7 +188,7 @@ def _bag(path: Path) -> Iterator[Bag]:
 
 
 @contextmanager
-def _db3(path: Path) -> Iterator[Bag]:
+def _db3(path: Path) -> Generator[Bag]:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     reader = Sqlite3Reader(path.absolute())
@@ -243,7 +243,7 @@ def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
 
 
 @contextmanager
-def _mcap(path: Path) -> Iterator[Bag]:
+def _mcap(path: Path) -> Generator[Bag]:
     reading = optional("mcap.reader", "ros", path, "MCAP")
     with path.open("rb") as stream:
         reader = reading.make_reader(stream)
