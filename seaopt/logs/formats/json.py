@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,12 +36,14 @@ def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
     notes: list[str] = []
     columns: dict[str, str] = {}
     length = 0
-    for length, (_, record) in enumerate(_records(path, notes), start=1):  # noqa: B007
-        for name, value in flat(record):
-            if value is not None and columns.get(name, "empty") == "empty":
-                columns[name] = kind(value)
-            else:
-                columns.setdefault(name, "empty")
+    with closing(_records(path, notes)) as records:
+        for _, record in records:
+            length += 1
+            for name, value in flat(record):
+                if value is not None and columns.get(name, "empty") == "empty":
+                    columns[name] = kind(value)
+                else:
+                    columns.setdefault(name, "empty")
     if not length:
         raise LogError(f"{path}: holds no entries; record the log again")
     return columns, notes, length
@@ -48,10 +51,11 @@ def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
 
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     columns: dict[str, list[float]] = {name: [] for name in names}
-    for place, record in _records(path, []):
-        row = dict(flat(record))
-        for name, values in columns.items():
-            values.append(_number(path, place, name, row.get(name)))
+    with closing(_records(path, [])) as records:
+        for place, record in records:
+            row = dict(flat(record))
+            for name, values in columns.items():
+                values.append(_number(path, place, name, row.get(name)))
     return {name: np.array(values) for name, values in columns.items()}
 
 
@@ -70,7 +74,7 @@ def _number(path: Path, place: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def _records(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
+def _records(path: Path, notes: list[str]) -> Generator[tuple[str, Record]]:
     """Return the entries with their places; of a header, a note."""
     with path.open("rb") as stream:
         first = _line(path, stream, 1)

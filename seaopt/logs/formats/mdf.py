@@ -25,7 +25,7 @@ def open_mdf(path: Path) -> Source:
     asammdf = optional("asammdf", "mdf", path, "MDF")
     fields: list[Field] = []
     places: dict[str, tuple[int, int]] = {}
-    with asammdf.MDF(path) as file:
+    with path.open("rb") as stream, asammdf.MDF(stream) as file:
         if str(file.version) < "4":
             raise LogError(f"{path}: is MDF {file.version}; convert it to MDF 4")
         groups = list(file.groups)
@@ -71,7 +71,7 @@ def _load(
     path: Path, places: Places, names: Sequence[str], window: Window | None
 ) -> dict[str, Float[np.ndarray, " n"]]:
     asammdf = optional("asammdf", "mdf", path, "MDF")
-    with asammdf.MDF(path) as file:
+    with path.open("rb") as stream, asammdf.MDF(stream) as file:
 
         def one(name: str, rows: slice) -> Float[np.ndarray, " n"]:
             group, index = places[name]
