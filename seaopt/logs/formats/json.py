@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.column import header_unit
-from seaopt.logs.formats.layout import MAX_LINE
+from seaopt.logs.formats.layout import MAX_LINE, too_long
 from seaopt.logs.formats.source import MAX_PARTS, Field, Source, Window, one_line
 
 MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
@@ -78,39 +78,30 @@ def _records(path: Path, notes: list[str]) -> Generator[tuple[str, Record]]:
     """Return the entries with their places; of a header, a note."""
     with path.open("rb") as stream:
         first = _line(path, stream, 1)
-        if not _is_object(first):
+        if not _is_entry(first) or not any(line.strip() for line in stream):
             yield from _whole(path, notes)
             return
+        stream.seek(0)
         number = 1
-        while first:
-            if first.strip():
-                yield f"line {number}", _object(path, _parsed(path, first, number), f"line {number}")
+        while line := _line(path, stream, number):
+            if line.strip():
+                yield f"line {number}", _object(path, _parsed(path, line.rstrip(), number), f"line {number}")
             number += 1
-            first = _line(path, stream, number)
 
 
 def _line(path: Path, stream: Any, number: int) -> bytes:
     line = stream.readline(MAX_LINE + 1)
     if len(line) > MAX_LINE and number > 1:
-        raise LogError(
-            f"{path}: line {number} is longer than {MAX_LINE >> 20} MiB; is it a log? write one entry a line"
-        )
+        raise too_long(path, number)
     return line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
 
 
-def _is_object(line: bytes) -> bool:
-    """Tell whether a line is one flat entry by itself, so that the file is JSON lines."""
-    if len(line) > MAX_LINE:
-        return False
+def _is_entry(line: bytes) -> bool:
+    """Tell whether the first line is an object by itself, as in JSON lines."""
     try:
-        found = json.loads(line)
+        return len(line) <= MAX_LINE and isinstance(json.loads(line), dict)
     except (ValueError, RecursionError):
         return False
-    return isinstance(found, dict) and not any(isinstance(item, list) and _is_long(item) for item in found.values())
-
-
-def _is_long(item: list[Any]) -> bool:
-    return len(item) > MAX_PARTS or any(isinstance(value, dict) for value in item[:1])
 
 
 def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
@@ -120,7 +111,7 @@ def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
     content = _parsed(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
     entries = content
     if isinstance(content, dict):
-        entries = content.get("entries", _turned(path, content) if "entries" not in content else None)
+        entries = content["entries"] if "entries" in content else _turned(path, content)
         header = [f"{key} = {value}" for key, value in content.items() if isinstance(value, str | int | float)]
         if header:
             notes.append(f"header: {', '.join(header)}"[:400])
@@ -132,14 +123,14 @@ def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
         yield f"entry {number}", _object(path, entry, f"entry {number}")
 
 
-def _turned(path: Path, content: dict[str, Any]) -> list[Record] | None:
-    """Return the entries of an object of lists, one list a column."""
+def _turned(path: Path, content: dict[str, Any]) -> list[Record]:
+    """Return the entries of an object of lists, one list a column; without lists it is an entry itself."""
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     lengths = {len(value) for value in lists.values()}
     if len(lengths) > 1:
         shown = ", ".join(f"{key}: {len(value)}" for key, value in list(lists.items())[:10])
         raise LogError(f"{path}: its lists differ in length ({shown}); write one value a sample in each")
-    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else None
+    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else [content]
 
 
 def _parsed(path: Path, text: bytes, line: int) -> Any:
