@@ -1,7 +1,7 @@
 """MATLAB 5 files: numbers, and structs of them, straight from the bytes; objects stay closed.
 
 Layout (MathWorks, "MAT-File Format"): a header of 128 bytes, then elements of type and size; one of type 15 is
-compressed; a matrix (14) holds flags, dimensions, name and data, and cells and structs hold matrices. The numbers may be
+compressed; a matrix (14) holds flags, dimensions, name and data, and cells and structs hold matrices. Numbers may be
 stored in a smaller type than their class. SciPy's reader is not used: a damaged file makes it crash the interpreter.
 """
 
@@ -178,7 +178,7 @@ def _leaves(body: bytes, at: int, order: str, name: str, depth: int = 0) -> Iter
     width = struct.unpack_from(f"{order}i", body, width_at)[0]
     _, keys_at, count, after = _element(body, after, order)
     names = body[keys_at : keys_at + count]
-    keys = [names[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, count, max(width, 1))]
+    keys = [names[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(names), max(width, 1))]
     number = 0
     many = max(found.dims) > 1
     while keys and after + 8 <= len(body) and number < np.prod(found.dims, dtype=float):
