@@ -27,7 +27,7 @@ from seaopt.logs.formats.source import Field, Source, Window, one_line
 if TYPE_CHECKING:
     import polars as pl
 
-BLOCK = 8 << 20
+BLOCK = 4 << 20
 AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
 _RUNS = re.compile(rb"[ \t]+")
 _BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
@@ -96,16 +96,26 @@ def _blocks(path: Path, form: Layout) -> Generator[bytes]:
         for _ in range(form.first):
             stream.readline()
         number = 0
-        while part := stream.read(BLOCK):
-            rest = stream.readline(MAX_LINE + 1)
-            block = part + rest if isinstance(part, bytes) else (part + rest).encode()
+        while block := _block(stream, form):
             _check_lines(path, form, block, number)
             if not number:
                 block = block.removeprefix(codecs.BOM_UTF8)
-            if len(part) < BLOCK:  # the last one may end in blank lines, and in the end-of-file mark of DOS
+            if len(block) < BLOCK:  # the last one may end in blank lines, and in the end-of-file mark of DOS
                 block = block.rstrip(b"\x1a \t\r\n") + b"\n"
             yield block
             number += 1
+
+
+def _block(stream: IO[Any], form: Layout) -> bytes:
+    """Return the next block, up to the end of a line."""
+    if form.encoding == "utf-16":
+        return (stream.read(BLOCK) + stream.readline(MAX_LINE + 1)).encode()
+    start = stream.tell()
+    stream.seek(start + BLOCK)
+    stream.readline(MAX_LINE + 1)
+    end = stream.tell()
+    stream.seek(start)
+    return stream.read(end - start)
 
 
 def _first_line(path: Path, form: Layout, number: int) -> int:
