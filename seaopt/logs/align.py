@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 
 from seaopt.errors import LogError
 
+TICK = 1e-9  # seconds within which two instants are one: an offset that is taken off leaves rounding behind
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hold:
@@ -79,6 +81,7 @@ class Linear:
         before, after, inside = _neighbours(at, time)
         step = time[after] - time[before]
         weight = np.divide(at - time[before], step, out=np.zeros_like(at), where=step > 0)
+        weight[np.abs(at - time[before]) <= TICK] = 0.0
         # A sample that is met exactly needs no neighbour.
         joined = np.where(weight > 0, (1 - weight) * values[before] + weight * values[after], values[before])
         return np.where(inside & ((step <= self.max_gap_s) | (weight == 0)), joined, np.nan)
@@ -148,9 +151,9 @@ def _neighbours(
     at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
 ) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
     """Return the samples on either side of each instant, and whether the instant lies in the clock's span."""
-    before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, time.size - 1)
+    before = np.clip(np.searchsorted(time, at + TICK, side="right") - 1, 0, time.size - 1)
     after = np.minimum(before + 1, time.size - 1)
-    return before, after, (at >= time[0]) & (at <= time[-1])
+    return before, after, (at >= time[0] - TICK) & (at <= time[-1] + TICK)
 
 
 def _positive(rule: str, name: str, value: float) -> None:

@@ -283,6 +283,11 @@ def _validated(source: Path, content: dict[str, Any]) -> ProblemTable:
         found = error.errors(include_url=False)
         # A misspelt key is also a missing one: the misspelling is the mistake.
         first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
+        # Where a string or a table may stand, what is wrong inside the table is the mistake.
+        inside = [
+            item for item in found if item["loc"][:-1] != first["loc"][:-1] and _within(item["loc"], first["loc"])
+        ]
+        first = inside[0] if first["type"] == "string_type" and inside else first
         place = _place(first["loc"])
         if first["type"] == "extra_forbidden":
             known = _known_keys(first["loc"])
@@ -292,6 +297,10 @@ def _validated(source: Path, content: dict[str, Any]) -> ProblemTable:
         value = repr(first["input"])
         shown = value if len(value) <= 60 else value[:57] + "..."
         raise ProblemError(f"{source}: {place} = {shown}: {first['msg']}") from error
+
+
+def _within(loc: tuple[int | str, ...], other: tuple[int | str, ...]) -> bool:
+    return len(loc) > len(other) and loc[: len(other) - 1] == other[:-1]
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
