@@ -1,0 +1,223 @@
+"""CSV and other delimited text, parsed by polars in blocks of whole lines.
+
+A block is parsed to floats at once; only where that fails is it parsed as text, and only where a cell is no number is
+it walked line by line, to name that cell. Memory holds the wanted columns and one block.
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+from seaopt.logs.formats.layout import BLANK, MAX_LINE, Layout, cells, is_number, layout, not_text, too_long
+from seaopt.logs.formats.source import Field, Source, Window, one_line
+
+if TYPE_CHECKING:
+    import polars as pl
+
+BLOCK = 4 << 20
+AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
+_RUNS = re.compile(rb"[ \t]+")
+_BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
+
+
+def open_text(path: Path) -> Source:
+    """List a text file's columns."""
+    form = layout(path)
+    fields = tuple(
+        Field(name=name, kind="float64" if numeric else "text", length=None, unit=unit)
+        for name, unit, numeric in zip(form.headers, form.units, form.numeric, strict=True)
+        if name
+    )
+    return Source(path=path, format="CSV", fields=fields, load=partial(_load, path, form), notes=form.notes)
+
+
+def _load(path: Path, form: Layout, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return columns by header; text has no index, so a window reads it whole."""
+    index = {name: form.headers.index(name) for name in names}
+    columns = _Columns(names)
+    size = path.stat().st_size
+    pending: deque[tuple[float, Future[dict[str, Any]]]] = deque()
+    try:
+        with closing(_blocks(path, form)) as blocks, ThreadPoolExecutor(AHEAD) as pool:
+            for number, block in enumerate(blocks):
+                if not block.isspace():
+                    pending.append((size / len(block), pool.submit(_parse, path, form, block, index, number)))
+                if len(pending) > AHEAD:
+                    columns.add(*pending.popleft())
+            while pending:
+                columns.add(*pending.popleft())
+    except UnicodeError as error:
+        raise not_text(path, form.encoding, error) from error
+    return columns.whole()
+
+
+class _Columns:
+    """Arrays that grow block by block, sized by the first block so that they are rarely moved."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.rows = 0
+        self.arrays: dict[str, np.ndarray] = {name: np.empty(0) for name in names}
+
+    def add(self, blocks: float, future: Future[dict[str, Any]]) -> None:
+        parsed = future.result()
+        count = next(iter(parsed.values())).size
+        stop = self.rows + count
+        for name, values in parsed.items():
+            array = self.arrays[name]
+            if not self.rows:  # not filled, so that memory is taken as it is written
+                array = self.arrays[name] = np.empty(int(count * max(blocks, 1.0) * 1.02) + 1)
+            elif stop > array.size:
+                array.resize(int(stop * 1.25), refcheck=False)
+            array[self.rows : stop] = values
+        self.rows = stop
+
+    def whole(self) -> dict[str, Float[np.ndarray, " n"]]:
+        for array in self.arrays.values():
+            array.resize(self.rows, refcheck=False)
+        return self.arrays
+
+
+def _blocks(path: Path, form: Layout) -> Generator[bytes]:
+    """Return blocks of whole lines as UTF-8."""
+    with _opened(path, form.encoding) as stream:
+        for _ in range(form.first):
+            stream.readline()
+        number = 0
+        while block := _block(stream, form):
+            _check_lines(path, form, block, number)
+            if not number:
+                block = block.removeprefix(codecs.BOM_UTF8)
+            if len(block) < BLOCK:  # the last one may end in blank lines, and in the end-of-file mark of DOS
+                block = block.rstrip(b"\x1a \t\r\n") + b"\n"
+            yield block
+            number += 1
+
+
+def _block(stream: IO[Any], form: Layout) -> bytes:
+    """Return the next block, up to the end of a line."""
+    if form.encoding == "utf-16":
+        return (stream.read(BLOCK) + stream.readline(MAX_LINE + 1)).encode()
+    start = stream.tell()
+    stream.seek(start + BLOCK)
+    stream.readline(MAX_LINE + 1)
+    end = stream.tell()
+    stream.seek(start)
+    return stream.read(end - start)
+
+
+def _first_line(path: Path, form: Layout, number: int) -> int:
+    """Return the line on which a block begins; counted only to name a line, as it takes a while."""
+    with closing(_blocks(path, form)) as blocks:
+        return form.first + 1 + sum(block.count(b"\n") for block in islice(blocks, number))
+
+
+def _opened(path: Path, encoding: str) -> IO[Any]:
+    if encoding == "utf-16":
+        return path.open(encoding=encoding, newline="\n")
+    return path.open("rb")
+
+
+def _check_lines(path: Path, form: Layout, block: bytes, number: int) -> None:
+    start = 0
+    while len(block) - start > MAX_LINE:
+        end = block.rfind(b"\n", start, start + MAX_LINE)
+        if end < start:
+            raise too_long(path, _first_line(path, form, number) + block.count(b"\n", 0, start))
+        start = end + 1
+
+
+def _parse(path: Path, form: Layout, block: bytes, index: dict[str, int], number: int) -> dict[str, Any]:
+    import polars as pl
+
+    def bad(reason: str) -> LogError:
+        return _bad_cell(path, form, block, index, _first_line(path, form, number), reason)
+
+    try:
+        frame = _frame(_blanks_as_tabs(block, form), form, index, pl.Float64)
+    except (pl.exceptions.PolarsError, ValueError):
+        return _parse_text(form, block, index, bad)
+    if frame.to_series(0).null_count() and _BLANK_LINES.search(block):
+        return _parse_text(form, block, index, bad)
+    parsed = {name: frame[f"column_{at}"].to_numpy() for name, at in index.items()}
+    if any(np.isinf(values).any() for values in parsed.values()):
+        raise bad("a cell is infinite")
+    return parsed
+
+
+def _blanks_as_tabs(block: bytes, form: Layout) -> bytes:
+    """Return a block whose delimiter is one byte."""
+    return re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", block)) if form.delimiter == " " else block
+
+
+def _frame(block: bytes, form: Layout, index: dict[str, int], kind: Any) -> pl.DataFrame:
+    import polars as pl
+
+    wanted = set(index.values())
+    schema = {f"column_{at}": kind if at in wanted else pl.String for at in range(len(form.headers))}
+    return pl.read_csv(
+        block,
+        has_header=False,
+        separator="\t" if form.delimiter == " " else form.delimiter,
+        schema=schema,
+        columns=[f"column_{at}" for at in sorted(wanted)],
+        decimal_comma=form.comma,
+        missing_columns="insert",
+        extra_columns="raise",
+        null_values=["NA", "na", "N/A", "n/a"],
+    )
+
+
+def _parse_text(form: Layout, block: bytes, index: dict[str, int], bad: Callable[[str], LogError]) -> dict[str, Any]:
+    """Parse a block with blank lines, or with blanks around its numbers; what is still no number is named."""
+    import polars as pl
+
+    try:
+        frame = _frame(_blanks_as_tabs(_BLANK_LINES.sub(b"", block), form), form, index, pl.String)
+    except (pl.exceptions.PolarsError, ValueError) as error:
+        raise bad(one_line(error)) from error
+    parsed: dict[str, Any] = {}
+    for name, at in index.items():
+        text = frame[f"column_{at}"].str.strip_chars()
+        values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
+        blank = text.is_null() | text.str.to_lowercase().is_in(list(BLANK))
+        if (values.is_null() & ~blank).any() or values.is_infinite().any():
+            raise bad("a cell is no number")
+        parsed[name] = values.to_numpy()
+    return parsed
+
+
+def _bad_cell(path: Path, form: Layout, block: bytes, index: dict[str, int], line: int, reason: str) -> LogError:
+    """Return the error that names the first cell, or row, that cannot be read."""
+    for number, text in enumerate(block.decode().split("\n"), start=line):
+        row = cells(text.rstrip("\r"), form.delimiter) if text.strip() else []
+        if len(row) > len(form.headers):
+            return LogError(
+                f"{path}: cannot be read as CSV (line {number} has {len(row)} columns and the header "
+                f"{len(form.headers)}); check that every row has the header's columns"
+            )
+        for name, at in index.items():
+            cell = row[at] if at < len(row) else ""
+            if cell.casefold() in BLANK:
+                continue
+            where = f'{path}: line {number}: "{cell[:60]}" in column "{name}"'
+            if "inf" in cell.casefold() and is_number(cell, form.comma):
+                return LogError(f"{where} is not finite; leave the cell empty")
+            if not is_number(cell, form.comma):
+                decimal = re.fullmatch(r"[-+]?\d+,\d+", cell) is not None
+                return LogError(
+                    f"{where} is not a number; correct it{', or save the log with decimal points' if decimal else ''}"
+                )
+    return LogError(f"{path}: cannot be read as CSV ({reason}); check that every row has the header's columns")

@@ -1,0 +1,73 @@
+"""The reading keys of a problem file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.errors import LogError, ProblemError
+
+T = np.arange(400) / 400
+HEAD = 'schema = 1\n[plant.a]\nkind = "high_impedance"\n[[experiment]]\nname = "x"\nplant = "a"\n'
+
+
+@pytest.fixture
+def problem(tmp_path):
+    counts = np.round(1000 * np.sin(9 * T)).astype(np.int64) % 65536
+    rows = "".join(f"{1000 * t:.6f},{n}\n" for t, n in zip(T, counts, strict=True))
+    (tmp_path / "motor.csv").write_text("t,cur\n" + rows)
+    late = T[::2] + 0.5
+    rows = "".join(f"{t:.6f},{np.cos(t - 0.5):.9f}\n" for t in late)
+    (tmp_path / "cell.csv").write_text("t [s],F1 [kN]\n" + rows)
+
+    def write(keys):
+        path = tmp_path / "problem.toml"
+        path.write_text(HEAD + keys, encoding="utf-8")
+        return so.read_problem(path)
+
+    return write
+
+
+KEYS = """
+log = "motor.csv"
+time = { column = "t", unit = "ms", file = "motor.csv" }
+inputs = { I = { column = "cur", unit = "mA", wrap_bits = 16, scale = 2.0, offset = 1.0 } }
+[experiment.outputs]
+F1 = { column = "F1 [kN]", file = "cell.csv", clock_offset_s = -0.5, align = { linear = { max_gap_s = 0.01 } } }
+"""
+
+
+def test_columns_are_converted_and_aligned(problem):
+    (experiment,) = problem(KEYS).experiments()
+    log = experiment.log
+    np.testing.assert_allclose(log["I"], 1e-3 * (2 * np.round(1000 * np.sin(9 * T)) + 1), atol=1e-12)
+    np.testing.assert_allclose(log["F1"][:-1], 1000 * np.cos(T[:-1]), atol=5e-3)
+    assert np.isnan(log["F1"][-1])
+
+
+def test_a_window_and_a_rule_for_all(problem):
+    keys = KEYS.replace(", align = { linear = { max_gap_s = 0.01 } }", "")
+    with pytest.raises(LogError, match=r"problem.toml: experiment x: .*on the clock"):
+        problem(keys).experiments()
+    more = "align = { hold = { max_age_s = 0.01 } }\nwindow_s = [0.1, 0.2]\n[experiment.outputs]"
+    (experiment,) = problem(keys.replace("[experiment.outputs]", more)).experiments()
+    assert len(experiment.log) == 41
+    np.testing.assert_allclose(experiment.log["F1"], 1000 * np.cos(np.floor(np.arange(40, 81) / 2) / 200), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"motor.csv"\n', '"../motor.csv"\n', "leaves the problem file's folder"),
+        ('"cell.csv"', '"/tmp/cell.csv"', "leaves the problem file's folder"),
+        ('"cell.csv"', '"C:\\\\cell.csv"', "leaves the problem file's folder"),
+        ("linear = { max_gap_s = 0.01 }", "linear = {}, hold = {}", "exactly one of hold, linear and nearest"),
+        ("wrap_bits = 16", "wrap_bits = 99", "wrap_bits"),
+        ("clock_offset_s = -0.5", "clok_offset_s = -0.5", 'did you mean "clock_offset_s"'),
+    ],
+)
+def test_bad_keys_are_named(problem, old, new, words):
+    with pytest.raises(ProblemError, match=words) as raised:
+        problem(KEYS.replace(old, new, 1))
+    assert "\n" not in str(raised.value)
