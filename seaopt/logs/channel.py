@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.logs.faults import (
-    Counter,
     Rail,
     Runs,
+    Skips,
     counter,
     held,
     outliers,
@@ -28,7 +28,7 @@ MOVES = 0.05  # of its standard deviation over the log: what makes a channel mov
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Channel:
+class ChannelQuality:
     """What was found in one channel, in its SI unit; rows are counted from 0.
 
     Parameters
@@ -50,7 +50,7 @@ class Channel:
         Flat tops and bottoms.
     outliers : array of int
         Rows.
-    counter : Counter or None
+    counter : Skips or None
         Lost samples, where the channel counts.
     hum : Hum or None
 
@@ -69,7 +69,7 @@ class Channel:
     stuck: Runs
     rails: tuple[Rail, ...]
     outliers: Int[np.ndarray, " k"]
-    counter: Counter | None
+    counter: Skips | None
     hum: Hum | None = None
 
     @property
@@ -83,7 +83,7 @@ class Channel:
         return sum(rail.runs.samples for rail in self.rails)
 
 
-def channel_of(signal: Signal) -> Channel:
+def channel_of(signal: Signal) -> ChannelQuality:
     """Return what is found in a channel on its own.
 
     Examples
@@ -100,7 +100,7 @@ def channel_of(signal: Signal) -> Channel:
     values = values if not np.any(np.isinf(values)) else np.where(finite, values, np.nan)
     if not good.size or good.min() == good.max():
         edge = float(good[0]) if good.size else np.nan
-        return Channel(
+        return ChannelQuality(
             name=signal.name, unit=signal.unit, low=edge, high=edge, mean=edge, std=0.0 if good.size else np.nan,
             missing=missing, quantum=0.0, still=1.0, held=1, stuck=Runs(), rails=(),
             outliers=np.zeros(0, dtype=int), counter=None,
@@ -113,7 +113,7 @@ def channel_of(signal: Signal) -> Channel:
         tame = values.copy()
         tame[wild] = np.nan
     flat = tuple(rails(tame, quantum, still)) if counted is None else ()
-    return Channel(
+    return ChannelQuality(
         name=signal.name, unit=signal.unit, low=float(good.min()), high=float(good.max()), mean=float(good.mean()),
         std=float(good.std()), missing=missing, quantum=quantum, still=still,
         held=held(values) if still >= 0.4 else 1,
@@ -146,7 +146,9 @@ def moving(found: Runs, others: Sequence[tuple[Float[np.ndarray, " n"], float]])
     def moves(start: int, stop: int) -> bool:
         return any(np.nanstd(values[start:stop]) > MOVES * std for values, std in active if _seen(values[start:stop]))
 
-    chosen: Bool[np.ndarray, " k"] = np.array([moves(a, b) for a, b in zip(found.start.tolist(), found.stop.tolist(), strict=True)])
+    chosen: Bool[np.ndarray, " k"] = np.array(
+        [moves(a, b) for a, b in zip(found.start.tolist(), found.stop.tolist(), strict=True)]
+    )
     return found.where(chosen)
 
 

@@ -15,7 +15,7 @@ LOOKED_AT = 200_000  # steps that are enough to see the rounding of timestamps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Clock:
+class ClockQuality:
     """What the timestamps say; rows are counted from 0.
 
     Parameters
@@ -54,7 +54,7 @@ class Clock:
         return float(f"{1.0 / self.period:.9g}")
 
 
-def clock_of(time: Float[np.ndarray, " n"], source: str) -> Clock:
+def clock_of(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     """Return what the timestamps of a log or table say.
 
     Raises
@@ -80,7 +80,7 @@ def clock_of(time: Float[np.ndarray, " n"], source: str) -> Clock:
     inside = step[(step > 0.0) & ~across]
     strays = inside - period
     rounding = resolution(stamps)
-    return Clock(
+    return ClockQuality(
         samples=time.size,
         period=period,
         jitter_rms=float(np.sqrt(np.mean(strays**2))),

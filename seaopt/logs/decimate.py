@@ -18,7 +18,7 @@ from seaopt.logs.log import Log
 
 PASS_BAND = 0.8  # of the new Nyquist frequency
 ATTENUATION_DB = 80.0
-MISSING = 0.05  # of the filter's weight on missing samples, beyond which its output is missing
+MISSING = 0.2  # of the filter's weight on missing samples, beyond which its output is missing
 
 
 def decimate(log: Log, factor: int) -> Log:
@@ -36,7 +36,7 @@ def decimate(log: Log, factor: int) -> Log:
     Log
         With a note that names the pass band and the samples that were cut at the ends: 25 periods of the new clock at
         each end of each stretch. A short run of missing samples is bridged by a line for the filter, and the output is
-        missing where they carry more than 5 % of its weight. An input that was held is no longer: fit with
+        missing where they carry more than 20 % of its weight. An input that was held is no longer: fit with
         ``hold="first"``.
 
     Raises

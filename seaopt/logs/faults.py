@@ -62,7 +62,7 @@ class Rail:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Counter:
+class Skips:
     """A channel that counts: each value held `held` samples, `lost` samples skipped ahead of each of `rows`."""
 
     held: int
@@ -137,8 +137,12 @@ def outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.ndarray,
     usual = _distances(values, some)[1]
     floor = max(OUTLYING * 1.4826 * float(np.median(usual)), 2.0 * quantum) if usual.size else np.inf
     bend = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
-    near = np.flatnonzero(bend > 0.25 * floor)  # an outlier is bent by half its height, or its neighbours are
-    rows = np.unique(np.concatenate([near, near + 1, near + 2]))
+    bent = bend > 0.25 * floor  # an outlier is, by its height, and its neighbours by half of that
+    near = np.zeros(values.size, dtype=bool)
+    near[1:-1] = bent
+    near[:-2] |= bent
+    near[2:] |= bent
+    rows = np.flatnonzero(near)
     found: list[Int[np.ndarray, " _"]] = []
     for part in np.array_split(rows, max(1, -(-rows.size // LOOKED_AT))):  # in the memory of a part
         kept, off, spread, beyond = _distances(values, part)
@@ -169,20 +173,20 @@ def rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list
     if values.size < SCARCE or np.unique(finite).size <= FEW_LEVELS:
         return []
     found: list[Rail] = []
-    for side, sign in (("low", -1.0), ("high", 1.0)):
-        edge = float(np.nanmax(sign * values))
-        span = float(np.nanmax(values) - np.nanmin(values))
-        depth = edge - sign * values
-        at = depth <= max(0.01 * quantum, 1e-12 * span)
+    low, high = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))
+    level = quantum if quantum else 1e-3 * (high - low)
+    alike = max(0.01 * quantum, 1e-12 * (high - low))
+    for side, edge in (("low", low), ("high", high)):
+        at = values >= high - alike if side == "high" else values <= low + alike
+        near = values >= high - 4.5 * level if side == "high" else values <= low + 4.5 * level
         count = int(np.count_nonzero(at))
-        level = quantum if quantum else 1e-3 * span
-        below = (np.count_nonzero(depth <= 4.5 * level) - count) / 4.0
+        below = (np.count_nonzero(near) - count) / 4.0
         runs = runs_of(at)
         # A run at either end may be rest, and single samples the peaks of a periodic signal.
         flat = runs.where((runs.start > 0) & (runs.stop < values.size) & (runs.lengths > 1))
         if count >= 3 and count >= PILE * max(below, 0.5) and len(flat):
             clear = len(flat) >= 3 and still < 0.5
-            found.append(Rail(side=side, value=sign * edge, runs=runs, clear=clear))
+            found.append(Rail(side=side, value=edge, runs=runs, clear=clear))
     return found
 
 
@@ -224,7 +228,7 @@ def held(values: Float[np.ndarray, " n"]) -> int:
     return usual if np.mean(spacing == usual) >= REGULAR else 1
 
 
-def counter(values: Float[np.ndarray, " n"]) -> Counter | None:
+def counter(values: Float[np.ndarray, " n"]) -> Skips | None:
     """Return the samples that a counter shows to be missing; None where the channel is no counter.
 
     A counter goes up by one, at regular intervals, and may wrap.
@@ -258,4 +262,4 @@ def counter(values: Float[np.ndarray, " n"]) -> Counter | None:
     # A value that was held too briefly lost samples; so did every value that was passed over.
     lost = np.maximum(usual - spacing, 0) + ((turned[1:] - 1.0) * usual).astype(int)
     short = lost > 0
-    return Counter(held=usual, rows=changes[1:][short], lost=lost[short])
+    return Skips(held=usual, rows=changes[1:][short], lost=lost[short])

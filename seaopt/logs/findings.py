@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.logs.channel import Channel
-from seaopt.logs.clock import Clock
+from seaopt.logs.channel import ChannelQuality
+from seaopt.logs.clock import ClockQuality
 from seaopt.logs.excitation import Excitation
 from seaopt.logs.faults import Runs
 from seaopt.logs.log import JITTER_LIMIT
@@ -61,7 +61,7 @@ class Finding:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
-def clock_findings(clock: Clock, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
+def clock_findings(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
     """Yield what is wrong with the clock."""
     for kind, rows, what in (
         ("time_missing", clock.not_numbers, "no number as time; remove these rows"),
@@ -84,7 +84,7 @@ def clock_findings(clock: Clock, time: Float[np.ndarray, " n"]) -> Iterator[Find
         )  # fmt: skip
 
 
-def _jitter(clock: Clock, share: float) -> Finding:
+def _jitter(clock: ClockQuality, share: float) -> Finding:
     said = f"steps of time stray up to {share:.0%} from the period of {clock.period:.4g} s"
     if clock.rounded_only:
         text = (
@@ -97,7 +97,7 @@ def _jitter(clock: Clock, share: float) -> Finding:
     return Finding(kind="jitter", severity="error", value=100.0 * share, unit="% of the period", sentence=text)
 
 
-def channel_findings(found: Channel, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
+def channel_findings(found: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
     """Yield what is wrong with one channel."""
     name, n = found.name, time.size
     if len(found.missing):
@@ -112,7 +112,7 @@ def channel_findings(found: Channel, time: Float[np.ndarray, " n"]) -> Iterator[
         if count == n:
             return
     if found.constant:
-        text = f"{name} is {found.low:.4g} {found.unit} throughout; check its wiring, or leave it out"
+        text = f"{name} is {_with(found.low, found.unit)} throughout; check its wiring, or leave it out"
         yield Finding(
             kind="constant", severity="warning", channel=name, value=found.low, unit=found.unit, sentence=text
         )
@@ -134,9 +134,10 @@ def channel_findings(found: Channel, time: Float[np.ndarray, " n"]) -> Iterator[
         )  # fmt: skip
     if found.counter is not None and found.counter.rows.size:
         rows, lost = found.counter.rows, int(np.sum(found.counter.lost))
+        held = f", samples_per_count={found.counter.held}" if found.counter.held > 1 else ""
         text = (
             f"{name} counts, and skips at {_some(rows.size, 'place')}: {_some(lost, 'sample')} lost that the clock "
-            "does not show; correct the clock, or cut the log there"
+            f'does not show; read the log with counter=Counter(column="{name}"{held}), which opens the gaps'
         )
         yield Finding(
             kind="gap", severity="error", channel=name, count=int(rows.size), value=float(lost), unit="samples",
@@ -146,12 +147,12 @@ def channel_findings(found: Channel, time: Float[np.ndarray, " n"]) -> Iterator[
         yield _hum(found)
 
 
-def _rails(found: Channel, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
+def _rails(found: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
     name = found.name
     for rail in found.rails:
         edge = "largest" if rail.side == "high" else "least"
         count = f"{_some(rail.runs.samples, 'sample')} ({rail.runs.samples / time.size:.2%})"
-        text = f"{name} is flat at its {edge} value, {rail.value:.5g} {found.unit}, for {count}"
+        text = f"{name} is flat at its {edge} value, {_with(rail.value, found.unit)}, for {count}"
         text += (
             ": it is clipped; a fit masks these samples of an output"
             if rail.clear
@@ -161,7 +162,7 @@ def _rails(found: Channel, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
         yield _runs("clipping", severity, found, rail.runs, time, text, value=rail.value)
 
 
-def _levels(found: Channel) -> Iterator[Finding]:
+def _levels(found: ChannelQuality) -> Iterator[Finding]:
     if found.held > 1:
         text = (
             f"{found.name} repeats each value {found.held} times: its own rate is lower than the log's; decimate, or "
@@ -170,7 +171,7 @@ def _levels(found: Channel) -> Iterator[Finding]:
         yield Finding(kind="held", severity="note", channel=found.name, count=found.held, sentence=text)
     levels = (found.high - found.low) / found.quantum if found.quantum else np.inf
     if found.counter is None and levels < FINE:
-        text = f"{found.name} moves in steps of {found.quantum:.4g} {found.unit}, {levels:.0f} over its range"
+        text = f"{found.name} moves in steps of {_with(found.quantum, found.unit)}, {levels:.0f} over its range"
         text += "; use a finer range, or expect coloured residuals" if levels < COARSE else ""
         yield Finding(
             kind="quantisation", severity="warning" if levels < COARSE else "note", channel=found.name,
@@ -178,11 +179,11 @@ def _levels(found: Channel) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _hum(found: Channel) -> Finding:
+def _hum(found: ChannelQuality) -> Finding:
     assert found.hum is not None
     lines = ", ".join(f"{line:g} Hz" for line in found.hum.lines_hz)
     text = (
-        f"{found.name} hums with the mains at {lines}: {found.hum.rms:.3g} {found.unit} rms, "
+        f"{found.name} hums with the mains at {lines}: {_with(found.hum.rms, found.unit)} rms, "
         f"{max(found.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it (band_hz)"
     )
     return Finding(
@@ -207,10 +208,10 @@ def pair_findings(found: Pair, period: float, driven: bool) -> Iterator[Finding]
     text = f"{late} follows {early} by {1e3 * abs(found.lag_s):.3g} ms ({abs(samples):.2f} samples), correlation "
     text += f"{found.correlation:.2f}"
     severity: Severity = "note"
-    if driven and samples < -1.5:
+    if driven and found.leads and samples < -1.5:
         severity = "warning"
         text += "; an input cannot come after what it causes: align the channels"
-    elif driven:
+    elif driven and samples > 0:
         text += "; that is the plant's own lag and any delay: let a fit tell them apart (delay_s free)"
     yield Finding(kind="delay", severity=severity, channel=name, value=found.lag_s, unit="s", sentence=text)
 
@@ -238,12 +239,16 @@ def _some(count: int, noun: str) -> str:
     return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
+def _with(value: float, unit: str) -> str:
+    return f"{value:.4g} {unit}".rstrip()
+
+
 def _rows(time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]) -> tuple[tuple[float, float], ...]:
     return tuple((float(time[row]), float(time[row])) for row in rows[:SHOWN])
 
 
 def _runs(
-    kind: str, severity: Severity, found: Channel, runs: Runs, time: Float[np.ndarray, " n"], text: str,
+    kind: str, severity: Severity, found: ChannelQuality, runs: Runs, time: Float[np.ndarray, " n"], text: str,
     value: float = 0.0,
 ) -> Finding:  # fmt: skip
     pairs = zip(runs.start[:SHOWN], runs.stop[:SHOWN], strict=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
+from seaopt.logs.column import bare_name, header_unit
 from seaopt.logs.log import Log
-from seaopt.logs.read import header_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,7 +99,7 @@ def from_frame(
     if not columns:
         raise LogError(f"{type(frame).__name__} is no frame with columns; give a polars or pandas DataFrame")
     if channels is None:
-        channels = {_name(column): column for column in columns if column != time}
+        channels = {bare_name(column): column for column in columns if column != time}
     wanted = {"time": time} | dict(channels)
     for name, column in wanted.items():
         if column not in columns:
@@ -109,10 +108,6 @@ def from_frame(
     given = {name: unit for name, unit in brackets.items() if unit is not None} | dict(units or {})
     arrays = {name: _column(frame, column, source) for name, column in wanted.items()}
     return Log.from_arrays(units=given, source=source, **arrays)
-
-
-def _name(header: str) -> str:
-    return header if header_unit(header) is None else re.split(r"\s*[\[(]", header)[0]
 
 
 def _column(frame: Any, column: str, source: str) -> Float[np.ndarray, " n"]:

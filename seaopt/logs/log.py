@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
+    from seaopt.logs.align import Rule
     from seaopt.logs.quality import Quality
-    from seaopt.logs.resample import Rule
 
 JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
 GAP = 1.5  # periods between two samples that make a gap

@@ -25,6 +25,8 @@ class Pair:
         Where the correlation is largest in size, a fraction of a sample by a parabola through three.
     correlation : float
         There, with its sign.
+    leads : bool
+        Whether the second is clearly ahead: nothing within a tenth of that correlation where it is late.
     flipped : bool
         Whether the correlation within three samples of no lag is mostly negative.
 
@@ -34,6 +36,7 @@ class Pair:
     second: str
     lag_s: float
     correlation: float
+    leads: bool
     flipped: bool
 
 
@@ -71,5 +74,6 @@ def pair(found: Spectra, first: str, second: str) -> Pair | None:
         second=second,
         lag_s=float(lags[best] + shift) / FINE * found.period,
         correlation=float(near[best]),
+        leads=bool(lags[best] < 0 and np.max(np.abs(near[lags >= 0])) < 0.9 * abs(near[best])),
         flipped=bool(-np.min(close) > max(FLIPPED, 1.5 * np.max(close))),
     )

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError, suggestion
-from seaopt.logs.channel import Channel, channel_of, moving
-from seaopt.logs.clock import Clock, clock_of
+from seaopt.logs.channel import ChannelQuality, channel_of, moving
+from seaopt.logs.clock import ClockQuality, clock_of
 from seaopt.logs.excitation import Excitation, excitation
 from seaopt.logs.findings import (
     Finding,
@@ -45,8 +45,8 @@ class Quality:
     source : str
     duration_s : float
         From the first sample to the last.
-    clock : Clock
-    channels : mapping of name to Channel
+    clock : ClockQuality
+    channels : mapping of name to ChannelQuality
     inputs : tuple of str
         Channels that were taken as inputs.
     pairs : tuple of Pair
@@ -63,8 +63,8 @@ class Quality:
 
     source: str
     duration_s: float
-    clock: Clock
-    channels: Mapping[str, Channel]
+    clock: ClockQuality
+    channels: Mapping[str, ChannelQuality]
     inputs: tuple[str, ...]
     pairs: tuple[Pair, ...]
     excitation: Mapping[str, Excitation]
@@ -177,12 +177,11 @@ def quality(data: Log | Table, *, inputs: Sequence[str] | None = None) -> Qualit
     found = {name: channel_of(signal) for name, signal in data.signals.items()}
     found = {name: _against_others(item, found, data) for name, item in found.items()}
     varying = {name: data.signals[name].values for name, item in found.items() if _varies(item)}
+    drives = tuple(inputs) if inputs is not None else _likely_inputs(found)
     seen = spectra(varying, _pieces(clock, len(data)), clock.period)
     if seen is not None:
-        found = {
-            name: replace(item, hum=hum(seen, name)) if name in seen.channels else item for name, item in found.items()
-        }
-    drives = tuple(inputs) if inputs is not None else _likely_inputs(found)
+        heard = {name: hum(seen, name, drives) for name in seen.channels}
+        found = {name: replace(item, hum=heard.get(name)) for name, item in found.items()}
     pairs = _pairs(seen, drives, found)
     told = _excitations(seen, drives)
     findings = [*clock_findings(clock, data.time)]
@@ -197,11 +196,11 @@ def quality(data: Log | Table, *, inputs: Sequence[str] | None = None) -> Qualit
     )  # fmt: skip
 
 
-def _varies(item: Channel) -> bool:
+def _varies(item: ChannelQuality) -> bool:
     return item.std > 0.0 and item.counter is None
 
 
-def _against_others(item: Channel, found: Mapping[str, Channel], data: Log | Table) -> Channel:
+def _against_others(item: ChannelQuality, found: Mapping[str, ChannelQuality], data: Log | Table) -> ChannelQuality:
     """Keep the runs of a channel as stuck during which another one moves."""
     others = [
         (data.signals[name].values, other.std)
@@ -211,20 +210,20 @@ def _against_others(item: Channel, found: Mapping[str, Channel], data: Log | Tab
     return replace(item, stuck=moving(item.stuck, others)) if len(item.stuck) else item
 
 
-def _pieces(clock: Clock, n: int) -> list[slice]:
+def _pieces(clock: ClockQuality, n: int) -> list[slice]:
     """Return the rows without a gap or a step backwards."""
     breaks = np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers]))
     edges = [0, *breaks.tolist(), n]
     return [slice(a, b) for a, b in pairwise(edges) if b > a]
 
 
-def _likely_inputs(found: Mapping[str, Channel]) -> tuple[str, ...]:
+def _likely_inputs(found: Mapping[str, ChannelQuality]) -> tuple[str, ...]:
     active = [name for name, item in found.items() if _varies(item)]
     named = tuple(name for name in active if name.casefold() in INPUTS)
     return named or tuple(name for name in active if found[name].unit in INPUT_UNITS)
 
 
-def _pairs(seen: Spectra | None, drives: Sequence[str], found: Mapping[str, Channel]) -> tuple[Pair, ...]:
+def _pairs(seen: Spectra | None, drives: Sequence[str], found: Mapping[str, ChannelQuality]) -> tuple[Pair, ...]:
     if seen is None:
         return ()
     rest = [name for name in seen.channels if name not in drives]
@@ -260,7 +259,7 @@ def _unjudged(drives: Sequence[str], seen: Spectra | None, data: Log | Table) ->
 CHANNEL_HEAD = ("channel", "unit", "low", "high", "std", "missing", "step", "stuck", "saturated", "outliers", "hum")
 
 
-def channel_row(item: Channel) -> tuple[str, ...]:
+def channel_row(item: ChannelQuality) -> tuple[str, ...]:
     """Return a channel's figures for people, in the order of CHANNEL_HEAD."""
     return (
         item.name, item.unit or "-", f"{item.low:.4g}", f"{item.high:.4g}", f"{item.std:.4g}",
@@ -269,7 +268,7 @@ def channel_row(item: Channel) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def jitter(clock: Clock) -> str:
+def jitter(clock: ClockQuality) -> str:
     """Return the clock's jitter for people."""
     if clock.jitter_max <= 1e-6 * clock.period:
         return "no jitter"
@@ -286,7 +285,7 @@ def _fields(item: Any) -> dict[str, Any]:
     return {name: getattr(item, name) for name in item.__dataclass_fields__}
 
 
-def _channel_dict(item: Channel) -> dict[str, Any]:
+def _channel_dict(item: ChannelQuality) -> dict[str, Any]:
     return {
         "unit": item.unit, "low": item.low, "high": item.high, "mean": item.mean, "std": item.std,
         "missing": item.missing.samples, "constant": item.constant, "quantisation": item.quantum, "held": item.held,

@@ -1,71 +1,64 @@
-"""Raw files to logs: CSV with a header, units in brackets or given (polars reads)."""
+"""Raw files to tables and logs: which columns, on which clock, brought together by which rule."""
 
 from __future__ import annotations
 
 import hashlib
-import io
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError, SeaoptError, suggestion
+from seaopt.errors import LogError
 from seaopt.files import write_text
+from seaopt.logs.align import Rule, check_clock
+from seaopt.logs.column import Column
+from seaopt.logs.counter import Counter
+from seaopt.logs.formats import Window, open_source
 from seaopt.logs.log import Log
+from seaopt.logs.select import Channel, Clock, Selection, select
 from seaopt.logs.table import Table
 from seaopt.signals import Origin, Signal
 from seaopt.units import factor, si_unit
 
-if TYPE_CHECKING:
-    import polars as pl
-
-_BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Column:
-    """A column of a file and the unit of its numbers; without `unit`, the header's brackets say it."""
-
-    column: str
-    unit: str | None = None
-
-
-def header_unit(header: str) -> str | None:
-    """Return the unit in a header's brackets, None where there is none.
-
-    Examples
-    --------
-    >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
-    ('N', 'usec', None)
-
-    """
-    found = _BRACKETS.match(header)
-    return found["unit"].strip() if found else None
-
 
 def read_table(
-    path: str | Path, *, time: str | Column | None = None, channels: Mapping[str, str | Column] | None = None
+    path: str | Path | Sequence[str | Path],
+    *,
+    time: str | Column | None = None,
+    channels: Mapping[str, str | Column] | None = None,
+    align: Rule | None = None,
+    window_s: tuple[float, float] | None = None,
+    counter: Counter | None = None,
+    digest: bool = True,
 ) -> Table:
     r"""Read a file as it is: time may repeat or run backwards, and a channel may be empty.
 
     Parameters
     ----------
-    path : path
-        The file; the delimiter (comma, semicolon, tab) is the one its header uses.
+    path : path, or several
+        CSV and other text, MAT, HDF5, Parquet, NPZ, JSON, ROS bags, MCAP, MDF or TDMS, told by content.
     time : str or Column, optional
-        Header of the time column; where it is left out, the one column that is named like a time.
+        The clock: a column, or in a bag a topic. Where it is left out, the format's own clock, or the one column that
+        is named like a time.
     channels : mapping of channel name to str or Column, optional
-        Which column is which channel; where it is left out, every column of numbers, named by its header without the
-        unit's brackets.
+        Which column is which channel; where it is left out, every column of numbers on the clock, named by its header
+        without the unit's brackets.
+    align : Hold, Linear or Nearest, optional
+        How channels of other clocks come to this one; a Column's own rule goes first.
+    window_s : tuple, optional
+        Read only what lies between these times of the clock; formats with an index skip the rest of the file.
+    counter : Counter, optional
+        A column that counts samples: where it skips, the later times are moved to open a gap.
+    digest : bool
+        Whether to note the files' SHA-256, for which they are read whole, though never held.
 
     Raises
     ------
     LogError
-        The file is missing, empty or not text, a column is missing or doubled, or a cell is not a number.
+        The file is missing or damaged, a column is missing or doubled, a cell is not a number, or a channel is on
+        another clock and no rule is given.
     UnitError
         A unit is unknown or of the wrong dimension.
 
@@ -77,48 +70,43 @@ def read_table(
     >>> table = read_table(file)
     >>> table.time.tolist(), {name: (signal.values.tolist(), signal.unit) for name, signal in table.signals.items()}
     ([0.0, 0.0025], {'cur': ([0.1, 0.15], 'A')})
+    >>> table.notes
+    ('columns that hold no numbers were left out: note',)
 
     """
-    source = Path(path)
-    text = _read_text(source)
-    digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    first, _, rows = text.partition("\n")
-    if not rows.strip():
-        raise LogError(f"{source}: 0 rows below the header; record the log again")
-    headers, delimiter = _headers(first.rstrip("\r"))
-    if channels is not None and "time" in channels:
-        raise LogError(f'{source}: a channel is named "time"; rename it, time is the clock')
-    clock = _as_column(time) if time is not None else Column(column=_time_column(source, headers))
-    notes: list[str] = []
-    if channels is None:
-        given = _every_column(source, headers, delimiter, rows, clock.column, notes)
-    else:
-        given = {name: _as_column(item) for name, item in channels.items()}
-    wanted = {"time": clock} | given
-    for name, column in wanted.items():
-        _check_column(source, name, column.column, headers)
-    units = {name: _unit_of(source, column) for name, column in wanted.items()}
-    if factor_error := _wrong_time_unit(source, units["time"]):
-        raise factor_error
-    table = _parse(source, text, headers, delimiter, {column.column for column in wanted.values()})
-    if table.height < 2:
-        raise LogError(f"{source}: too few rows ({table.height}) below the header; a log needs at least 2")
-    arrays = {name: _numbers(source, table, column.column) for name, column in wanted.items()}
-    signals = {
-        name: _signal(name, arrays[name], units[name], str(path), digest, column) for name, column in given.items()
-    }
-    seconds = arrays["time"] * factor(units["time"], "s")
-    return Table(time=seconds, signals=signals, source=str(path), notes=tuple(notes))
+    files = [Path(path)] if isinstance(path, str | Path) else [Path(item) for item in path]
+    if not files:
+        raise LogError("path is an empty list; give a file")
+    sources = [open_source(file) for file in files]
+    window = _window(window_s)
+    with ThreadPoolExecutor(max_workers=1) as pool:  # the files are hashed while they are parsed
+        digests = {source.path: pool.submit(_digest, source.path) if digest else None for source in sources}
+        chosen = select(sources, time, channels, align, counter)
+        arrays, clock, notes = _read(chosen, window, counter)
+        hashes = {file: future.result() if future is not None else "" for file, future in digests.items()}
+    notes = [*chosen.notes, *notes]
+    signals = {}
+    for name, channel in chosen.channels.items():
+        signals[name] = _signal(name, channel, arrays.pop(name), chosen.clock, hashes[channel.source.path])
+        notes += _remarks(signals[name])
+    return Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
 
 
 def read_log(
-    path: str | Path, *, time: str | Column | None = None, channels: Mapping[str, str | Column] | None = None
+    path: str | Path | Sequence[str | Path],
+    *,
+    time: str | Column | None = None,
+    channels: Mapping[str, str | Column] | None = None,
+    align: Rule | None = None,
+    window_s: tuple[float, float] | None = None,
+    counter: Counter | None = None,
+    digest: bool = True,
 ) -> Log:
     r"""Read a file, and check that it is a log.
 
     Parameters
     ----------
-    path, time, channels
+    path, time, channels, align, window_s, counter, digest
         As in `read_table`; channels are named as the plant's inputs and outputs, as a rule.
 
     Returns
@@ -142,7 +130,9 @@ def read_log(
     [0.1, 0.15]
 
     """
-    table = read_table(path, time=time, channels=channels)
+    table = read_table(
+        path, time=time, channels=channels, align=align, window_s=window_s, counter=counter, digest=digest
+    )
     for signal in table.signals.values():
         if not np.any(np.isfinite(signal.values)):
             raise LogError(f'{table.source}: column "{signal.origin.column}" holds no number; choose another column')
@@ -159,162 +149,115 @@ def write_log(log: Log, path: str | Path) -> Path:
     return write_text(path, pl.DataFrame(columns).write_csv())
 
 
-_TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit"})
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _time_column(source: Path, headers: list[str]) -> str:
-    """Return the one header that is named like a time."""
-    found = [header for header in headers if _bare(header).casefold() in _TIME_NAMES]
-    if len(found) != 1:
-        why = "no column is" if not found else f"{len(found)} columns are"
-        raise LogError(f"{source}: {why} named like a time; give time=, one of the columns: {', '.join(headers)}")
-    return found[0]
+def _window(given: tuple[float, float] | None) -> tuple[float, float] | None:
+    if given is not None and not (len(given) == 2 and given[0] < given[1]):
+        raise LogError(f"window_s = {given}: give (start, stop) with start before stop")
+    return given
 
 
-def _bare(header: str) -> str:
-    found = _BRACKETS.match(header)
-    return found["name"].strip() if found else header
+def _read(
+    chosen: Selection, window: tuple[float, float] | None, counter: Counter | None
+) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"], list[str]]:
+    """Return the channels in their files' units and the clock in seconds, and what was done."""
+    notes: list[str] = []
+    arrays: dict[str, Float[np.ndarray, " n"]] = {}
+    own = {name: channel for name, channel in chosen.channels.items() if channel.clock == chosen.clock}
+    extra = [counter.column] if counter is not None else []
+    columns, clock = _read_clock(chosen.clock, [channel.field.name for channel in own.values()] + extra, window)
+    if clock.size < 2:
+        span = f" in window_s = {window}" if window else ""
+        raise LogError(f"{chosen.clock.source.path}: too few samples ({clock.size}){span}; a log needs at least 2")
+    if counter is not None:
+        clock, note = counter.open_gaps(clock, columns[counter.column], str(chosen.clock.source.path))
+        notes.append(note)
+    arrays |= _one_each(own, columns)
+    others = [channel.clock for channel in chosen.channels.values() if channel.clock != chosen.clock]
+    for other in dict.fromkeys(others):
+        group = {name: channel for name, channel in chosen.channels.items() if channel.clock == other}
+        found, time = _read_clock(other, [channel.field.name for channel in group.values()], _wider(window, group))
+        check_clock(time, f'{other.source.path}: clock "{other.name}"')
+        for name, channel in group.items():
+            assert channel.rule is not None
+            arrays[name] = channel.rule(clock, time, found[channel.field.name])
+            notes.append(_aligned_note(name, channel, clock, time))
+    return arrays, clock, notes
 
 
-def _every_column(
-    source: Path, headers: list[str], delimiter: str, rows: str, clock: str, notes: list[str]
-) -> dict[str, Column]:
-    """Return a channel for every column whose first filled cell is a number; brackets that hold no unit are a name."""
-    table = _parse(source, "\n" + "\n".join(rows.splitlines()[:1000]), headers, delimiter, set(headers) - {clock})
-    numeric = [header for header in headers if header != clock and _is_numeric(table[header])]
-    skipped = [header for header in headers if header != clock and header not in numeric]
-    if skipped:
-        notes.append(f"columns that hold no numbers were left out: {', '.join(skipped)}")
-    if not all(_is_unit(header_unit(header)) for header in numeric):
-        notes.append("brackets in the headers that are no units were taken as names; no unit is known")
-        return {header: Column(column=header, unit="") for header in numeric}
-    bare = [_bare(header) for header in numeric]
+def _read_clock(
+    clock: Clock, names: list[str], window: tuple[float, float] | None
+) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
+    """Return columns that share a clock, and the clock in seconds, cut to the window."""
+    scale = factor(clock.unit, "s")
+    span = None
+    if window is not None:
+        start, stop = ((edge - clock.offset_s) / scale for edge in window)
+        slack = 1e-9 * max(abs(start), abs(stop))  # the exact cut is below, in seconds
+        span = Window(clock=clock.name, start=start - slack, stop=stop + slack)
+    columns = clock.source.read([clock.name, *names], span)
+    time = columns[clock.name] * scale if scale != 1.0 or clock.name in names else columns[clock.name]
+    if clock.offset_s:
+        time = time + clock.offset_s
+    if window is not None:
+        keep = (time >= window[0]) & (time <= window[1])
+        columns = {name: values[keep] for name, values in columns.items()}
+        time = time[keep]
+    return columns, time
+
+
+def _one_each(
+    group: Mapping[str, Channel], columns: dict[str, Float[np.ndarray, " n"]]
+) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return an array of its own for each channel: two channels of one column are converted apart."""
+    names = [channel.field.name for channel in group.values()]
     return {
-        name if bare.count(name) == 1 else header: Column(column=header, unit=header_unit(header) or "")
-        for name, header in zip(bare, numeric, strict=True)
+        name: columns[channel.field.name].copy() if names.count(channel.field.name) > 1 else columns[channel.field.name]
+        for name, channel in group.items()
     }
 
 
-def _is_numeric(cells: pl.Series) -> bool:
-    filled = [cell.strip() for cell in cells.drop_nulls() if cell.strip()]
-    try:
-        float(filled[0] if filled else "x")
-    except ValueError:
-        return False
-    return True
+def _wider(window: tuple[float, float] | None, group: Mapping[str, Channel]) -> tuple[float, float] | None:
+    """Return the window in which the rules may find neighbours."""
+    if window is None:
+        return None
+    margin = max(channel.rule.reach_s for channel in group.values() if channel.rule is not None)
+    return window[0] - margin, window[1] + margin
 
 
-def _is_unit(unit: str | None) -> bool:
-    if unit is None:
-        return True
-    try:
-        si_unit(unit)
-    except SeaoptError:
-        return False
-    return True
+def _aligned_note(name: str, channel: Channel, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> str:
+    """Say by which rule a channel came over, and how much of the log its clock does not reach."""
+    outside = int(np.sum(~((at >= time[0]) & (at <= time[-1]))))
+    text = f'{name}: brought from clock "{channel.clock.name}" by {channel.rule}'
+    if outside:
+        text += f"; {outside} of {at.size} samples lie outside its {time[0]:.6g} to {time[-1]:.6g} s and are missing"
+    return text
 
 
-def _signal(name: str, values: Float[np.ndarray, " n"], unit: str, path: str, digest: str, column: Column) -> Signal:
-    to = si_unit(unit)
-    origin = Origin(file=path, sha256=digest, column=column.column, conversion=f"{unit} to {to}" if unit != to else "")
-    return Signal(name=name, values=values * factor(unit, to), unit=to, origin=origin)
+def _signal(name: str, channel: Channel, values: Float[np.ndarray, " n"], clock: Clock, digest: str) -> Signal:
+    column, unit = channel.column, channel.unit
+    converted = column.to_si(values, unit, str(channel.source.path))
+    words = [text for text in (column.conversion(unit), "" if channel.clock == clock else str(channel.rule)) if text]
+    origin = Origin(
+        file=str(channel.source.path), sha256=digest, column=channel.field.name, conversion=", then ".join(words)
+    )
+    return Signal(name=name, values=converted, unit=si_unit(unit), origin=origin)
 
 
-def _as_column(given: str | Column) -> Column:
-    return given if isinstance(given, Column) else Column(column=given)
-
-
-def _read_text(source: Path) -> str:
-    if source.is_dir():
-        raise LogError(f"{source}: is a folder; give a CSV file")
-    try:
-        raw = source.read_bytes()
-    except FileNotFoundError as error:
-        raise LogError(f"{source}: no such file; check the path") from error
-    except OSError as error:
-        raise LogError(f"{source}: cannot be read ({error.strerror}); check the path") from error
-    if not raw.strip():
-        raise LogError(f"{source}: the file is empty; record the log again")
-    if b"\x00" in raw[:4096]:
-        raise LogError(f"{source}: is not a text file; save the log as CSV")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise LogError(f"{source}: is not UTF-8 text (byte {error.start}); save the log as UTF-8 CSV") from error
-
-
-def _headers(line: str) -> tuple[list[str], str]:
-    delimiter = max(",;\t", key=line.count)
-    return [cell.strip().strip('"') for cell in line.split(delimiter)], delimiter
-
-
-def _check_column(source: Path, name: str, column: str, headers: list[str]) -> None:
-    count = headers.count(column)
-    if count == 0:
-        raise LogError(f'{source}: no column "{column}" for {name}; {suggestion(column, headers)}')
-    if count > 1:
-        raise LogError(f'{source}: {count} columns are named "{column}"; rename all but one')
-
-
-def _unit_of(source: Path, column: Column) -> str:
-    unit = column.unit if column.unit is not None else header_unit(column.column)
-    if unit is None:
-        raise LogError(
-            f'{source}: column "{column.column}" has no unit; write it in the header\'s brackets, '
-            f'"{column.column} [unit]", or give it with the column'
-        )
-    return unit
-
-
-def _wrong_time_unit(source: Path, unit: str) -> SeaoptError | None:
-    try:
-        factor(unit, "s")
-    except SeaoptError as error:
-        return type(error)(f"{source}: time: {error}")
-    return None
-
-
-def _parse(source: Path, text: str, headers: list[str], delimiter: str, wanted: set[str]) -> pl.DataFrame:
-    """Return the wanted columns as text; what cannot be parsed is found cell by cell, to name it."""
-    import polars as pl
-
-    try:
-        return pl.read_csv(
-            io.StringIO(text),
-            has_header=False,
-            skip_rows=1,
-            separator=delimiter,
-            new_columns=[f"{index}:{name}" for index, name in enumerate(headers)],
-            columns=[index for index, name in enumerate(headers) if name in wanted],
-            schema_overrides=[pl.String] * len(headers),
-            truncate_ragged_lines=False,
-            raise_if_empty=False,
-        ).rename(lambda name: name.split(":", 1)[1])
-    except (pl.exceptions.PolarsError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise LogError(
-            f"{source}: cannot be read as CSV ({reason}); check that every row has the header's columns"
-        ) from error
-
-
-def _numbers(source: Path, table: pl.DataFrame, column: str) -> Float[np.ndarray, " n"]:
-    import polars as pl
-
-    text = table[column].str.strip_chars()
-    values = text.cast(pl.Float64, strict=False)
-    blank = text.is_null() | text.str.to_lowercase().is_in(["", "nan", "na"])
-    bad = (values.is_null() & ~blank).arg_true()
-    if len(bad):
-        row = int(bad[0])
-        comma = re.fullmatch(r"[-+]?\d+,\d+", str(text[row])) is not None
-        hint = ", or save the log with decimal points" if comma else ""
-        raise LogError(
-            f'{source}: line {row + 2}: "{text[row]}" in column "{column}" is not a number; correct it{hint}'
-        )
-    infinite = values.is_infinite().fill_null(value=False).arg_true()
-    if len(infinite):
-        row = int(infinite[0])
-        raise LogError(
-            f'{source}: line {row + 2}: "{text[row]}" in column "{column}" is not finite; leave the cell empty'
-        )
-    return values.fill_null(float("nan")).to_numpy().astype(float)
+def _remarks(signal: Signal) -> list[str]:
+    """Say what is odd about a channel at first sight."""
+    low, high = np.fmin.reduce(signal.values), np.fmax.reduce(signal.values)
+    if not np.isfinite(low):
+        return [f"{signal.name}: holds no number"]
+    if low == high:
+        return [f"{signal.name}: is constant at {low:.6g} {signal.unit}".rstrip()]
+    loss = Counter.suspect(signal.values)
+    if loss:
+        return [
+            f"{signal.name}: looks like a sample counter that misses {loss} sample{'s' if loss > 1 else ''}; to open "
+            f'gaps there, give counter=Counter(column="{signal.origin.column}", ...)'
+        ]
+    return []

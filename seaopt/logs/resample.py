@@ -5,45 +5,17 @@ Neither bridges a gap: the stretches between gaps keep their places, and the sam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
+from seaopt.logs.align import Hold, Linear, Nearest, Rule
 from seaopt.logs.clock import resolution
 from seaopt.logs.log import GAP, Log
 
 LEAST = 0.8  # of the log's rate; below it interpolation would fold what is above the new Nyquist frequency
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Linear:
-    """A line from each sample to the next; missing where either is."""
-
-    def values(
-        self, at: Float[np.ndarray, " m"], time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " m"]:
-        """Return the values at the times `at`, which lie within `time`."""
-        below = np.clip(np.searchsorted(time, at, side="right") - 1, 0, time.size - 2)
-        share = (at - time[below]) / (time[below + 1] - time[below])
-        line = values[below] + share * (values[below + 1] - values[below])
-        return np.where(share == 0.0, values[below], np.where(share == 1.0, values[below + 1], line))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Hold:
-    """The latest sample: for commands, and for what a device repeats until it knows better."""
-
-    def values(
-        self, at: Float[np.ndarray, " m"], time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " m"]:
-        """Return the values at the times `at`, which lie within `time`."""
-        return values[np.clip(np.searchsorted(time, at, side="right") - 1, 0, time.size - 1)]
-
-
-Rule = Linear | Hold
 
 
 def resample(log: Log, *, rate_hz: float, rule: Rule | None = None, bridge_s: float | None = None) -> Log:
@@ -55,7 +27,7 @@ def resample(log: Log, *, rate_hz: float, rule: Rule | None = None, bridge_s: fl
         Sampled with jitter, or at another rate.
     rate_hz : float
         Of the new clock, which starts at the log's first sample; at least 0.8 of the log's own rate.
-    rule : Linear or Hold, optional
+    rule : Linear, Hold or Nearest, optional
         Linear if left out. A line between samples is a low-pass filter: it takes 0.9 dB at a quarter of the sample
         rate and 3.9 dB at half.
     bridge_s : float, optional
@@ -76,12 +48,12 @@ def resample(log: Log, *, rate_hz: float, rule: Rule | None = None, bridge_s: fl
     >>> log = Log.from_arrays(time=[0.0, 0.11, 0.2, 0.29, 0.4], F1=[0.0, 1.1, 2.0, 2.9, 4.0])
     >>> even = log.resample(rate_hz=10)
     >>> even["F1"].round(9).tolist(), even.notes
-    ([0.0, 1.0, 2.0, 3.0, 4.0], ('resampled from 10 Hz to 10 Hz by lines between samples',))
+    ([0.0, 1.0, 2.0, 3.0, 4.0], ('resampled from 10 Hz to 10 Hz by Linear(max_gap_s=inf)',))
 
     """
     chosen = rule if rule is not None else Linear()
-    if not isinstance(chosen, Linear | Hold):
-        raise LogError(f"{log.source}: rule = {rule!r} is no rule; give Linear() or Hold()")
+    if not isinstance(chosen, Hold | Linear | Nearest):
+        raise LogError(f"{log.source}: rule = {rule!r} is no rule; give Linear(), Hold() or Nearest(tolerance_s=...)")
     if not 0.0 < rate_hz < np.inf:
         raise LogError(f"{log.source}: rate_hz = {rate_hz:g} is not positive; give the rate of the new clock")
     if rate_hz < LEAST * log.rate_hz:
@@ -99,11 +71,10 @@ def resample(log: Log, *, rate_hz: float, rule: Rule | None = None, bridge_s: fl
             continue
         grid.append(at)
         for name, parts in found.items():
-            parts.append(chosen.values(at, time, log[name][piece]))
+            parts.append(chosen(at, time, log[name][piece]))
     if not grid:
         raise LogError(f"{log.source}: no stretch without a gap holds 2 samples at {rate_hz:g} Hz; give bridge_s")
-    how = "lines between samples" if isinstance(chosen, Linear) else "holding each sample"
-    note = f"resampled from {log.rate_hz:.6g} Hz to {rate_hz:g} Hz by {how}"
+    note = f"resampled from {log.rate_hz:.6g} Hz to {rate_hz:g} Hz by {chosen}"
     return log.with_values(np.concatenate(grid), {name: np.concatenate(parts) for name, parts in found.items()}, note)
 
 

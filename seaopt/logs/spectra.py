@@ -112,11 +112,12 @@ class Hum:
     rms: float
 
 
-def hum(found: Spectra, name: str) -> Hum | None:
+def hum(found: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
     """Return the mains' lines of a channel, None where there are none or the stretches are too short to tell.
 
     A line stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median stretch: what comes and goes,
-    such as a chirp, does not count. Where other lines stand out as well it is a multisine.
+    such as a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines
+    stand out as well it is a multisine.
     """
     f = found.frequency_hz
     width = f[1] - f[0]
@@ -124,6 +125,8 @@ def hum(found: Spectra, name: str) -> Hum | None:
         return None
     square = np.abs(found.channels[name]) ** 2
     steady = np.median(square, axis=0)
+    others = [found.coherence(other, name) for other in inputs if other in found.channels and other != name]
+    own = 1.0 - np.max(others, axis=0) if others else np.ones(f.size)
     limit = LINE * (1.0 + 2.0 / np.sqrt(found.averages))
     for mains in MAINS_HZ:
         lines: list[tuple[float, float, float]] = []
@@ -133,7 +136,7 @@ def hum(found: Spectra, name: str) -> Hum | None:
                 break
             at = np.abs(f - line) <= max(0.5, width)
             floor = _floor(f, steady, line)
-            ratio = float(np.max(steady[at])) / max(floor, 1e-300)
+            ratio = float(np.max(steady[at] * own[at])) / max(floor, 1e-300)
             if k == 1 and (ratio < limit or _lines_beside(f, steady, line, limit) >= FAMILY):
                 break
             if ratio >= limit:
@@ -145,7 +148,7 @@ def hum(found: Spectra, name: str) -> Hum | None:
             return Hum(
                 mains_hz=mains,
                 lines_hz=tuple(item[0] for item in lines),
-                over_floor_db=tuple(round(item[1], 1) for item in lines),
+                over_floor_db=tuple(round(float(item[1]), 1) for item in lines),
                 rms=float(np.sqrt(2.0 * power / (0.375 * n**2))),
             )
     return None

@@ -245,9 +245,7 @@ def test_an_input_that_nothing_answers_to_is_a_warning():
 def test_a_counter_shows_lost_samples(data):
     def read(name):
         rows = np.genfromtxt(data / "formats" / "acqtools" / name, delimiter=",", skip_header=1, max_rows=27)
-        return Table(
-            time=1e-6 * rows[:, 0], signals={"msr": Signal(name="msr", values=rows[:, 1].copy())}, source=name
-        )
+        return Table(time=1e-6 * rows[:, 0], signals={"msr": Signal(name="msr", values=rows[:, 1].copy())}, source=name)
 
     lost = quality(read("Wmsr2_loss.csv"))
     gap = lost.of("gap")[0]

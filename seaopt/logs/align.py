@@ -1,0 +1,158 @@
+"""Channels of other clocks, brought to the log's clock by a declared rule; outside their span they are missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.errors import LogError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hold:
+    """The last sample at or before each instant: commands, switches, and what a controller saw.
+
+    Parameters
+    ----------
+    max_age_s : float
+        Older samples are not held.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Hold()(np.array([0.0, 1.0, 2.5, 3.1]), np.array([1.0, 3.0]), np.array([5.0, 7.0])).tolist()
+    [nan, 5.0, 5.0, nan]
+
+    """
+
+    max_age_s: float = np.inf
+
+    def __post_init__(self) -> None:
+        _positive("Hold", "max_age_s", self.max_age_s)
+
+    @property
+    def reach_s(self) -> float:
+        """How far from an instant the rule looks for samples."""
+        return self.max_age_s
+
+    def __call__(
+        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return the values at the instants `at`, NaN where the rule has none."""
+        before, _, inside = _neighbours(at, time)
+        return np.where(inside & (at - time[before] <= self.max_age_s), values[before], np.nan)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Linear:
+    """The straight line between the samples on either side: quantities that are smooth between samples.
+
+    Parameters
+    ----------
+    max_gap_s : float
+        Samples further apart than this are not joined.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Linear(max_gap_s=2)(np.array([1.5, 4.0]), np.array([1.0, 3.0, 6.0]), np.array([5.0, 7.0, 8.0])).tolist()
+    [5.5, nan]
+
+    """
+
+    max_gap_s: float = np.inf
+
+    def __post_init__(self) -> None:
+        _positive("Linear", "max_gap_s", self.max_gap_s)
+
+    @property
+    def reach_s(self) -> float:
+        """How far from an instant the rule looks for samples."""
+        return self.max_gap_s
+
+    def __call__(
+        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return the values at the instants `at`, NaN where the rule has none."""
+        before, after, inside = _neighbours(at, time)
+        step = time[after] - time[before]
+        weight = np.divide(at - time[before], step, out=np.zeros_like(at), where=step > 0)
+        # A sample that is met exactly needs no neighbour.
+        joined = np.where(weight > 0, (1 - weight) * values[before] + weight * values[after], values[before])
+        return np.where(inside & ((step <= self.max_gap_s) | (weight == 0)), joined, np.nan)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nearest:
+    """The sample nearest in time, if it is within the tolerance: clocks that tick together with a little jitter.
+
+    Parameters
+    ----------
+    tolerance_s : float
+        Further samples are not taken.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Nearest(tolerance_s=0.2)(np.array([1.1, 2.0]), np.array([1.0, 3.0]), np.array([5.0, 7.0])).tolist()
+    [5.0, nan]
+
+    """
+
+    tolerance_s: float
+
+    def __post_init__(self) -> None:
+        _positive("Nearest", "tolerance_s", self.tolerance_s)
+
+    @property
+    def reach_s(self) -> float:
+        """How far from an instant the rule looks for samples."""
+        return self.tolerance_s
+
+    def __call__(
+        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return the values at the instants `at`, NaN where the rule has none."""
+        before, after, inside = _neighbours(at, time)
+        best = np.where(time[after] - at < at - time[before], after, before)
+        return np.where(inside & (np.abs(time[best] - at) <= self.tolerance_s), values[best], np.nan)
+
+
+Rule = Hold | Linear | Nearest
+
+
+def check_clock(time: Float[np.ndarray, " m"], place: str) -> None:
+    """Refuse a clock that no rule can work on.
+
+    Raises
+    ------
+    LogError
+        It is empty, not a number somewhere, repeats or runs backwards.
+
+    """
+    if time.size == 0:
+        raise LogError(f"{place} holds no sample; choose another channel or window_s")
+    if not np.all(np.isfinite(time)):
+        row = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise LogError(f"{place} is not a number in sample {row + 1}; remove that row")
+    step = np.diff(time)
+    if np.any(step <= 0):
+        row = int(np.flatnonzero(step <= 0)[0]) + 1
+        how = "repeats" if step[row - 1] == 0 else "runs backwards"
+        raise LogError(f"{place} {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows")
+
+
+def _neighbours(
+    at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
+) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
+    """Return the samples on either side of each instant, and whether the instant lies in the clock's span."""
+    before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, time.size - 1)
+    after = np.minimum(before + 1, time.size - 1)
+    return before, after, (at >= time[0]) & (at <= time[-1])
+
+
+def _positive(rule: str, name: str, value: float) -> None:
+    if not value > 0:
+        raise LogError(f"{rule}: {name} = {value:g} must be above 0; give seconds")

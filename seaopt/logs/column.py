@@ -1,0 +1,125 @@
+"""A column of a file, and its declared way to SI."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+from seaopt.logs.align import Rule
+from seaopt.units import factor, si_unit
+
+_BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """A column of a file and the way from its numbers to SI: (value, wrapped, times scale, plus offset) in `unit`.
+
+    Parameters
+    ----------
+    column : str
+        Its header or path, as `contents` lists it.
+    unit : str, optional
+        Unit after scale and offset; where it is left out, the file's own.
+    scale, offset : float
+        Applied before the unit, in this order.
+    wrap_bits : int, optional
+        The numbers are unsigned integers of so many bits that stand for signed ones (two's complement).
+    file : path, optional
+        Which of several files; needed where more than one has the column.
+    time : str or Column, optional
+        The column's own clock, where it is not the log's.
+    clock_offset_s : float
+        Seconds to add to its own clock.
+    align : Hold, Linear or Nearest, optional
+        How it comes from its own clock to the log's.
+
+    Examples
+    --------
+    >>> Column(column="load", unit="-", wrap_bits=16, scale=1e-3).conversion("-")
+    "two's complement of 16 bits, times 0.001"
+
+    """
+
+    column: str
+    unit: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    wrap_bits: int | None = None
+    file: str | Path | None = None
+    time: str | Column | None = None
+    clock_offset_s: float = 0.0
+    align: Rule | None = None
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.scale) or self.scale == 0 or not np.isfinite(self.offset):
+            raise LogError(
+                f'column "{self.column}": scale = {self.scale:g}, offset = {self.offset:g}; give finite numbers, no '
+                "scale of 0"
+            )
+        if self.wrap_bits is not None and not 2 <= self.wrap_bits <= 53:
+            raise LogError(f'column "{self.column}": wrap_bits = {self.wrap_bits}; give 2 to 53, 16 for a uint16')
+        if not np.isfinite(self.clock_offset_s):
+            raise LogError(f'column "{self.column}": clock_offset_s = {self.clock_offset_s:g}; give seconds')
+
+    def to_si(self, values: Float[np.ndarray, " n"], unit: str, place: str) -> Float[np.ndarray, " n"]:
+        """Return the values in the SI unit of `unit`; the array given is used up."""
+        if self.wrap_bits is not None:
+            values = _wrapped(values, self.wrap_bits, f'{place}: column "{self.column}"')
+        for step in (self.scale, factor(unit, si_unit(unit))):
+            if step != 1.0:
+                values *= step
+            if step is self.scale and self.offset:
+                values += self.offset
+        return values
+
+    def conversion(self, unit: str) -> str:
+        """Return in words what `to_si` does."""
+        steps = [f"two's complement of {self.wrap_bits} bits"] if self.wrap_bits is not None else []
+        steps += [f"times {self.scale:g}"] if self.scale != 1 else []
+        steps += [f"plus {self.offset:g}"] if self.offset else []
+        steps += [f"{unit} to {si_unit(unit)}"] if factor(unit, si_unit(unit)) != 1 else []
+        return ", ".join(steps)
+
+
+def header_unit(header: str) -> str | None:
+    """Return the unit in a header's brackets, None where there is none.
+
+    Examples
+    --------
+    >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
+    ('N', 'usec', None)
+
+    """
+    found = _BRACKETS.match(header)
+    return found["unit"].strip() if found else None
+
+
+def bare_name(header: str) -> str:
+    """Return a header without its unit.
+
+    Examples
+    --------
+    >>> bare_name("F1 [N]"), bare_name("cur")
+    ('F1', 'cur')
+
+    """
+    found = _BRACKETS.match(header)
+    return found["name"].strip() or header if found else header
+
+
+def _wrapped(values: Float[np.ndarray, " n"], bits: int, where: str) -> Float[np.ndarray, " n"]:
+    """Return two's complement of unsigned integers."""
+    whole = 2.0**bits
+    good = np.isnan(values) | ((values >= 0) & (values < whole) & (values == np.floor(values)))
+    if not np.all(good):
+        row = int(np.flatnonzero(~good)[0])
+        raise LogError(
+            f"{where} is {values[row]:g} in sample {row + 1}, no unsigned integer of {bits} bits; correct wrap_bits"
+        )
+    return np.where(values >= whole / 2, values - whole, values)

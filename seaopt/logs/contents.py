@@ -1,0 +1,75 @@
+"""What is in a file: the first question to ask of a raw log."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+
+from seaopt.logs.formats import Field, open_source
+
+SHOWN = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """The columns of a file, without their data.
+
+    Parameters
+    ----------
+    path : str
+    format : str
+    fields : tuple of Field
+        Name, kind, length, unit and clock of each column; the name is what `Column(column=...)` takes.
+    notes : tuple of str
+        What was found besides.
+
+    """
+
+    path: str
+    format: str
+    fields: tuple[Field, ...]
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        rows = [("column", "kind", "samples", "unit", "clock")]
+        rows += [_row(item) for item in self.fields[:SHOWN]]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [f"{self.path}: {self.format}, {len(self.fields)} columns"]
+        lines += [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        ]
+        lines += [f"... and {len(self.fields) - SHOWN} more"] if len(self.fields) > SHOWN else []
+        return "\n".join([*lines, *self.notes])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def contents(path: str | Path) -> Contents:
+    r"""List what a file holds, whatever its format; no data are loaded.
+
+    Raises
+    ------
+    LogError
+        The file is missing, damaged, or of no known format.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "chirp.csv"
+    >>> _ = file.write_text("Zeit [ms];Strom [mA];Text\n0,0;100;a\n2,5;150;b\n")
+    >>> for field in contents(file).fields:
+    ...     print(field.name, field.kind, field.unit)
+    Zeit [ms] float64 ms
+    Strom [mA] float64 mA
+    Text text None
+
+    """
+    source = open_source(Path(path))
+    return Contents(path=str(path), format=source.format, fields=source.fields, notes=source.notes)
+
+
+def _row(item: Field) -> tuple[str, str, str, str, str]:
+    length = "" if item.length is None else str(item.length)
+    return item.name, item.kind, length, item.unit or "", item.clock or ""

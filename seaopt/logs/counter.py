@@ -1,0 +1,98 @@
+"""A column that counts samples shows which ones were lost, where the recorder numbers its rows all the same.
+
+Each count stands for a fixed number of samples. A count that was held shorter, or skipped, tells how many samples are
+missing; the recorder's time column does not, because it counts rows. The first and the last count may be cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.errors import LogError
+
+PROBE = 1000  # samples that must look like a counter before all are looked at
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counter:
+    """A declared sample counter.
+
+    Parameters
+    ----------
+    column : str
+        A whole number that rises by one every `samples_per_count` samples.
+    samples_per_count : int
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> time, note = Counter(column="n").open_gaps(np.array([0.0, 1.0, 2.0]), np.array([7.0, 8.0, 10.0]), "log.csv")
+    >>> time.tolist()
+    [0.0, 1.0, 3.0]
+
+    """
+
+    column: str
+    samples_per_count: int = 1
+
+    def __post_init__(self) -> None:
+        if self.samples_per_count < 1:
+            raise LogError(f"Counter: samples_per_count = {self.samples_per_count}; give a whole number from 1")
+
+    def open_gaps(
+        self, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], place: str
+    ) -> tuple[Float[np.ndarray, " n"], str]:
+        """Return time with the later samples moved by what was lost, and what was done.
+
+        Raises
+        ------
+        LogError
+            The column is no counter: not whole, or falling.
+
+        """
+        if not np.all(np.isfinite(values)) or np.any(values != np.floor(values)) or np.any(np.diff(values) < 0):
+            raise LogError(
+                f'{place}: counter "{self.column}" is not a whole number that only rises; choose another column'
+            )
+        starts, lost = _losses(values, self.samples_per_count)
+        total = int(lost.sum())
+        if not total:
+            return time, f'counter "{self.column}" shows no lost sample'
+        late = np.zeros(time.size)
+        late[starts] = lost
+        first = float(time[starts[np.flatnonzero(lost)[0]]])
+        moved = time + np.cumsum(late) * float(np.median(np.diff(time)))
+        plural = "s" if total > 1 else ""
+        return moved, (
+            f'counter "{self.column}" shows {total} lost sample{plural}, the first before t = {first:.6g} s; later '
+            "times were moved to open gaps"
+        )
+
+    @staticmethod
+    def suspect(values: Float[np.ndarray, " n"]) -> int:
+        """Return how many samples a column seems to miss, if it looks like a counter; 0 otherwise."""
+        for part in (values[:PROBE], values):
+            step = np.diff(part)
+            if part.size < 10 or not np.all((step >= 0) & (part[1:] == np.floor(part[1:]))):
+                return 0
+        runs = np.diff(np.flatnonzero(np.diff(values)))
+        if runs.size < 5:
+            return 0
+        usual = int(np.bincount(runs).argmax())
+        jumps = np.diff(values)[np.diff(values) > 0]
+        if np.mean(runs == usual) < 0.8 or np.mean(jumps == 1) < 0.8:
+            return 0
+        return int(_losses(values, usual)[1].sum())
+
+
+def _losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Return where each count but the first begins, and how many samples are missing before it."""
+    starts = np.flatnonzero(np.diff(values)) + 1
+    skipped = (np.diff(values)[starts - 1].astype(int) - 1) * each
+    held = np.diff(np.concatenate([[0], starts]))
+    short = np.maximum(each - held, 0)
+    short[:1] = 0  # the recording may begin within a count
+    return starts, skipped + short

@@ -1,0 +1,173 @@
+"""JSON: lines of objects, a list of them, one under "entries" with header fields beside it, or an object of lists."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+from seaopt.logs.column import header_unit
+from seaopt.logs.formats.layout import MAX_LINE
+from seaopt.logs.formats.source import MAX_PARTS, Field, Source, Window, one_line
+
+MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
+DEPTH = 32
+Record = Mapping[str, Any]
+
+
+def open_json(path: Path) -> Source:
+    """List the keys of a JSON log; nested objects become dotted paths, lists carry an index."""
+    columns, notes, length = _columns(path, None)
+    fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
+    return Source(path=path, format="JSON", fields=fields, load=partial(_load, path), notes=tuple(notes))
+
+
+def _columns(path: Path, _: None) -> tuple[dict[str, str], list[str], int]:
+    """Return each key with its kind, what the header says, and the number of entries."""
+    notes: list[str] = []
+    columns: dict[str, str] = {}
+    length = 0
+    for length, (_, record) in enumerate(_records(path, notes), start=1):  # noqa: B007
+        for name, value in _flat(record):
+            if value is not None and columns.get(name, "empty") == "empty":
+                columns[name] = "float64" if isinstance(value, int | float) else "text"
+            else:
+                columns.setdefault(name, "empty")
+    if not length:
+        raise LogError(f"{path}: holds no entries; record the log again")
+    return columns, notes, length
+
+
+def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+    columns: dict[str, list[float]] = {name: [] for name in names}
+    for place, record in _records(path, []):
+        row = dict(_flat(record))
+        for name, values in columns.items():
+            values.append(_number(path, place, name, row.get(name)))
+    return {name: np.array(values) for name, values in columns.items()}
+
+
+def _number(path: Path, place: str, name: str, value: Any) -> float:
+    if value is None:
+        return float("nan")
+    if not isinstance(value, int | float):
+        raise LogError(f'{path}: {place}: {json.dumps(value)[:60]} in "{name}" is not a number; correct it')
+    if value in (float("inf"), float("-inf")) or abs(value) > 1e308:
+        raise LogError(f'{path}: {place}: "{name}" is not finite; write null')
+    return float(value)
+
+
+def _records(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
+    """Return the entries with their places; of a header, a note."""
+    with path.open("rb") as stream:
+        first = _line(path, stream, 1)
+        if not _is_object(first):
+            yield from _whole(path, notes)
+            return
+        number = 1
+        while first:
+            if first.strip():
+                yield f"line {number}", _object(path, _parsed(path, first, number), f"line {number}")
+            number += 1
+            first = _line(path, stream, number)
+
+
+def _line(path: Path, stream: Any, number: int) -> bytes:
+    line = stream.readline(MAX_LINE + 1)
+    if len(line) > MAX_LINE and number > 1:
+        raise LogError(
+            f"{path}: line {number} is longer than {MAX_LINE >> 20} MiB; is it a log? write one entry a line"
+        )
+    return line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
+
+
+def _is_object(line: bytes) -> bool:
+    """Tell whether a line is one flat entry by itself, so that the file is JSON lines."""
+    if len(line) > MAX_LINE:
+        return False
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(found, dict) and not any(isinstance(item, list) and _is_long(item) for item in found.values())
+
+
+def _is_long(item: list[Any]) -> bool:
+    return len(item) > MAX_PARTS or any(isinstance(value, dict) for value in item[:1])
+
+
+def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
+    size = path.stat().st_size
+    if size > MAX_WHOLE:
+        raise LogError(f"{path}: is {size >> 20} MiB of JSON in one piece; save it as JSON lines, one entry a line")
+    content = _parsed(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
+    entries = content
+    if isinstance(content, dict):
+        entries = content.get("entries", _turned(path, content) if "entries" not in content else None)
+        header = [f"{key} = {value}" for key, value in content.items() if isinstance(value, str | int | float)]
+        if header:
+            notes.append(f"header: {', '.join(header)}"[:400])
+    if not isinstance(entries, list):
+        raise LogError(
+            f'{path}: holds no list of entries; write {{"entries": [{{"time": 0.0, ...}}, ...]}} or JSON lines'
+        )
+    for number, entry in enumerate(entries, start=1):
+        yield f"entry {number}", _object(path, entry, f"entry {number}")
+
+
+def _turned(path: Path, content: dict[str, Any]) -> list[Record] | None:
+    """Return the entries of an object of lists, one list a column."""
+    lists = {key: value for key, value in content.items() if isinstance(value, list)}
+    lengths = {len(value) for value in lists.values()}
+    if len(lengths) > 1:
+        shown = ", ".join(f"{key}: {len(value)}" for key, value in list(lists.items())[:10])
+        raise LogError(f"{path}: its lists differ in length ({shown}); write one value a sample in each")
+    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else None
+
+
+def _parsed(path: Path, text: bytes, line: int) -> Any:
+    try:
+        return json.loads(text, object_pairs_hook=partial(_unique, path))
+    except json.JSONDecodeError as error:
+        raise LogError(
+            f"{path}: line {line + error.lineno - 1}, column {error.colno}: is not valid JSON ({error.msg}); the file "
+            "may be cut off, correct that place"
+        ) from error
+    except RecursionError as error:
+        raise LogError(f"{path}: line {line}: is nested too deep; is it a log?") from error
+    except ValueError as error:  # bytes that are no text, integers of thousands of digits
+        raise LogError(f"{path}: line {line}: is not valid JSON ({one_line(error)}); correct that place") from error
+
+
+def _unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise LogError(f'{path}: {keys.count(twice)} keys of one entry are named "{twice}"; rename all but one')
+    return found
+
+
+def _object(path: Path, entry: Any, place: str) -> Record:
+    if not isinstance(entry, dict):
+        raise LogError(f"{path}: {place} is no object but {json.dumps(entry)[:40]}; write one with named values")
+    return entry
+
+
+def _flat(record: Record, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Return names and values; a list gives one name for each of its first elements."""
+    for key, value in record.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict) and depth < DEPTH:
+            yield from _flat(value, f"{name}.", depth + 1)
+        elif isinstance(value, list):
+            named = {f"{name}[{index}]": item for index, item in enumerate(value[:MAX_PARTS])}
+            yield from _flat(named, "", depth + 1) if depth < DEPTH else ()
+        else:
+            yield name, value

@@ -1,0 +1,257 @@
+"""How a text file is laid out: encoding, delimiter, decimal sign, banner, headers, units row, first line of data.
+
+Everything is read off the first lines: the delimiter is the one that cuts most cells into numbers, the data start at
+the first line of that width which is mostly numbers, and what stands above it is banner or header.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from seaopt.errors import LogError, SeaoptError
+from seaopt.logs.column import header_unit
+from seaopt.units import si_unit
+
+HEAD = 1 << 20  # bytes in which the data must begin
+MAX_LINE = 1 << 20
+SAMPLE = 200  # lines that decide on delimiter and decimal sign
+COMMENTS = ("#", "%", "//")
+BLANK = frozenset({"", "nan", "na", "n/a"})
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?inf(inity)?", re.IGNORECASE | re.ASCII)
+_DELIMITERS = ("\t", ";", "|", ",", " ")
+_BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """How a text file is laid out.
+
+    Parameters
+    ----------
+    encoding : str
+    delimiter : str
+        A space stands for any run of blanks.
+    comma : bool
+        Whether the decimal sign is a comma.
+    headers, units : tuple
+        One a column; an empty header belongs to no column.
+    numeric : tuple of bool
+        Whether the column's first filled cell is a number.
+    first : int
+        Lines above the data.
+    notes : tuple of str
+
+    """
+
+    encoding: str
+    delimiter: str
+    comma: bool
+    headers: tuple[str, ...]
+    units: tuple[str | None, ...]
+    numeric: tuple[bool, ...]
+    first: int
+    notes: tuple[str, ...]
+
+
+def layout(path: Path) -> Layout:
+    """Return the layout of a text file.
+
+    Raises
+    ------
+    LogError
+        The file is empty, is not text, has a line beyond 1 MiB, or no data below its header.
+
+    """
+    encoding, lines = _head(path)
+    filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not _is_comment(line)]
+    if not filled:
+        raise LogError(f"{path}: the file holds no data, only comments or blank lines; record the log again")
+    sample = [line for _, line in filled[-SAMPLE:]]
+    delimiter, comma = _delimiter(sample, filled[0][1])
+    width = Counter(len(cells(line, delimiter)) for line in sample).most_common(1)[0][0]
+    first = next((at for at, line in filled if _is_data(line, delimiter, comma, width)), None)
+    if first is None:  # the header is the first line, and text stands in every row below it
+        first = filled[1][0] if len(filled) > 1 else len(lines)
+    if first >= len(lines):
+        raise LogError(f"{path}: 0 rows below the header; record the log again")
+    rows = [cells(line, delimiter) for at, line in filled if at >= first]
+    headers, units, notes = _headers(path, lines[:first], delimiter, width, rows)
+    numeric = tuple(_is_numeric(rows, index, comma) for index in range(len(headers)))
+    if comma:
+        notes.append("the decimal sign is a comma")
+    return Layout(
+        encoding=encoding, delimiter=delimiter, comma=comma, headers=tuple(headers), units=tuple(units),
+        numeric=numeric, first=first, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def cells(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line, stripped."""
+    if delimiter == " ":
+        return line.split()
+    if '"' in line:
+        line_cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+        return [cell.strip() for cell in line_cells]
+    return [cell.strip() for cell in line.split(delimiter)]
+
+
+def is_number(cell: str, comma: bool) -> bool:
+    """Tell whether a cell is a number, or infinite."""
+    return _NUMBER.fullmatch(cell.replace(",", ".", 1) if comma else cell) is not None
+
+
+def _head(path: Path) -> tuple[str, list[str]]:
+    """Return the encoding and the lines of the first MiB, the last one only if it is whole."""
+    with path.open("rb") as stream:
+        raw = stream.read(HEAD)
+    if not raw.strip(b" \t\r\n\x1a\x00"):
+        raise LogError(f"{path}: the file is empty; record the log again")
+    encoding = next((name for bom, name in _BOMS if raw.startswith(bom)), "utf-8")
+    if encoding != "utf-16" and b"\x00" in raw[:4096]:
+        raise LogError(f"{path}: is not a text file; save the log as CSV")
+    try:
+        text = codecs.getincrementaldecoder(encoding)().decode(raw, final=len(raw) < HEAD)
+    except UnicodeError as error:
+        raise not_text(path, encoding, error) from error
+    whole = len(raw) < HEAD
+    lines = text.rstrip("\x1a" if whole else "").split("\n")
+    if not whole:
+        lines.pop()
+    if not lines or max(map(len, lines)) > MAX_LINE:
+        raise too_long(path, 1)
+    if len(lines) <= 1 and "\r" in text.rstrip("\r\n"):
+        raise LogError(f"{path}: its lines end in CR alone; save it with LF line ends")
+    return encoding, [line.rstrip("\r") for line in lines]
+
+
+def not_text(path: Path, encoding: str, error: UnicodeError) -> LogError:
+    """Return the error of a byte that is no text."""
+    name = "UTF-16" if encoding == "utf-16" else "UTF-8"
+    at = f"byte {error.start}" if isinstance(error, UnicodeDecodeError) else "no text"
+    return LogError(f"{path}: is not {name} text ({at}); save the log as UTF-8 CSV")
+
+
+def too_long(path: Path, line: int) -> LogError:
+    """Return the error of a line that no log has."""
+    return LogError(f"{path}: line {line} is longer than {MAX_LINE >> 20} MiB; is it a log? save one row a line")
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(COMMENTS)
+
+
+def _delimiter(sample: list[str], header: str) -> tuple[str, bool]:
+    """Return the delimiter and decimal sign that make most cells numbers."""
+    best = max(
+        ((_score(sample, delimiter, comma), delimiter, comma) for delimiter in _DELIMITERS
+         for comma in ((False,) if delimiter == "," else (False, True))),
+        key=lambda item: item[0],
+    )  # fmt: skip
+    return (best[1], best[2]) if best[0] > 0 else (max(",;\t|", key=header.count), False)
+
+
+def _score(sample: list[str], delimiter: str, comma: bool) -> float:
+    rows = [cells(line, delimiter) for line in sample]
+    width, count = Counter(map(len, rows)).most_common(1)[0]
+    if width < 2:
+        return 0.0
+    filled = [cell for row in rows for cell in row if cell.casefold() not in BLANK]
+    numbers = sum(is_number(cell, comma) for cell in filled)
+    # A point is read either way; a comma only where it occurs.
+    bonus = 1e-6 if comma == any("," in cell for cell in filled if is_number(cell, comma)) else 0.0
+    return (count / len(rows)) * numbers / max(len(filled), 1) + (bonus if numbers else 0.0)
+
+
+def _is_data(line: str, delimiter: str, comma: bool, width: int) -> bool:
+    row = [cell for cell in cells(line, delimiter) if cell.casefold() not in BLANK]
+    numbers = sum(is_number(cell, comma) for cell in row)
+    return len(cells(line, delimiter)) == width and numbers > 0 and 2 * numbers >= len(row)
+
+
+def _is_numeric(rows: list[list[str]], index: int, comma: bool) -> bool:
+    """Tell whether a column's first filled cell is a number; a column that starts empty may still hold some."""
+    for row in rows:
+        if index < len(row) and row[index].casefold() not in BLANK:
+            return is_number(row[index], comma)
+    return True
+
+
+def _headers(
+    path: Path, above: list[str], delimiter: str, width: int, rows: list[list[str]]
+) -> tuple[list[str], list[str | None], list[str]]:
+    """Return header and unit of each column, and what was found above the data."""
+    notes: list[str] = []
+    candidates = [(at, _header_cells(line, delimiter)) for at, line in enumerate(above) if line.strip()]
+    table = [(at, row) for at, row in candidates if not _is_comment(above[at])]
+    found = [(at, row) for at, row in table if _fits(row, width, rows) and sum(map(bool, row)) > min(1, width - 1)]
+    if not found and table:  # a lone line above the data is the header, whatever its width
+        at, row = table[-1]
+        raise LogError(
+            f"{path}: cannot be read as CSV (line {at + 1} has {len(row)} columns and the rows below have {width}); "
+            "check that every row has the header's columns, and that a decimal comma is not the delimiter as well"
+        )
+    if not found:
+        found = [(at, row) for at, row in candidates if len(row) == width][-1:]
+    skipped = len(candidates) - len(found)
+    if skipped:
+        notes.append(f"{skipped} line{'s' if skipped > 1 else ''} above the header passed over")
+    if not found:
+        notes.append("no header was found; columns are numbered from 1")
+        return [f"column {index + 1}" for index in range(width)], [None] * width, notes
+    units: list[str | None] = [None] * width
+    if len(found) > 1 and _is_units_row(found[-1][1]):
+        notes.append(f"line {found[-1][0] + 1} was read as the units")
+        units = [_bare_unit(cell) for cell in _padded(found.pop()[1], width)]
+    if len(found) > 1:
+        notes.append(f"{len(found)} header lines were joined")
+    names = zip(*(_padded(row, width) for _, row in found), strict=True)
+    headers = [" ".join(cell for cell in column if cell) for column in names]
+    return headers, [unit or header_unit(name) for unit, name in zip(units, headers, strict=True)], notes
+
+
+def _header_cells(line: str, delimiter: str) -> list[str]:
+    if _is_comment(line):
+        line = line.lstrip().lstrip("#%/").strip()
+    if delimiter != " ":
+        return cells(line, delimiter)
+    joined: list[str] = []  # "time [s]" is one header
+    for token in line.split():
+        if joined and token[0] in "[(":
+            joined[-1] += f" {token}"
+        else:
+            joined.append(token)
+    return joined
+
+
+def _fits(row: list[str], width: int, rows: list[list[str]]) -> bool:
+    """Tell whether a line can be the header: as wide as the data, but for cells that are empty in every row."""
+    if len(row) >= width:
+        return not any(row[width:]) or all(len(data) <= len(row) for data in rows)
+    return len(row) > 0 and not any(cell for data in rows for cell in data[len(row) :])
+
+
+def _padded(row: list[str], width: int) -> list[str]:
+    return (row + [""] * width)[:width]
+
+
+def _bare_unit(cell: str) -> str | None:
+    return cell.strip("[]() ") or None
+
+
+def _is_units_row(row: list[str]) -> bool:
+    filled = [unit for cell in row if (unit := _bare_unit(cell))]
+    return bool(filled) and all(is_unit(unit) for unit in filled)
+
+
+def is_unit(text: str) -> bool:
+    """Tell whether a text is a unit."""
+    try:
+        si_unit(text)
+    except SeaoptError:
+        return False
+    return True

@@ -1,0 +1,58 @@
+"""Parquet: columns and row groups are read as they are needed (polars)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.logs.column import header_unit
+from seaopt.logs.formats.source import Field, Source, Window
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+def open_parquet(path: Path) -> Source:
+    """List the columns of a Parquet file."""
+    import polars as pl
+
+    frame = pl.scan_parquet(path, glob=False)
+    length = int(frame.select(pl.len()).collect().item())
+    fields = tuple(_field(name, dtype, length) for name, dtype in frame.collect_schema().items())
+    return Source(path=path, format="Parquet", fields=fields, load=partial(_load, path))
+
+
+def _field(name: str, dtype: pl.DataType, length: int) -> Field:
+    if dtype.is_temporal():  # seconds, counted from 1970 or from zero
+        known = str(dtype).startswith(("Datetime", "Duration"))
+        return Field(name=name, kind="float64" if known else str(dtype), length=length, unit="s")
+    kind = "bool" if str(dtype) == "Boolean" else str(dtype).lower()
+    return Field(name=name, kind=kind, length=length, unit=header_unit(name))
+
+
+def _load(path: Path, names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+    import polars as pl
+
+    frame = pl.scan_parquet(path, glob=False)
+    schema = frame.collect_schema()
+    if window is not None:
+        clock = _number(window.clock, schema[window.clock])
+        frame = frame.filter(clock.is_between(window.start, window.stop))
+    found = frame.select(_number(name, schema[name]).alias(name) for name in names).collect()
+    return {name: np.array(found[name].to_numpy(), dtype=float) for name in names}
+
+
+def _number(name: str, dtype: Any) -> pl.Expr:
+    import polars as pl
+
+    column = pl.col(name)
+    if str(dtype).startswith("Datetime"):
+        return column.dt.timestamp("us").cast(pl.Float64) * 1e-6
+    if str(dtype).startswith("Duration"):
+        return column.dt.total_nanoseconds().cast(pl.Float64) * 1e-9
+    return column if dtype.is_numeric() and not dtype.is_decimal() else column.cast(pl.Float64)

@@ -1,0 +1,230 @@
+"""What every format gives: the fields of a file without their data, and the data of chosen fields."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError, SeaoptError
+
+# What one file may unfold to in memory: archives are checked before they are unpacked.
+MAX_UNPACKED = 8 << 30
+_NUMBERS = re.compile(r"bool|u?int\d+|float\d+")
+MAX_FIELDS = 100_000
+MAX_PARTS = 256  # columns of one matrix, or elements of one array, that get a name each
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Field:
+    """One column of a file.
+
+    Parameters
+    ----------
+    name : str
+        Its header or path, as `Column(column=...)` takes it.
+    kind : str
+        Type of its numbers, such as "float64"; "text" or another word where it holds no numbers.
+    length : int or None
+        Samples; None where the format tells it only on reading.
+    unit : str or None
+        As the file says it.
+    clock : str or None
+        Name of the field that is its clock, where the format says so.
+    remedy : str
+        What to do where it holds no numbers.
+
+    """
+
+    name: str
+    kind: str
+    length: int | None
+    unit: str | None = None
+    clock: str | None = None
+    remedy: str = "choose another column"
+
+    @property
+    def numeric(self) -> bool:
+        """Whether it holds numbers."""
+        return _NUMBERS.fullmatch(self.kind) is not None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """Samples of which the clock lies between start and stop, both in the clock's own unit."""
+
+    clock: str
+    start: float
+    stop: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A file that has been opened and listed.
+
+    Parameters
+    ----------
+    path : Path
+    format : str
+        Its name, for messages.
+    fields : tuple of Field
+    load : function of (names, window)
+        Returns float arrays by name, for fields that share a clock. With a window it may return more samples than lie
+        in it, but the same ones for every name.
+    notes : tuple of str
+        What was found on listing.
+
+    """
+
+    path: Path
+    format: str
+    fields: tuple[Field, ...]
+    load: Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]
+    notes: tuple[str, ...] = ()
+
+    def read(self, names: Sequence[str], window: Window | None = None) -> dict[str, Float[np.ndarray, " _"]]:
+        """Return the data of fields that share a clock.
+
+        Raises
+        ------
+        LogError
+            The file is damaged, or a cell is not a number.
+
+        """
+        with reading(self.path, self.format):
+            return self.load(list(dict.fromkeys(names)), window)
+
+
+def by_rows(
+    load: Callable[[str, slice], Any],
+) -> Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]:
+    """Return the `load` of a source whose fields can be read by name and rows."""
+
+    def rows_loaded(names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " _"]]:
+        def one(name: str, rows: slice) -> Float[np.ndarray, " _"]:
+            return np.array(load(name, rows), dtype=float).reshape(-1)
+
+        rows = slice(None) if window is None else rows_of(one(window.clock, slice(None)), window)
+        return {name: one(name, rows) for name in names}
+
+    return rows_loaded
+
+
+def rows_of(clock: Float[np.ndarray, " n"], window: Window) -> slice:
+    """Return the rows from the first to the last sample inside the window."""
+    inside = np.flatnonzero((clock >= window.start) & (clock <= window.stop))
+    return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """Where a field's samples are: an array, and one row or column of it (all of it where `index` is None)."""
+
+    array: str
+    index: int | None = None
+    axis: int = 1
+
+    def cut(self, rows: slice) -> tuple[slice | int, ...]:
+        """Return what to index the array with."""
+        if self.index is None:
+            return (rows,)
+        return (rows, self.index) if self.axis == 1 else (self.index, rows)
+
+
+def spread(
+    name: str, shape: Sequence[int], kind: str, *, matlab: bool = False, unit: str | None = None
+) -> list[tuple[Field, Place]]:
+    """Return the fields of one array: a vector is one, a matrix one for each column (or row, if it has fewer of them).
+
+    Examples
+    --------
+    >>> [field.name for field, _ in spread("x", (100, 2), "float64")], [f.name for f, _ in spread("x", (2, 9), "int8")]
+    (['x[:,0]', 'x[:,1]'], ['x[0,:]', 'x[1,:]'])
+    >>> [field.name for field, _ in spread("x", (100, 2), "float64", matlab=True)]
+    ['x(:,1)', 'x(:,2)']
+
+    """
+    sizes = [int(size) for size in shape]
+    long = [size for size in sizes if size != 1]
+    if len(long) <= 1 and len(sizes) <= 2:
+        length = long[0] if long else 1
+        axis = 0 if len(sizes) == 2 and sizes[0] == 1 else 1
+        place = Place(array=name) if len(sizes) < 2 else Place(array=name, index=0, axis=axis)
+        return [(Field(name=name, kind=kind, length=length, unit=unit), place)]
+    if len(sizes) != 2 or min(sizes) > MAX_PARTS:
+        return [(Field(name=name, kind=f"{kind} array of {'x'.join(map(str, sizes))}", length=None), Place(array=name))]
+    axis = 1 if sizes[1] <= sizes[0] else 0
+    shown = "({})" if matlab else "[{}]"
+    out: list[tuple[Field, Place]] = []
+    for index in range(sizes[axis]):
+        number = str(index + 1 if matlab else index)
+        label = name + shown.format(f":,{number}" if axis == 1 else f"{number},:")
+        place = Place(array=name, index=index, axis=axis)
+        out.append((Field(name=label, kind=kind, length=sizes[1 - axis], unit=unit), place))
+    return out
+
+
+@contextmanager
+def reading(path: Path, form: str) -> Iterator[None]:
+    """Turn whatever a library raises on a damaged file into one line, and keep its warnings to ourselves."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except SeaoptError:
+        raise
+    except MemoryError as error:
+        raise LogError(f"{path}: does not fit in memory as {form}; read fewer columns or a shorter window_s") from error
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise  # an interrupt; a panic of polars is no Exception, but a damaged file all the same
+        raise LogError(
+            f"{path}: cannot be read as {form} ({one_line(error)}); the file may be cut off or damaged, copy or record "
+            "it again"
+        ) from error
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's text on one short line."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else text[:157] + "..."
+
+
+def optional(module: str, extra: str, path: Path, form: str) -> Any:
+    """Import an optional library.
+
+    Raises
+    ------
+    LogError
+        It is not installed; the message names the extra.
+
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return import_module(module)
+    except ImportError as error:
+        raise LogError(f"{path}: reading {form} needs an extra library; pip install 'seaopt[{extra}]'") from error
+
+
+def check_size(path: Path, size: int, what: str) -> None:
+    """Refuse what would unfold beyond the limit."""
+    if size > MAX_UNPACKED:
+        raise LogError(
+            f"{path}: {what} unpacks to {size / 2**30:.1f} GiB, more than {MAX_UNPACKED >> 30} GiB; cut the file into "
+            "shorter ones"
+        )
+
+
+def check_count(path: Path, fields: Sequence[Field] | Mapping[str, Any]) -> None:
+    """Refuse a file of absurdly many fields."""
+    if len(fields) > MAX_FIELDS:
+        raise LogError(f"{path}: holds more than {MAX_FIELDS} columns; is it a log?")

@@ -1,0 +1,187 @@
+"""CSV and other delimited text, parsed by polars in blocks of whole lines.
+
+A block is parsed to floats at once; only where that fails is it parsed as text, and only where a cell is no number is
+it walked line by line, to name that cell. Memory holds the wanted columns and one block.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+from seaopt.logs.formats.layout import BLANK, MAX_LINE, Layout, cells, is_number, layout, not_text, too_long
+from seaopt.logs.formats.source import Field, Source, Window, one_line
+
+if TYPE_CHECKING:
+    import polars as pl
+
+BLOCK = 8 << 20
+_RUNS = re.compile(rb"[ \t]+")
+_BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
+
+
+def open_text(path: Path) -> Source:
+    """List a text file's columns."""
+    form = layout(path)
+    fields = tuple(
+        Field(name=name, kind="float64" if numeric else "text", length=None, unit=unit)
+        for name, unit, numeric in zip(form.headers, form.units, form.numeric, strict=True)
+        if name
+    )
+    return Source(path=path, format="CSV", fields=fields, load=partial(_load, path, form), notes=form.notes)
+
+
+def _load(path: Path, form: Layout, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return columns by header; text has no index, so a window reads it whole."""
+    index = {name: form.headers.index(name) for name in names}
+    columns = _Columns(names)
+    size = path.stat().st_size
+    try:
+        for line, block in _blocks(path, form):
+            columns.add(_parse(path, form, block, index, line), size / len(block))
+    except UnicodeError as error:
+        raise not_text(path, form.encoding, error) from error
+    return columns.whole()
+
+
+class _Columns:
+    """Arrays that grow block by block, sized by the first block so that they are rarely moved."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.rows = 0
+        self.arrays: dict[str, np.ndarray] = {name: np.empty(0) for name in names}
+
+    def add(self, parsed: dict[str, Float[np.ndarray, " n"]], blocks: float) -> None:
+        count = next(iter(parsed.values())).size
+        stop = self.rows + count
+        for name, values in parsed.items():
+            array = self.arrays[name]
+            if stop > array.size:
+                array.resize(int(max(stop * 1.25, count * blocks * 1.02)), refcheck=False)
+            array[self.rows : stop] = values
+        self.rows = stop
+
+    def whole(self) -> dict[str, Float[np.ndarray, " n"]]:
+        for array in self.arrays.values():
+            array.resize(self.rows, refcheck=False)
+        return self.arrays
+
+
+def _blocks(path: Path, form: Layout) -> Iterator[tuple[int, bytes]]:
+    """Return blocks of whole lines as UTF-8, each with the number of its first line."""
+    line = 1
+    with _opened(path, form.encoding) as stream:
+        for _ in range(form.first):
+            stream.readline()
+        line += form.first
+        while part := stream.read(BLOCK):
+            rest = stream.readline(MAX_LINE + 1)
+            block = part + rest if isinstance(part, bytes) else (part + rest).encode()
+            _check_lines(path, block, line)
+            if len(part) < BLOCK:  # the last one may end in blank lines, and in the end-of-file mark of DOS
+                block = block.rstrip(b"\x1a \t\r\n") + b"\n"
+            if block.strip():
+                yield line, block
+            line += block.count(b"\n")
+
+
+def _opened(path: Path, encoding: str) -> IO[Any]:
+    if encoding == "utf-16":
+        return path.open(encoding=encoding, newline="\n")
+    return path.open("rb")
+
+
+def _check_lines(path: Path, block: bytes, line: int) -> None:
+    start = 0
+    while len(block) - start > MAX_LINE:
+        end = block.rfind(b"\n", start, start + MAX_LINE)
+        if end < start:
+            raise too_long(path, line + block.count(b"\n", 0, start))
+        start = end + 1
+
+
+def _parse(path: Path, form: Layout, block: bytes, index: dict[str, int], line: int) -> dict[str, Any]:
+    import polars as pl
+
+    gaps = b"\n\n" in block or b"\n\r\n" in block or block[:1] in b"\r\n"
+    clean = _BLANK_LINES.sub(b"", block) if gaps else block
+    if form.delimiter == " ":
+        clean = re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", clean))
+    try:
+        frame = _frame(clean, form, index, pl.Float64)
+    except (pl.exceptions.PolarsError, ValueError):
+        return _parse_text(path, form, block, clean, index, line)
+    parsed = {name: frame[f"column_{at}"].to_numpy() for name, at in index.items()}
+    if any(np.isinf(values).any() for values in parsed.values()):
+        raise _bad_cell(path, form, block, index, line, "a cell is infinite")
+    return parsed
+
+
+def _frame(block: bytes, form: Layout, index: dict[str, int], kind: Any) -> pl.DataFrame:
+    import polars as pl
+
+    wanted = set(index.values())
+    schema = {f"column_{at}": kind if at in wanted else pl.String for at in range(len(form.headers))}
+    return pl.read_csv(
+        block,
+        has_header=False,
+        separator="\t" if form.delimiter == " " else form.delimiter,
+        schema=schema,
+        columns=[f"column_{at}" for at in sorted(wanted)],
+        decimal_comma=form.comma,
+        missing_columns="insert",
+        extra_columns="raise",
+        null_values=["NA", "na", "N/A", "n/a"],
+    )
+
+
+def _parse_text(
+    path: Path, form: Layout, block: bytes, clean: bytes, index: dict[str, int], line: int
+) -> dict[str, Any]:
+    """Parse cells with blanks around their numbers; what is still no number is named."""
+    import polars as pl
+
+    try:
+        frame = _frame(clean, form, index, pl.String)
+    except (pl.exceptions.PolarsError, ValueError) as error:
+        raise _bad_cell(path, form, block, index, line, one_line(error)) from error
+    parsed: dict[str, Any] = {}
+    for name, at in index.items():
+        text = frame[f"column_{at}"].str.strip_chars()
+        values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
+        blank = text.is_null() | text.str.to_lowercase().is_in(list(BLANK))
+        if (values.is_null() & ~blank).any() or values.is_infinite().any():
+            raise _bad_cell(path, form, block, index, line, "a cell is no number")
+        parsed[name] = values.to_numpy()
+    return parsed
+
+
+def _bad_cell(path: Path, form: Layout, block: bytes, index: dict[str, int], line: int, reason: str) -> LogError:
+    """Return the error that names the first cell, or row, that cannot be read."""
+    for number, text in enumerate(block.decode().split("\n"), start=line):
+        row = cells(text.rstrip("\r"), form.delimiter) if text.strip() else []
+        if len(row) > len(form.headers):
+            return LogError(
+                f"{path}: cannot be read as CSV (line {number} has {len(row)} columns and the header "
+                f"{len(form.headers)}); check that every row has the header's columns"
+            )
+        for name, at in index.items():
+            cell = row[at] if at < len(row) else ""
+            if cell.casefold() in BLANK:
+                continue
+            where = f'{path}: line {number}: "{cell[:60]}" in column "{name}"'
+            if "inf" in cell.casefold() and is_number(cell, form.comma):
+                return LogError(f"{where} is not finite; leave the cell empty")
+            if not is_number(cell, form.comma):
+                decimal = re.fullmatch(r"[-+]?\d+,\d+", cell) is not None
+                return LogError(
+                    f"{where} is not a number; correct it{', or save the log with decimal points' if decimal else ''}"
+                )
+    return LogError(f"{path}: cannot be read as CSV ({reason}); check that every row has the header's columns")
