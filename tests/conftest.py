@@ -23,6 +23,7 @@ CHOICES = (
     ("fixed", "mass", "pendulum"),
     ("zero", "first"),
     ("split", "error"),
+    ("auto", "declared", "none"),
     ("pd", "pid"),
     ("error", "measurement"),
     ("disturbance", "noise"),
