@@ -23,20 +23,22 @@ Record = Mapping[str, Any]
 
 def open_json(path: Path) -> Source:
     """List the keys of a JSON log; nested objects become dotted paths, lists carry an index."""
-    columns, notes, length = _columns(path, None)
-    fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
+    columns, notes, length = _columns(path)
+    fields = tuple(
+        Field(name=name, kind=found, length=length, unit=header_unit(name)) for name, found in columns.items()
+    )
     return Source(path=path, format="JSON", fields=fields, load=partial(_load, path), notes=tuple(notes))
 
 
-def _columns(path: Path, _: None) -> tuple[dict[str, str], list[str], int]:
+def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
     """Return each key with its kind, what the header says, and the number of entries."""
     notes: list[str] = []
     columns: dict[str, str] = {}
     length = 0
     for length, (_, record) in enumerate(_records(path, notes), start=1):  # noqa: B007
-        for name, value in _flat(record):
+        for name, value in flat(record):
             if value is not None and columns.get(name, "empty") == "empty":
-                columns[name] = "float64" if isinstance(value, int | float) else "text"
+                columns[name] = kind(value)
             else:
                 columns.setdefault(name, "empty")
     if not length:
@@ -47,10 +49,15 @@ def _columns(path: Path, _: None) -> tuple[dict[str, str], list[str], int]:
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     columns: dict[str, list[float]] = {name: [] for name in names}
     for place, record in _records(path, []):
-        row = dict(_flat(record))
+        row = dict(flat(record))
         for name, values in columns.items():
             values.append(_number(path, place, name, row.get(name)))
     return {name: np.array(values) for name, values in columns.items()}
+
+
+def kind(value: Any) -> str:
+    """Return the kind of a JSON value."""
+    return "bool" if isinstance(value, bool) else "float64" if isinstance(value, int | float) else "text"
 
 
 def _number(path: Path, place: str, name: str, value: Any) -> float:
@@ -160,14 +167,14 @@ def _object(path: Path, entry: Any, place: str) -> Record:
     return entry
 
 
-def _flat(record: Record, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+def flat(record: Record, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
     """Return names and values; a list gives one name for each of its first elements."""
     for key, value in record.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict) and depth < DEPTH:
-            yield from _flat(value, f"{name}.", depth + 1)
+            yield from flat(value, f"{name}.", depth + 1)
         elif isinstance(value, list):
             named = {f"{name}[{index}]": item for index, item in enumerate(value[:MAX_PARTS])}
-            yield from _flat(named, "", depth + 1) if depth < DEPTH else ()
+            yield from flat(named, "", depth + 1) if depth < DEPTH else ()
         else:
             yield name, value

@@ -28,7 +28,7 @@ COMPRESSED, MATRIX = 15, 14
 CELL, STRUCT, OBJECT_CLASS, CHAR, SPARSE, OPAQUE = 1, 2, 3, 4, 5, 17
 NUMBERS = {6: "float64", 7: "float32", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32", 13: "uint32",
            14: "int64", 15: "uint64"}  # fmt: skip
-WORDS = {CELL: "a cell array", OBJECT_CLASS: OBJECT, CHAR: "text", SPARSE: "a sparse matrix", 16: "a function"}  # fmt: skip
+WORDS = {CELL: "a cell array", OBJECT_CLASS: OBJECT, CHAR: "text", SPARSE: "a sparse matrix", 16: "a function"}
 COMPLEX, LOGICAL = 0x08, 0x02
 
 

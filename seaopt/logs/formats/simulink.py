@@ -37,7 +37,8 @@ def clocked(fields: Sequence[Field]) -> list[Field]:
 
 def opaque(name: str, owner: str) -> Field:
     """Return the field of a MATLAB object, which only MATLAB decodes; a timeseries is saved as a struct there."""
-    remedy = f"only MATLAB decodes it: there, s.time = {name}.Time; s.signals.values = {name}.Data; save('log.mat', 's', '-v7')"
+    code = f"s.time = {name}.Time; s.signals.values = {name}.Data; save('log.mat', 's', '-v7')"
+    remedy = f"only MATLAB decodes it; save a timeseries there by {code}"
     return Field(name=name, kind=f"{OBJECT} ({owner})" if owner else OBJECT, length=None, remedy=remedy)
 
 

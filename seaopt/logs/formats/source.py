@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -173,7 +173,7 @@ def spread(
 
 
 @contextmanager
-def reading(path: Path, form: str) -> Iterator[None]:
+def reading(path: Path, form: str) -> Generator[None]:
     """Turn whatever a library raises on a damaged file into one line, and keep its warnings to ourselves."""
     try:
         with warnings.catch_warnings():

@@ -1,0 +1,92 @@
+"""ASAM MDF 4 files (asammdf): the master of each group is its clock; formulas in the file are not evaluated."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+from seaopt.logs.formats.source import Field, Source, Window, check_size, optional, rows_of
+
+NUMERIC = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
+INTEGERS, FLOATS = frozenset({0, 1, 2, 3}), frozenset({4, 5})
+TIME_MASTER = 1
+Places = Mapping[str, tuple[int, int]]
+
+
+def open_mdf(path: Path) -> Source:
+    """List the channels of an MDF 4 file; a name that several groups have carries the group's number."""
+    asammdf = optional("asammdf", "mdf", path, "MDF")
+    fields: list[Field] = []
+    places: dict[str, tuple[int, int]] = {}
+    with asammdf.MDF(path) as file:
+        if str(file.version) < "4":
+            raise LogError(f"{path}: is MDF {file.version}; convert it to MDF 4")
+        groups = list(file.groups)
+        check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
+        names = Counter(channel.name for group in groups for channel in group.channels)
+        for number, group in enumerate(groups):
+            labels = [_label(channel.name, number, names) for channel in group.channels]
+            master = file.masters_db.get(number)
+            for index, (label, channel) in enumerate(zip(labels, group.channels, strict=True)):
+                is_master = index == master
+                fields.append(
+                    Field(
+                        name=label, kind=_kind(channel), length=int(group.channel_group.cycles_nr),
+                        unit=_unit(channel) or ("s" if is_master and channel.sync_type == TIME_MASTER else None),
+                        clock=None if master is None else labels[master],
+                    )
+                )  # fmt: skip
+                places[label] = (number, index)
+    return Source(path=path, format="MDF", fields=tuple(fields), load=partial(_load, path, places))
+
+
+def _label(name: str, group: int, names: Mapping[str, int]) -> str:
+    return name if names[name] == 1 else f"{group}/{name}"
+
+
+def _kind(channel: Any) -> str:
+    conversion = channel.conversion
+    if conversion is not None and conversion.conversion_type not in NUMERIC:
+        return "text, or a formula"
+    if channel.data_type in FLOATS:
+        return f"float{channel.bit_count}"
+    if channel.data_type in INTEGERS:
+        return f"{'int' if channel.data_type > 1 else 'uint'}{channel.bit_count}"
+    return "text"
+
+
+def _unit(channel: Any) -> str | None:
+    conversion = channel.conversion
+    return channel.unit or (conversion.unit if conversion is not None else "") or None
+
+
+def _load(
+    path: Path, places: Places, names: Sequence[str], window: Window | None
+) -> dict[str, Float[np.ndarray, " n"]]:
+    asammdf = optional("asammdf", "mdf", path, "MDF")
+    with asammdf.MDF(path) as file:
+
+        def one(name: str, rows: slice) -> Float[np.ndarray, " n"]:
+            group, index = places[name]
+            start = rows.start or 0
+            count = None if rows.stop is None else rows.stop - start
+            found, bad = file.get(
+                group=group, index=index, record_offset=start, record_count=count, samples_only=True,
+                ignore_invalidation_bits=False,
+            )  # fmt: skip
+            values = np.array(found, dtype=float).reshape(-1)
+            if bad is not None:
+                values[np.asarray(bad, dtype=bool)] = np.nan
+            return values
+
+        rows = slice(None) if window is None else rows_of(one(window.clock, slice(None)), window)
+        if rows.stop is not None and rows.stop <= (rows.start or 0):
+            return {name: np.empty(0) for name in names}
+        return {name: one(name, rows) for name in names}

@@ -1,0 +1,280 @@
+"""ROS recordings: ROS 1 bags, ROS 2 db3 and MCAP; each topic is a clock, its numbers are topic.field paths.
+
+The clock of a topic is the time of reception; stamps inside the messages are columns of their own. Both count seconds
+from the start of the recording, which the notes name.
+"""
+
+from __future__ import annotations
+
+import bz2
+import json
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import LogError
+from seaopt.logs.formats.json import flat, kind
+from seaopt.logs.formats.messages import Node, leaves, tree, values, wanted_tree
+from seaopt.logs.formats.source import Field, Source, Window, one_line, optional
+
+MAX_CHUNK = 1 << 30
+UNIX = 1_000_000_000 * 1_000_000_000  # stamps after 2001 count from 1970; earlier ones are a simulation's
+ENCODINGS = ("cdr", "ros1", "json")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Topic:
+    """One stream of messages."""
+
+    name: str
+    kind: str
+    count: int
+    encoding: str
+    definition: str
+    syntax: str  # "msg", "idl", or "" where the recording has no definition
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bag:
+    """An open recording: `messages` gives time in ns and bytes, of one topic, from start to stop (ns)."""
+
+    start: int
+    topics: Mapping[str, Topic]
+    messages: Callable[[str, int | None, int | None], Iterator[tuple[int, bytes]]]
+
+
+Opened = Callable[[Path], AbstractContextManager[Bag]]
+
+
+def open_bag(path: Path) -> Source:
+    """List a ROS 1 bag."""
+    return _source(path, "ROS 1 bag", _bag)
+
+
+def open_db3(path: Path) -> Source:
+    """List a ROS 2 SQLite recording."""
+    return _source(path, "ROS 2 db3", _db3)
+
+
+def open_mcap(path: Path) -> Source:
+    """List an MCAP recording."""
+    return _source(path, "MCAP", _mcap)
+
+
+def _source(path: Path, form: str, opened: Opened) -> Source:
+    optional("rosbags", "ros", path, form)
+    fields: list[Field] = []
+    notes: list[str] = []
+    nodes: dict[str, Node | None] = {}
+    with opened(path) as bag:
+        for topic in bag.topics.values():
+            fields.append(Field(name=topic.name, kind="float64", length=topic.count, unit="s", clock=topic.name))
+            try:
+                nodes[topic.name] = _tree(topic)
+                fields += _fields(bag, topic, nodes[topic.name])
+            except Exception as error:  # one odd definition leaves the other topics readable
+                notes.append(f"{topic.name}: {topic.kind} cannot be decoded ({one_line(error)})")
+        count = sum(topic.count for topic in bag.topics.values())
+        began = datetime.fromtimestamp(bag.start * 1e-9, UTC).isoformat(timespec="microseconds") if count else "nothing"
+    notes.insert(0, f"{count} messages; times count from {began} ({bag.start} ns)")
+    return Source(
+        path=path, format=form, fields=tuple(fields), load=partial(_load, path, opened, nodes), notes=tuple(notes)
+    )  # fmt: skip
+
+
+def _tree(topic: Topic) -> Node | None:
+    """Return how a topic's messages are built; None where they carry their own names (JSON)."""
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    if topic.encoding == "json":
+        return None
+    if topic.encoding not in ENCODINGS:
+        raise ValueError(f"its encoding is {topic.encoding or 'not said'}")
+    if topic.syntax == "idl":
+        types: Any = {}
+        for part in topic.definition.split("=" * 80 + "\n"):
+            types |= get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part)
+    elif topic.syntax == "msg":
+        types = get_types_from_msg(topic.definition, topic.kind)
+    else:  # ROS 2 up to Humble stores no definitions in db3; the standard messages are known
+        types = get_typestore(Stores.LATEST).fielddefs
+    return tree(topic.kind, types)
+
+
+def _fields(bag: Bag, topic: Topic, node: Node | None) -> list[Field]:
+    """Return the fields of a topic, as long as its first message has them."""
+    first = next(bag.messages(topic.name, None, None), None)
+    if first is None:
+        return []
+    if node is None:
+        found = [(name, kind(value)) for name, value in flat(json.loads(first[1]))]
+    else:
+        found = leaves(node, first[1], topic.encoding)
+    return [
+        Field(name=f"{topic.name}.{path}", kind=word, length=topic.count, unit=_unit(path), clock=topic.name)
+        for path, word in found
+    ]
+
+
+def _unit(path: str) -> str | None:
+    return "s" if path.split(".")[-1] == "stamp" else None
+
+
+def _load(
+    path: Path, opened: Opened, nodes: Mapping[str, Node | None], names: Sequence[str], window: Window | None
+) -> dict[str, Float[np.ndarray, " n"]]:
+    with opened(path) as bag:
+        topic = next(item for item in bag.topics.values() if _of(item.name, names))
+        paths = {name.removeprefix(f"{topic.name}."): name for name in names if name != topic.name}
+        span = _span(bag, window) if window is not None and window.clock == topic.name else (None, None)
+        take = _taker(topic, nodes[topic.name], paths) if paths else None
+        times: list[int] = []
+        rows: list[Mapping[str, float | int]] = []
+        for time, data in bag.messages(topic.name, *span):
+            times.append(time - bag.start)
+            if take is not None:
+                rows.append(take(data))
+    out = {name: np.array([row.get(name, np.nan) for row in rows], dtype=float) for name in paths.values()}
+    for name in paths.values():
+        if _unit(name) == "s":
+            out[name] = _seconds([int(row[name]) for row in rows], bag.start)
+    if topic.name in names:
+        out[topic.name] = np.array(times, dtype=np.int64) * 1e-9
+    return out
+
+
+def _of(topic: str, names: Sequence[str]) -> bool:
+    return all(name == topic or name.startswith(f"{topic}.") for name in names)
+
+
+def _span(bag: Bag, window: Window) -> tuple[int | None, int | None]:
+    edges = (window.start, window.stop)
+    start, stop = (None if np.isinf(edge) else bag.start + int(edge * 1e9) for edge in edges)
+    return None if start is None else max(start - 1, 0), None if stop is None else max(stop + 2, 0)
+
+
+def _taker(topic: Topic, node: Node | None, paths: Mapping[str, str]) -> Callable[[bytes], Mapping[str, float | int]]:
+    if node is not None:
+        wanted = wanted_tree(paths)
+        return lambda data: values(node, data, topic.encoding, wanted)
+
+    def from_json(data: bytes) -> Mapping[str, float | int]:
+        found = dict(flat(json.loads(data)))
+        return {name: found[path] for path, name in paths.items() if isinstance(found.get(path), int | float)}
+
+    return from_json
+
+
+def _seconds(stamps: list[int], start: int) -> Float[np.ndarray, " n"]:
+    """Return stamps in seconds, from the start of the recording where they are of its kind."""
+    whole = np.array(stamps, dtype=np.int64)
+    return np.where(whole > UNIX, whole - start, whole) * 1e-9
+
+
+@contextmanager
+def _bag(path: Path) -> Generator[Bag]:
+    from rosbags.rosbag1 import Reader
+
+    with Reader(path) as reader:
+        reader.chunks = {at: chunk._replace(decompressor=_bounded(chunk)) for at, chunk in reader.chunks.items()}
+        yield _rosbags(reader, reader.connections, reader.start_time if reader.message_count else 0, "ros1")
+
+
+@contextmanager
+def _db3(path: Path) -> Generator[Bag]:
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    reader = Sqlite3Reader(path.absolute())
+    reader.open()
+    try:
+        meta = reader.metadata
+        yield _rosbags(reader, reader.connections, meta.start_time if meta.message_count else 0, "cdr")
+    finally:
+        reader.close()
+
+
+def _rosbags(reader: Any, connections: Sequence[Any], start: int, encoding: str) -> Bag:
+    """Return rosbags' reader as a Bag; a topic with several publishers has several connections."""
+    topics: dict[str, Topic] = {}
+    for item in connections:
+        known = topics.get(item.topic)
+        if known is not None and known.kind != item.msgtype:
+            raise ValueError(
+                f"topic {item.topic} carries {known.kind} and {item.msgtype}; record them on topics of their own"
+            )
+        said = getattr(item.ext, "serialization_format", encoding) or encoding
+        topics[item.topic] = Topic(
+            name=item.topic, kind=item.msgtype, count=item.msgcount + (known.count if known else 0), encoding=said,
+            definition=item.msgdef.data, syntax=item.msgdef.format.name.lower().replace("none", ""),
+        )  # fmt: skip
+
+    def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
+        for _, time, data in reader.messages([item for item in connections if item.topic == topic], start, stop):
+            yield time, bytes(data)
+
+    return Bag(start=start, topics=topics, messages=messages)
+
+
+def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
+    """Return the chunk's own decompressor, stopped at the limit."""
+
+    def unpacked(data: bytes) -> bytes:
+        if data.startswith(b"BZh"):
+            stream: Any = bz2.BZ2Decompressor()
+        elif data.startswith(b"\x04\x22\x4d\x18"):
+            import lz4.frame
+
+            stream = lz4.frame.LZ4FrameDecompressor()
+        else:
+            return chunk.decompressor(data)
+        out = stream.decompress(data, MAX_CHUNK)
+        if not stream.eof:
+            raise ValueError(f"a chunk unpacks to more than {MAX_CHUNK >> 20} MiB, or is cut off")
+        return out
+
+    return unpacked
+
+
+@contextmanager
+def _mcap(path: Path) -> Generator[Bag]:
+    reading = optional("mcap.reader", "ros", path, "MCAP")
+    with path.open("rb") as stream:
+        reader = reading.make_reader(stream)
+        summary = reader.get_summary()
+        if summary is None or summary.statistics is None:
+            raise LogError(f"{path}: has no summary, its recorder did not end in order; run mcap recover on it")
+        if any(chunk.uncompressed_size > MAX_CHUNK for chunk in summary.chunk_indexes):
+            raise LogError(f"{path}: a chunk unpacks to more than {MAX_CHUNK >> 20} MiB; is it damaged?")
+        counts = summary.statistics.channel_message_counts
+        topics: dict[str, Topic] = {}
+        for channel in summary.channels.values():
+            schema = summary.schemas.get(channel.schema_id)
+            before = topics[channel.topic].count if channel.topic in topics else 0
+            topics[channel.topic] = Topic(
+                name=channel.topic, kind=_long(schema.name) if schema else "", count=before + counts.get(channel.id, 0),
+                encoding=channel.message_encoding, definition=schema.data.decode(errors="replace") if schema else "",
+                syntax=_syntax(schema.encoding) if schema else "",
+            )  # fmt: skip
+
+        def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
+            for _, _, message in reader.iter_messages([topic], starting_at=start, ending_before=stop):
+                yield message.log_time, message.data
+
+        start = summary.statistics.message_start_time if summary.statistics.message_count else 0
+        yield Bag(start=start, topics=topics, messages=messages)
+
+
+def _syntax(encoding: str) -> str:
+    return {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl"}.get(encoding, "")
+
+
+def _long(name: str) -> str:
+    """Return a type's name as rosbags writes it: "std_msgs/String" is "std_msgs/msg/String"."""
+    return "/msg/".join(name.split("/")) if name.count("/") == 1 else name
