@@ -25,6 +25,7 @@ def mask_saturated(
     Parameters
     ----------
     log : Log
+        The log.
     outputs : collection of str
         Channels to look at.
     ranges : mapping of channel to (low, high)

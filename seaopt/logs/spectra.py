@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Complex, Float
 
-SHORTEST, LONGEST, MOST = 32, 1 << 15, 64
+SHORTEST, LONGEST, FEWEST, MOST = 32, 1 << 15, 4, 64
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = 5
 BESIDE_HZ = 12.0  # from a line: where the noise floor is read
 LINE = 4.0  # times the noise floor: 6 dB
 FAMILY = 3  # lines beside the mains' in the same channel that make a multisine
-BRIDGED = 0.02  # share of missing samples that are bridged by lines for the spectra
+BRIDGED = 0.02  # share of a stretch's samples that may be missing: they are bridged by lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,7 +32,7 @@ class Spectra:
     period : float
         Seconds between samples.
     channels : mapping of name to complex array, shape (stretches, m)
-        Channels that have samples missing in many places are left out.
+        Channels that have samples missing in most stretches are left out, and then stretches that have holes.
 
     """
 
@@ -82,24 +82,28 @@ def spectra(channels: Mapping[str, Float[np.ndarray, " n"]], pieces: Sequence[sl
     starts = np.array(
         [row for piece in pieces for row in range(piece.start, piece.stop - length + 1, max(length // 2, 1))], dtype=int
     )
-    if starts.size < 4:
+    if starts.size < FEWEST:
         return None
     if starts.size > MOST:
         starts = starts[np.linspace(0, starts.size - 1, MOST).astype(int)]
-    window = np.hanning(length)
-    found: dict[str, Complex[np.ndarray, "d m"]] = {}
-    for name, values in channels.items():
-        cut = np.stack([values[start : start + length] for start in starts])
-        missing = ~np.isfinite(cut)
-        if np.mean(missing) > BRIDGED or np.any(np.all(missing, axis=1)):
-            continue
-        for row in np.flatnonzero(np.any(missing, axis=1)):
-            good = np.flatnonzero(~missing[row])
-            cut[row] = np.interp(np.arange(length), good, cut[row, good])
-        found[name] = np.fft.rfft((cut - cut.mean(axis=1, keepdims=True)) * window, axis=1)
-    if not found:
+    cuts = {name: np.stack([values[start : start + length] for start in starts]) for name, values in channels.items()}
+    holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED for name, cut in cuts.items()}
+    kept = [name for name in cuts if np.mean(holed[name]) <= 0.5]
+    whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(starts.size, dtype=bool)
+    if np.count_nonzero(whole) < FEWEST:
         return None
+    window = np.hanning(length)
+    found = {name: _spectrum(cuts[name][whole], window) for name in kept}
     return Spectra(frequency_hz=np.fft.rfftfreq(length, period), period=period, channels=found)
+
+
+def _spectrum(cut: Float[np.ndarray, "d n"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
+    """Return the spectra of stretches without their means; missing samples are bridged."""
+    rows = np.arange(window.size)
+    for row in np.flatnonzero(~np.all(np.isfinite(cut), axis=1)):
+        good = np.flatnonzero(np.isfinite(cut[row]))
+        cut[row] = np.interp(rows, good, cut[row, good])
+    return np.fft.rfft((cut - cut.mean(axis=1, keepdims=True)) * window, axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

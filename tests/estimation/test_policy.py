@@ -104,7 +104,8 @@ def test_the_problem_file_declares_it(tmp_path, stand, clipped, limit):
         'schema = 1\n[parameters]\nJ = { value = 2e-6, free = true }\n[plant.stand]\nkind = "high_impedance"\n'
         '[[experiment]]\nname = "chirp"\nplant = "stand"\nlog = "log.csv"\ntime = "time [s]"\n'
         'inputs = { I = { column = "I", unit = "A" } }\noutputs = { F1 = { column = "F1", unit = "N" } }\n'
-        f'slice_s = [0.0, 15.0]\nresample = "restamp"\nsaturation = {{ F1 = [{-limit}, {limit}] }}\nmask = "declared"\n',
+        'slice_s = [0.0, 15.0]\nresample = "restamp"\n'
+        f'saturation = {{ F1 = [{-limit}, {limit}] }}\nmask = "declared"\n',
         encoding="utf-8",
     )
     (experiment,) = so.read_problem(tmp_path / "problem.toml").experiments()
