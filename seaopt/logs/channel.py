@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.logs.faults import (
+    HOLDS,
     Rail,
     Runs,
     Skips,
@@ -116,7 +117,7 @@ def channel_of(signal: Signal) -> ChannelQuality:
     return ChannelQuality(
         name=signal.name, unit=signal.unit, low=float(good.min()), high=float(good.max()), mean=float(good.mean()),
         std=float(good.std()), missing=missing, quantum=quantum, still=still,
-        held=held(values) if still >= 0.4 else 1,
+        held=held(values) if still >= HOLDS else 1,
         stuck=_off_rails(stuck(values, quantum, still), values, flat) if counted is None else Runs(),
         rails=flat, outliers=wild, counter=counted,
     )  # fmt: skip

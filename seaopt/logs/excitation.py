@@ -90,7 +90,8 @@ class Excitation:
                 "channels, and drive harder"
             )
         low, high = told
-        said = f"{self.channel} excites {low:.3g} to {high:.3g} Hz"
+        what = "answered to" if self.bands[0].coherence is not None else "excited"
+        said = f"{self.channel} is {what} from {low:.3g} to {high:.3g} Hz"
         if high < 0.8 * self.nyquist_hz:
             said += f"; nothing above {high:.3g} Hz"
         top = self.rolls_off_above_hz

@@ -19,6 +19,7 @@ OUTLYING = 6.0  # robust standard deviations (Hampel)
 FEW_WINDOWS = 5_000  # that are enough to see what distances are usual
 STICKS_OUT = 0.8  # of its distance: how far an outlier lies beyond the second of its neighbours
 HALF = 5  # samples each side of an outlier that it is compared with
+HOLDS = 0.4  # share of still samples from which a channel may be one that is held
 REGULAR = 0.8  # share of a counter's, or a held channel's, steps that must be alike
 SCARCE = 16  # samples below which nothing is judged
 
@@ -167,7 +168,8 @@ def _distances(
 
 
 def rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list[Rail]:
-    """Return the flat tops and bottoms: exactly equal samples piled up at the largest or the least value."""
+    """Return the flat tops and bottoms: equal samples piled up at the largest or the least value."""
+    repeated = held(values) if still >= HOLDS else 1
     stride = max(1, values.size // LOOKED_AT)
     finite = values[::stride][np.isfinite(values[::stride])]
     if values.size < SCARCE or np.unique(finite).size <= FEW_LEVELS:
@@ -183,9 +185,9 @@ def rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list
         below = (np.count_nonzero(near) - count) / 4.0
         runs = runs_of(at)
         # A run at either end may be rest, and single samples the peaks of a periodic signal.
-        flat = runs.where((runs.start > 0) & (runs.stop < values.size) & (runs.lengths > 1))
-        if count >= 3 and count >= PILE * max(below, 0.5) and len(flat):
-            clear = len(flat) >= 3 and still < 0.5
+        flat = runs.where((runs.start > 0) & (runs.stop < values.size) & (runs.lengths > repeated))
+        if count >= 3 * repeated and count >= PILE * max(below, 0.5) and len(flat):
+            clear = len(flat) >= 3 and (still < 0.5 or repeated > 1)
             found.append(Rail(side=side, value=edge, runs=runs, clear=clear))
     return found
 
@@ -202,13 +204,12 @@ def stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> Runs
         return Runs()
     shortest = 1.0 + np.log(1e3 * n) / -np.log(max(still, 0.1))
     runs = repeats(values)
-    runs = runs.where(runs.lengths > shortest)
-    if still < 0.2 or not len(runs):
-        return runs
-    inside = runs.stop < n
+    ends = runs.stop == n
     last = np.minimum(runs.stop, n - 1)
-    jump = np.abs(values[last] - values[last - 1])
-    return runs.where(~inside | ~(jump <= 1.5 * quantum))
+    rests = ~ends & (np.abs(values[last] - values[last - 1]) <= 1.5 * quantum)
+    coarse = still >= 0.2 or bool(np.count_nonzero(rests) > 0.5 * len(runs))
+    long = runs.lengths > shortest
+    return runs.where(long & ~rests if coarse else long)
 
 
 def held(values: Float[np.ndarray, " n"]) -> int:

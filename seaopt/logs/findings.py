@@ -19,7 +19,7 @@ from seaopt.logs.pairs import Pair
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 SHOWN = 20  # places that a finding lists
-COARSE, FINE = 64, 4096  # levels in a channel's range: below the one a warning, above the other not worth a word
+COARSE, FINE = 32, 4096  # levels in a channel's range: below the one a warning, above the other not worth a word
 AGREED = 0.3  # correlation above which a lag is one
 
 
@@ -206,7 +206,7 @@ def pair_findings(found: Pair, period: float, driven: bool) -> Iterator[Finding]
         return
     late, early = (found.second, found.first) if samples > 0 else (found.first, found.second)
     text = f"{late} follows {early} by {1e3 * abs(found.lag_s):.3g} ms ({abs(samples):.2f} samples), correlation "
-    text += f"{found.correlation:.2f}"
+    text += f"{found.correlation:.2f}" + (" (with the opposite sign)" if found.correlation < 0.0 and not driven else "")
     severity: Severity = "note"
     if driven and found.leads and samples < -1.5:
         severity = "warning"

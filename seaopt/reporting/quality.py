@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from seaopt.files import write_bytes
 from seaopt.logs import Log, Quality, Table
 from seaopt.logs.channel import ChannelQuality
+from seaopt.logs.clock import ClockQuality
 from seaopt.logs.faults import Runs
 from seaopt.logs.quality import jitter
 from seaopt.reporting.figures import envelope, panels
@@ -56,7 +57,8 @@ def quality_figure(data: Log | Table, found: Quality) -> Figure:
     axes[-1, 1].set_xlabel("frequency [Hz]")
     handles: dict[str, Any] = {}
     for axis in axes.ravel():
-        handles |= dict(reversed(pair) for pair in zip(*axis.get_legend_handles_labels(), strict=True))
+        lines, labels = axis.get_legend_handles_labels()
+        handles |= dict(zip(labels, lines, strict=True))
     if handles:
         figure.legend(
             list(handles.values()), list(handles), loc="outside upper left", frameon=False, ncols=min(len(handles), 7)
@@ -97,10 +99,8 @@ def _steps(axis: Axes, time: Float[np.ndarray, " n"], found: Quality) -> None:
     step = np.where(np.abs(step) > 3.0 * clock.period, np.nan, step)
     _band(axis, time[1:], 1e3 * step, clock.gaps - 1)
     axis.axhline(1e3 * clock.period, color=MISSING, linewidth=0.8, label="period")
-    for row in clock.gaps[:MOST]:
-        axis.axvspan(time[row - 1], time[row], color=GAP, alpha=0.35, linewidth=1.0, label="gap")
-    for row in np.concatenate([clock.repeated, clock.backwards])[:MOST]:
-        axis.axvline(time[row], color=CLIPPED, linewidth=0.8, label="repeated or backwards")
+    _gaps(axis, time, clock)
+    _lines(axis, time, np.concatenate([clock.repeated, clock.backwards]), CLIPPED, "repeated or backwards")
     # A perfect clock is drawn as a line, not as its rounding.
     spread = max(1.2e3 * float(np.nanmax(np.abs(step - clock.period), initial=0.0)), 20.0 * clock.period)
     axis.set_ylim(1e3 * clock.period - spread, 1e3 * clock.period + spread)
@@ -129,8 +129,7 @@ def _in_time(
     axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], item: ChannelQuality, found: Quality
 ) -> None:
     _band(axis, time, values, found.clock.gaps)
-    for row in found.clock.gaps[:MOST]:
-        axis.axvspan(time[row - 1], time[row], color=GAP, alpha=0.35, linewidth=1.0, label="gap")
+    _gaps(axis, time, found.clock)
     _spans(axis, time, item.missing, MISSING, "missing")
     _spans(axis, time, item.stuck, STUCK, "stuck")
     for rail in item.rails:
@@ -139,12 +138,13 @@ def _in_time(
     if rows.size:
         axis.plot(time[rows], values[rows], "o", color=WILD, markersize=4, fillstyle="none", label="outlier")
     if item.counter is not None:
-        for row in item.counter.rows[:MOST]:
-            axis.axvline(time[row], color=GAP, linewidth=1.0, label="lost, by the counter")
+        _lines(axis, time, item.counter.rows, GAP, "lost, by the counter")
     axis.set_ylabel(f"{item.name} [{item.unit}]" if item.unit else item.name)
 
 
-def _band(axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " k"]) -> None:
+def _band(
+    axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " k"]
+) -> None:
     """Draw the range of a channel over time, with nothing across a gap."""
     edges = [0, *(gaps.tolist() if gaps.size <= MOST else []), time.size]
     for first, last in pairwise(edges):
@@ -155,8 +155,17 @@ def _band(axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, "
 
 
 def _spans(axis: Axes, time: Float[np.ndarray, " n"], runs: Runs, colour: str, label: str) -> None:
-    for start, stop in zip(runs.start[:MOST], runs.stop[:MOST], strict=True):
-        axis.axvspan(time[start], time[stop - 1], color=colour, alpha=0.35, linewidth=1.0, label=label)
+    for start, stop in zip(time[runs.start[:MOST]].tolist(), time[runs.stop[:MOST] - 1].tolist(), strict=True):
+        axis.axvspan(start, stop, color=colour, alpha=0.35, linewidth=1.0, label=label)
+
+
+def _gaps(axis: Axes, time: Float[np.ndarray, " n"], clock: ClockQuality) -> None:
+    _spans(axis, time, Runs(start=clock.gaps - 1, stop=clock.gaps + 1), GAP, "gap")
+
+
+def _lines(axis: Axes, time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], colour: str, label: str) -> None:
+    for at in time[rows[:MOST]].tolist():
+        axis.axvline(at, color=colour, linewidth=1.0, label=label)
 
 
 def _in_frequency(axis: Axes, item: ChannelQuality, found: Quality) -> None:

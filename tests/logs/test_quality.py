@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import scipy.io
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Multisine, Noise
@@ -253,6 +254,26 @@ def test_a_counter_shows_lost_samples(data):
     assert gap.where_s[0][0] == pytest.approx(14 * 40e-6)
     assert not quality(read("Wex1_noError.csv")).of("gap")
     assert not quality(read("Wmsr1_ini.csv")).of("gap")
+
+
+def test_a_swung_pendulum_s_encoder_is_not_stuck(data):
+    rows = np.genfromtxt(data / "ak80" / "data_measured.csv", delimiter=",", skip_header=1)
+    log = so.Log.from_arrays(time=rows[:, 0], position=rows[:, 1], velocity=rows[:, 2], torque=rows[:, 3])
+    found = quality(log, inputs=["torque"])
+    assert grave(found) == []
+    assert found.channels["position"].quantum == pytest.approx(0.0029145, rel=1e-4)
+    assert found.clock.rate_hz == pytest.approx(500, rel=1e-3)
+
+
+def test_a_two_mass_drive_is_clean_and_its_load_angle_turned_around(data):
+    content = scipy.io.loadmat(data / "twomass" / "MultisineTypeA.mat", squeeze_me=True)
+    log = so.Log.from_arrays(
+        time=content["time"], I=content["iq_adx"], motor=content["theta_mx"], load=content["theta_my"],
+        units={"time": "us", "I": "A", "motor": "rad", "load": "rad"},
+    )  # fmt: skip
+    found = log.quality
+    assert grave(found) == []
+    assert next(item for item in found.pairs if item.first == "motor").correlation < -0.8
 
 
 def test_the_report_is_strict_json(short_log):
