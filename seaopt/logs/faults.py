@@ -197,7 +197,7 @@ def stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> Runs
 
     With a share p of still steps, L equal samples in a row have a probability of about n p^(L-1): the limit is where
     that is 1e-3. A channel that is quantised more coarsely than its noise also rests at its extremes, and leaves them
-    by one quantisation step; a run that ends in a larger jump, or never, is not such a rest.
+    by one quantisation step; a run that ends in a larger jump, or with the log and twice as long as any rest, is none.
     """
     n = values.size
     if n < SCARCE or still > 0.98:
@@ -209,7 +209,10 @@ def stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> Runs
     rests = ~ends & (np.abs(values[last] - values[last - 1]) <= 1.5 * quantum)
     coarse = still >= 0.2 or bool(np.count_nonzero(rests) > 0.5 * len(runs))
     long = runs.lengths > shortest
-    return runs.where(long & ~rests if coarse else long)
+    if not coarse:
+        return runs.where(long)
+    longest = int(np.max(runs.lengths[rests], initial=0))
+    return runs.where(long & ~rests & (~ends | (runs.lengths > 2 * longest)))
 
 
 def held(values: Float[np.ndarray, " n"]) -> int:
