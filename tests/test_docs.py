@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import seaopt as so
 
@@ -58,6 +59,18 @@ def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
     shown = " ".join(page.replace(">", " ").split())
     for sentence in said:  # the numbers may move in their last digits
         assert sentence.split(":")[0] in shown
+
+
+def test_the_log_of_the_quality_page_is_clipped_and_masked():
+    space: dict = {}
+    for code in blocks("log_quality.md", "python"):
+        exec(re.sub(r"(?m)^print\(.*", "", code), space)
+    eta = {name: space[name].parameters["eta"] for name in ("masked", "declared", "biased")}
+    assert len(space["clipped"]) == 2
+    assert abs(eta["masked"].value - 1) < 3 * eta["masked"].std
+    assert eta["declared"].value == pytest.approx(eta["masked"].value)
+    assert eta["biased"].value < 1 - 10 * eta["biased"].std
+    assert space["again"].rate_hz == 200
 
 
 def test_every_figure_of_the_docs_is_there():

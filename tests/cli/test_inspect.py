@@ -57,8 +57,10 @@ def seaopt(*arguments, cwd):
 def test_faults_are_said_and_the_exit_code_is_0(folder):
     done = seaopt("bad.csv", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
-    for words in ("3900 samples", "1 gap, 100 samples lost", "F2 lacks 30 samples", "F1 is flat at its largest value, 300 N",
-                  "I is answered to from"):  # fmt: skip
+    for words in (
+        "3900 samples", "1 gap, 100 samples lost", "F2 lacks 30 samples", "F1 is flat at its largest value, 300 N",
+        "I is answered to from",
+    ):  # fmt: skip
         assert words in done.stdout
 
 
