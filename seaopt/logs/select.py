@@ -176,13 +176,15 @@ def _log_clock(sources: Sequence[Source], time: str | Column | None, found: list
     files = list(dict.fromkeys(str(source.path) for source, _ in found))
     if len(files) > 1:
         raise LogError(f"{', '.join(files)}: several files have several clocks; name the log's with time=")
-    source = found[0][0] if found else sources[0]
+    if not found:
+        raise LogError(f"{_paths(sources)}: holds no column of numbers; list it with contents(path)")
+    source = found[0][0]
     clocks = list(dict.fromkeys(item.clock for _, item in found))
     if len(clocks) > 1:
         names = [clock for clock in clocks if clock is not None]
         shown = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
         raise LogError(f"{source.path}: holds several clocks ({shown}); name the log's with time=")
-    column = Column(column=clocks[0]) if clocks and clocks[0] is not None else _time_like(source)
+    column = Column(column=clocks[0]) if clocks[0] is not None else _time_like(source)
     return _clock(*_with(column, find([source], "time", column)))
 
 
@@ -246,7 +248,8 @@ def _every_channel(
     notes: list[str] = []
     every = [(source, item) for source in sources for item in source.fields if item.name != clock.name]
     numeric = [(source, item) for source, item in every if item.numeric]
-    if words := [item.name for _, item in every if not item.numeric]:
+    words = [item.name for source, item in every if not item.numeric and _on(clock, reference, source, item)]
+    if words:
         notes.append(f"columns that hold no numbers were left out: {_listed(words)}")
     # A clock is not a channel of its own.
     numeric = [(source, item) for source, item in numeric if (str(source.path), item.name) not in clocks]

@@ -24,9 +24,10 @@ from seaopt.estimation import (
     PredictionError,
     SoftL1,
 )
-from seaopt.logs import Column, Hold, Log, read_log
+from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
+from seaopt.problem.columns import check_inside, column_of, log_files, rule_of
 from seaopt.problem.schema import (
     ColumnTable,
     ExperimentTable,
@@ -141,7 +142,7 @@ class Problem:
 
     def _experiment(self, table: ExperimentTable) -> Experiment:
         plant = self.plants[table.plant]
-        log = self._virtual(plant, table.virtual) if table.virtual else self._read(plant, table)
+        log = self._virtual(plant, table.virtual) if table.virtual else self._read(table)
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
         log = _on_its_clock(log, table).decimate(table.decimate)
@@ -157,11 +158,15 @@ class Problem:
             drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask,
         )  # fmt: skip
 
-    def _read(self, plant: Plant, table: ExperimentTable) -> Log:
-        assert table.log is not None and table.time is not None
-        columns = {name: _column(item) for name, item in {**table.inputs, **table.outputs}.items()}
-        path = self.folder / table.log
-        return read_log(path, time=_column(table.time), channels=columns)
+    def _read(self, table: ExperimentTable) -> Log:
+        return read_log(
+            [self.folder / name for name in log_files(table)],
+            time=None if table.time is None else column_of(table.time, self.folder),
+            channels={name: column_of(item, self.folder) for name, item in {**table.inputs, **table.outputs}.items()},
+            align=rule_of(table.align),
+            window_s=table.window_s,
+            counter=None if table.counter is None else Counter(**table.counter.model_dump()),
+        )
 
     def _virtual(self, plant: Plant, table: VirtualTable) -> Log:
         parts: list[Chirp | Noise | Multisine] = []
@@ -197,8 +202,7 @@ def _on_its_clock(log: Log, table: ExperimentTable) -> Log:
         return log
     if asked == "restamp":
         return log.restamp()
-    rule = Hold() if asked.rule == "hold" else None
-    return log.resample(rate_hz=asked.rate_hz, rule=rule, bridge_s=asked.bridge_s)
+    return log.resample(rate_hz=asked.rate_hz, rule=rule_of(asked.rule), bridge_s=asked.bridge_s)
 
 
 def _method(table: FitTable) -> Method:
@@ -218,10 +222,6 @@ def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
         return tuple(table.outputs)
     noisy = tuple(name for name in plant.outputs if name in table.noise_std)
     return noisy or tuple(name for name in ("F1", "F2") if name in plant.outputs) or tuple(plant.outputs)
-
-
-def _column(item: str | ColumnTable) -> Column:
-    return Column(column=item) if isinstance(item, str) else Column(column=item.column, unit=item.unit)
 
 
 def _unknown(name: str, unit: str, item: float | UnknownTable) -> float | Parameter:
@@ -418,10 +418,9 @@ def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
         raise ProblemError(f"{place}: give either log or virtual, and not both")
     if item.log is not None:
         driven = any(name not in plant.optional_inputs for name in plant.inputs)
-        if item.time is None or not item.outputs or (driven and not item.inputs):
+        if not item.outputs or (driven and not item.inputs):
             raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
-        if Path(item.log).is_absolute() or ".." in Path(item.log).parts:
-            raise ProblemError(f'{place}.log = "{item.log}" leaves the problem file\'s folder; put the log beside it')
+        check_inside(place, item)
     for kind, given, known in (
         ("inputs", item.inputs, plant.inputs),
         ("outputs", item.outputs, plant.outputs),

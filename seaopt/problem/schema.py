@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, model_validator
 
 
 class _Strict(BaseModel):
@@ -36,12 +36,67 @@ class PlantTable(BaseModel):
     kind: str
 
 
-class ColumnTable(_Strict):
-    """A column of a log, its unit, and for an output its noise."""
+class HoldTable(_Strict):
+    """The last sample at or before each instant."""
+
+    max_age_s: Annotated[Number, Field(gt=0)] | None = None
+
+
+class LinearTable(_Strict):
+    """The straight line between the samples on either side."""
+
+    max_gap_s: Annotated[Number, Field(gt=0)] | None = None
+
+
+class NearestTable(_Strict):
+    """The nearest sample."""
+
+    tolerance_s: Annotated[Number, Field(gt=0)]
+
+
+class AlignTable(_Strict):
+    """How a channel of another clock comes to the log's: exactly one of these."""
+
+    hold: HoldTable | None = None
+    linear: LinearTable | None = None
+    nearest: NearestTable | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> AlignTable:
+        if sum(rule is not None for rule in (self.hold, self.linear, self.nearest)) != 1:
+            raise ValueError("give exactly one of hold, linear and nearest")
+        return self
+
+
+class ClockTable(_Strict):
+    """A time column."""
 
     column: str
     unit: str | None = None
+    file: str | None = None
+    clock_offset_s: Number = 0.0
+
+
+class ColumnTable(_Strict):
+    """A column of a log, the way from its numbers to its unit, and for an output its noise."""
+
+    column: str
+    unit: str | None = None
+    scale: Number = 1.0
+    offset: Number = 0.0
+    wrap_bits: Annotated[Whole, Field(ge=2, le=53)] | None = None
+    file: str | None = None
+    time: str | ClockTable | None = None
+    clock_offset_s: Number = 0.0
+    align: AlignTable | None = None
     sigma: Number | None = None
+
+
+class CounterTable(_Strict):
+    """A column that counts samples; where it skips, gaps are opened."""
+
+    column: str
+    samples_per_count: Annotated[Whole, Field(ge=1)] = 1
 
 
 class UnknownTable(_Strict):
@@ -101,10 +156,10 @@ class VirtualTable(_Strict):
 
 
 class ResampleTable(_Strict):
-    """A uniform clock that a log is interpolated to."""
+    """A uniform clock that a log is interpolated to, by lines where no rule is given."""
 
     rate_hz: Annotated[Number, Field(gt=0, le=1e9)]
-    rule: Literal["linear", "hold"] = "linear"
+    rule: AlignTable | None = None
     bridge_s: Annotated[Number, Field(gt=0)] | None = None
 
 
@@ -113,11 +168,14 @@ class ExperimentTable(_Strict):
 
     name: Name
     plant: Name
-    log: str | None = None
+    log: str | list[str] | None = None
     virtual: VirtualTable | None = None
-    time: str | ColumnTable | None = None
+    time: str | ClockTable | None = None
     inputs: dict[str, str | ColumnTable] = {}
     outputs: dict[str, str | ColumnTable] = {}
+    align: AlignTable | None = None
+    window_s: tuple[Number, Number] | None = None
+    counter: CounterTable | None = None
     sigma: dict[str, Number] = {}
     initial_state: Literal["estimate", "rest"] | dict[str, Number] = "estimate"
     offset: Flag | dict[str, Number] = True

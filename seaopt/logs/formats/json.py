@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.column import header_unit
-from seaopt.logs.formats.layout import MAX_LINE
+from seaopt.logs.formats.layout import MAX_LINE, too_long
 from seaopt.logs.formats.source import MAX_PARTS, Field, Source, Window, one_line
 
 MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
@@ -35,12 +36,14 @@ def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
     notes: list[str] = []
     columns: dict[str, str] = {}
     length = 0
-    for length, (_, record) in enumerate(_records(path, notes), start=1):  # noqa: B007
-        for name, value in flat(record):
-            if value is not None and columns.get(name, "empty") == "empty":
-                columns[name] = kind(value)
-            else:
-                columns.setdefault(name, "empty")
+    with closing(_records(path, notes)) as records:
+        for _, record in records:
+            length += 1
+            for name, value in flat(record):
+                if value is not None and columns.get(name, "empty") == "empty":
+                    columns[name] = kind(value)
+                else:
+                    columns.setdefault(name, "empty")
     if not length:
         raise LogError(f"{path}: holds no entries; record the log again")
     return columns, notes, length
@@ -48,10 +51,11 @@ def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
 
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     columns: dict[str, list[float]] = {name: [] for name in names}
-    for place, record in _records(path, []):
-        row = dict(flat(record))
-        for name, values in columns.items():
-            values.append(_number(path, place, name, row.get(name)))
+    with closing(_records(path, [])) as records:
+        for place, record in records:
+            row = dict(flat(record))
+            for name, values in columns.items():
+                values.append(_number(path, place, name, row.get(name)))
     return {name: np.array(values) for name, values in columns.items()}
 
 
@@ -70,43 +74,34 @@ def _number(path: Path, place: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def _records(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
+def _records(path: Path, notes: list[str]) -> Generator[tuple[str, Record]]:
     """Return the entries with their places; of a header, a note."""
     with path.open("rb") as stream:
         first = _line(path, stream, 1)
-        if not _is_object(first):
+        if not _is_entry(first) or not any(line.strip() for line in stream):
             yield from _whole(path, notes)
             return
+        stream.seek(0)
         number = 1
-        while first:
-            if first.strip():
-                yield f"line {number}", _object(path, _parsed(path, first, number), f"line {number}")
+        while line := _line(path, stream, number):
+            if line.strip():
+                yield f"line {number}", _object(path, _parsed(path, line.rstrip(), number), f"line {number}")
             number += 1
-            first = _line(path, stream, number)
 
 
 def _line(path: Path, stream: Any, number: int) -> bytes:
     line = stream.readline(MAX_LINE + 1)
     if len(line) > MAX_LINE and number > 1:
-        raise LogError(
-            f"{path}: line {number} is longer than {MAX_LINE >> 20} MiB; is it a log? write one entry a line"
-        )
+        raise too_long(path, number)
     return line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
 
 
-def _is_object(line: bytes) -> bool:
-    """Tell whether a line is one flat entry by itself, so that the file is JSON lines."""
-    if len(line) > MAX_LINE:
-        return False
+def _is_entry(line: bytes) -> bool:
+    """Tell whether the first line is an object by itself, as in JSON lines."""
     try:
-        found = json.loads(line)
+        return len(line) <= MAX_LINE and isinstance(json.loads(line), dict)
     except (ValueError, RecursionError):
         return False
-    return isinstance(found, dict) and not any(isinstance(item, list) and _is_long(item) for item in found.values())
-
-
-def _is_long(item: list[Any]) -> bool:
-    return len(item) > MAX_PARTS or any(isinstance(value, dict) for value in item[:1])
 
 
 def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
@@ -116,7 +111,7 @@ def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
     content = _parsed(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
     entries = content
     if isinstance(content, dict):
-        entries = content.get("entries", _turned(path, content) if "entries" not in content else None)
+        entries = content["entries"] if "entries" in content else _turned(path, content)
         header = [f"{key} = {value}" for key, value in content.items() if isinstance(value, str | int | float)]
         if header:
             notes.append(f"header: {', '.join(header)}"[:400])
@@ -128,14 +123,14 @@ def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
         yield f"entry {number}", _object(path, entry, f"entry {number}")
 
 
-def _turned(path: Path, content: dict[str, Any]) -> list[Record] | None:
-    """Return the entries of an object of lists, one list a column."""
+def _turned(path: Path, content: dict[str, Any]) -> list[Record]:
+    """Return the entries of an object of lists, one list a column; without lists it is an entry itself."""
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     lengths = {len(value) for value in lists.values()}
     if len(lengths) > 1:
         shown = ", ".join(f"{key}: {len(value)}" for key, value in list(lists.items())[:10])
         raise LogError(f"{path}: its lists differ in length ({shown}); write one value a sample in each")
-    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else None
+    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else [content]
 
 
 def _parsed(path: Path, text: bytes, line: int) -> Any:

@@ -17,8 +17,8 @@ from seaopt.errors import LogError, SeaoptError
 from seaopt.logs.column import header_unit
 from seaopt.units import si_unit
 
-HEAD = 1 << 20  # bytes in which the data must begin
 MAX_LINE = 1 << 20
+HEAD = 2 * MAX_LINE  # bytes in which the data must begin
 SAMPLE = 200  # lines that decide on delimiter and decimal sign
 COMMENTS = ("#", "%", "//")
 BLANK = frozenset({"", "nan", "na", "n/a"})
@@ -106,7 +106,7 @@ def is_number(cell: str, comma: bool) -> bool:
 
 
 def _head(path: Path) -> tuple[str, list[str]]:
-    """Return the encoding and the lines of the first MiB, the last one only if it is whole."""
+    """Return the encoding and the first lines, the last one only if it is whole."""
     with path.open("rb") as stream:
         raw = stream.read(HEAD)
     if not raw.strip(b" \t\r\n\x1a\x00"):
@@ -120,10 +120,10 @@ def _head(path: Path) -> tuple[str, list[str]]:
         raise not_text(path, encoding, error) from error
     whole = len(raw) < HEAD
     lines = text.rstrip("\x1a" if whole else "").split("\n")
+    if (long := next((at for at, line in enumerate(lines, start=1) if len(line) > MAX_LINE), None)) is not None:
+        raise too_long(path, long)
     if not whole:
         lines.pop()
-    if not lines or max(map(len, lines)) > MAX_LINE:
-        raise too_long(path, 1)
     if len(lines) <= 1 and "\r" in text.rstrip("\r\n"):
         raise LogError(f"{path}: its lines end in CR alone; save it with LF line ends")
     return encoding, [line.rstrip("\r") for line in lines]

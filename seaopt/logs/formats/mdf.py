@@ -25,9 +25,10 @@ def open_mdf(path: Path) -> Source:
     asammdf = optional("asammdf", "mdf", path, "MDF")
     fields: list[Field] = []
     places: dict[str, tuple[int, int]] = {}
-    with asammdf.MDF(path) as file:
-        if str(file.version) < "4":
-            raise LogError(f"{path}: is MDF {file.version}; convert it to MDF 4")
+    with path.open("rb") as stream:
+        if stream.read(68)[64:] != b"##HD":
+            raise LogError(f"{path}: is no MDF 4 file, or is cut off; convert an older one to MDF 4")
+    with path.open("rb") as stream, asammdf.MDF(stream) as file:
         groups = list(file.groups)
         check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
         names = Counter(channel.name for group in groups for channel in group.channels)
@@ -71,7 +72,7 @@ def _load(
     path: Path, places: Places, names: Sequence[str], window: Window | None
 ) -> dict[str, Float[np.ndarray, " n"]]:
     asammdf = optional("asammdf", "mdf", path, "MDF")
-    with asammdf.MDF(path) as file:
+    with path.open("rb") as stream, asammdf.MDF(stream) as file:
 
         def one(name: str, rows: slice) -> Float[np.ndarray, " n"]:
             group, index = places[name]

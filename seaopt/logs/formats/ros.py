@@ -191,6 +191,7 @@ def _bag(path: Path) -> Generator[Bag]:
 def _db3(path: Path) -> Generator[Bag]:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
+    _check_pages(path)
     reader = Sqlite3Reader(path.absolute())
     reader.open()
     try:
@@ -198,6 +199,16 @@ def _db3(path: Path) -> Generator[Bag]:
         yield _rosbags(reader, reader.connections, meta.start_time if meta.message_count else 0, "cdr")
     finally:
         reader.close()
+
+
+def _check_pages(path: Path) -> None:
+    """Refuse a cut database, whose last messages SQLite would leave out without a word."""
+    with path.open("rb") as stream:
+        head = stream.read(100)
+    page = int.from_bytes(head[16:18], "big")
+    whole = (1 << 16 if page == 1 else page) * int.from_bytes(head[28:32], "big")
+    if path.stat().st_size < max(whole, 100):
+        raise LogError(f"{path}: is cut off, {path.stat().st_size} of {whole} bytes are there; copy or record it again")
 
 
 def _rosbags(reader: Any, connections: Sequence[Any], start: int, encoding: str) -> Bag:

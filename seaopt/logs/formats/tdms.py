@@ -19,7 +19,7 @@ def open_tdms(path: Path) -> Source:
     nptdms = optional("nptdms", "tdms", path, "TDMS")
     fields: list[Field] = []
     places: dict[str, tuple[str, str]] = {}
-    with nptdms.TdmsFile.open(path) as file:
+    with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
         for group in file.groups():
             clocks = _clocks(group)
             for channel in group.channels():
@@ -62,7 +62,7 @@ def _kind(channel: Any) -> str:
 def _load(path: Path, places: Mapping[str, tuple[str, str]], clocks: frozenset[str], name: str, rows: slice) -> Any:
     nptdms = optional("nptdms", "tdms", path, "TDMS")
     group, channel_name = places[name]
-    with nptdms.TdmsFile.open(path) as file:
+    with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
         channel = file[group][channel_name]
         check_size(path, len(channel) * 8, f'"{name}"')
         if name in clocks:

@@ -7,7 +7,8 @@ it walked line by line, to name that cell. Memory holds the wanted columns and o
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -44,8 +45,9 @@ def _load(path: Path, form: Layout, names: Sequence[str], _: Window | None) -> d
     columns = _Columns(names)
     size = path.stat().st_size
     try:
-        for line, block in _blocks(path, form):
-            columns.add(_parse(path, form, block, index, line), size / len(block))
+        with closing(_blocks(path, form)) as blocks:
+            for line, block in blocks:
+                columns.add(_parse(path, form, block, index, line), size / len(block))
     except UnicodeError as error:
         raise not_text(path, form.encoding, error) from error
     return columns.whole()
@@ -74,7 +76,7 @@ class _Columns:
         return self.arrays
 
 
-def _blocks(path: Path, form: Layout) -> Iterator[tuple[int, bytes]]:
+def _blocks(path: Path, form: Layout) -> Generator[tuple[int, bytes]]:
     """Return blocks of whole lines as UTF-8, each with the number of its first line."""
     line = 1
     with _opened(path, form.encoding) as stream:

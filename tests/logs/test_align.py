@@ -1,0 +1,131 @@
+"""Declared conversions and clocks, on one and several files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from seaopt.errors import LogError
+from seaopt.logs import Column, Counter, Hold, Linear, Nearest, read_table
+
+FAST = np.arange(40) / 100
+SLOW = 0.0513 + np.arange(8) / 20
+
+
+@pytest.fixture
+def files(tmp_path):
+    fast, slow = tmp_path / "motor.csv", tmp_path / "cell.csv"
+    fast.write_text("t [s],I [A]\n" + "".join(f"{t:.6f},{np.sin(9 * t):.9f}\n" for t in FAST))
+    slow.write_text("t [s],F [N]\n" + "".join(f"{t:.6f},{np.cos(9 * t):.9f}\n" for t in SLOW))
+    return [fast, slow]
+
+
+def channels(**options):
+    return {"I": "I [A]", "F": Column(column="F [N]", **options)}
+
+
+def test_another_clock_needs_a_rule(files):
+    with pytest.raises(LogError, match=r"cell.csv.*on the clock.*Hold\(\), Linear\(\) or Nearest"):
+        read_table(files, time="t [s]", channels=channels())
+
+
+def test_linear_is_numpys_between_samples_and_missing_outside(files):
+    table = read_table(files, time="t [s]", channels=channels(align=Linear()))
+    inside = np.array([SLOW[0] <= t <= SLOW[-1] for t in FAST])
+    expected = np.where(inside, np.interp(FAST, SLOW, np.cos(9 * SLOW)), np.nan)
+    np.testing.assert_allclose(table.signals["F"].values, expected, atol=1e-8)
+    assert f"{np.sum(~inside)} of 40 samples lie outside" in " ".join(table.notes)
+
+
+def test_hold_never_looks_ahead(files):
+    table = read_table(files, time="t [s]", channels=channels(align=Hold()))
+    for t, value in zip(FAST, table.signals["F"].values, strict=True):
+        past = SLOW[t >= SLOW]
+        if past.size and t <= SLOW[-1]:
+            assert value == pytest.approx(np.cos(9 * past[-1]), abs=1e-8)
+        else:
+            assert np.isnan(value)
+
+
+def test_nearest_keeps_to_its_tolerance(files):
+    found = read_table(files, time="t [s]", channels=channels(align=Nearest(tolerance_s=0.006))).signals["F"].values
+    gap = np.abs(FAST[:, None] - SLOW).min(axis=1)
+    inside = np.array([SLOW[0] <= t <= SLOW[-1] for t in FAST])
+    np.testing.assert_array_equal(np.isfinite(found), inside & (gap <= 0.006))
+
+
+def test_limits_leave_gaps_missing():
+    time, values = np.array([0.0, 1.0, 5.0, 6.0]), np.array([0.0, 1.0, 5.0, 6.0])
+    at = np.array([0.5, 1.5, 3.0, 5.0, 5.5])
+    np.testing.assert_array_equal(Linear(max_gap_s=2)(at, time, values), [0.5, np.nan, np.nan, 5, 5.5])
+    np.testing.assert_array_equal(Hold(max_age_s=1)(at, time, values), [0, 1, np.nan, 5, 5])
+
+
+def test_a_declared_offset_moves_a_clock(files):
+    late = read_table(files, time="t [s]", channels=channels(align=Linear(), clock_offset_s=-SLOW[0]))
+    expected = np.interp(FAST[:30], SLOW - SLOW[0], np.cos(9 * SLOW))
+    np.testing.assert_allclose(late.signals["F"].values[:30], expected, atol=1e-7)
+
+
+def test_a_column_in_two_files_must_say_which(files, tmp_path):
+    twin = tmp_path / "twin.csv"
+    twin.write_bytes(files[0].read_bytes())
+    with pytest.raises(LogError, match=r'"I \[A\]" for I is in .*motor.csv.*twin.csv'):
+        read_table([files[0], twin], time="t [s]", channels={"I": "I [A]"})
+    table = read_table(
+        [files[0], twin], time="t [s]", align=Hold(), channels={"a": Column(column="I [A]", file=files[0]),
+                                                               "b": Column(column="I [A]", file=twin)},
+    )  # fmt: skip
+    np.testing.assert_array_equal(table.signals["a"].values, table.signals["b"].values)
+
+
+def test_two_rates_in_one_text_file(tmp_path):
+    path = tmp_path / "both.csv"
+    path.write_text("t [s],I [A],t2 [s],F [N]\n0,1,0,10\n1,2,1.5,25\n2,3,,\n")
+    with pytest.raises(LogError, match="is on the clock"):
+        read_table(path, time="t [s]", channels={"F": Column(column="F [N]", time="t2 [s]")})
+
+
+def test_a_wrapped_integer_is_signed_and_scaled(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t [s],load\n0,0\n1,65535\n2,32767\n3,32768\n")
+    column = Column(column="load", unit="N", wrap_bits=16, scale=0.5, offset=1.0)
+    signal = read_table(path, channels={"load": column}).signals["load"]
+    np.testing.assert_array_equal(signal.values, [1, 0.5, 16384.5, -16383])
+    assert signal.origin.conversion == "two's complement of 16 bits, times 0.5, plus 1"
+    path.write_text("t [s],load\n0,0\n1,65536\n")
+    with pytest.raises(LogError, match="65536 in sample 2, no unsigned integer of 16 bits"):
+        read_table(path, channels={"load": column})
+
+
+def test_a_counter_opens_the_gaps_that_rows_hide(tmp_path):
+    path = tmp_path / "log.csv"
+    counts = [4, 5, 5, 6, 6, 7, 9, 9, 10]  # one sample of 7 is lost, and both of 8
+    path.write_text("t [s],n\n" + "".join(f"{i},{n}\n" for i, n in enumerate(counts)))
+    table = read_table(path, counter=Counter(column="n", samples_per_count=2))
+    np.testing.assert_array_equal(table.time, [0, 1, 2, 3, 4, 5, 9, 10, 11])
+    assert "3 lost samples" in " ".join(table.notes)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Column(column="a", scale=0.0), "scale"),
+        (lambda: Column(column="a", wrap_bits=1), "wrap_bits = 1"),
+        (lambda: Nearest(tolerance_s=0.0), "tolerance_s = 0"),
+        (lambda: Hold(max_age_s=-1.0), "max_age_s = -1"),
+        (lambda: Counter(column="a", samples_per_count=0), "samples_per_count"),
+    ],
+)
+def test_senseless_options_are_refused(make, words):
+    with pytest.raises(LogError, match=words):
+        make()
+
+
+def test_a_window_cuts_and_refuses_nonsense(files):
+    table = read_table(files[0], window_s=(0.1, 0.2))
+    np.testing.assert_allclose(table.time[[0, -1]], [0.1, 0.2])
+    with pytest.raises(LogError, match="too few samples"):
+        read_table(files[0], window_s=(5, 6))
+    with pytest.raises(LogError, match="start before stop"):
+        read_table(files[0], window_s=(1, 0))
