@@ -142,6 +142,7 @@ class Quality:
         )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers near the largest float have no std, and are reported as such
 def quality(data: Log | Table, *, inputs: Sequence[str] | None = None) -> Quality:
     """Look for every fault in a log.
 

@@ -7,6 +7,8 @@ import json
 import numpy as np
 import pytest
 import scipy.io
+from hypothesis import given
+from hypothesis import strategies as st
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Multisine, Noise
@@ -306,3 +308,30 @@ def test_short_logs_are_judged_as_far_as_they_go(n):
     log = so.Log.from_arrays(time=np.arange(n) / 10, I=rng.normal(size=n), F1=rng.normal(size=n))
     assert log.quality.clock.rate_hz == pytest.approx(10)
     assert grave(log.quality) in ([], [("excitation", "I")])
+
+
+NUMBERS = st.one_of(
+    st.sampled_from([0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-300]), st.floats(-10, 10)
+)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    pool=st.lists(NUMBERS, min_size=1, max_size=5),
+    steps=st.lists(st.sampled_from([1.0, 1.0, 1.0, 1.001, 0.0, -1.0, 5.0, np.nan, 1e9]), min_size=1, max_size=6),
+    n=st.integers(2, 300),
+)
+def test_whatever_the_numbers_a_report_or_a_seaopt_error(seed, pool, steps, n):
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.choice(steps, n))
+    signals = {
+        "I": Signal(name="I", values=rng.choice(np.array(pool), n)),
+        "F1": Signal(name="F1", values=rng.normal(size=n), unit="N"),
+        "F2": Signal(name="F2", values=np.repeat(rng.choice(np.array(pool), -(-n // 3)), 3)[:n], unit="N"),
+    }
+    try:
+        found = quality(Table(time=time, signals=signals, source="any"))
+    except LogError:
+        return
+    json.loads(to_json(found.to_dict()))
+    assert repr(found)
