@@ -12,16 +12,19 @@ from rich.table import Table as Grid
 
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import to_json, write_json
-from seaopt.logs import Column, Quality, quality, read_table
+from seaopt.logs import Column, Counter, Hold, Linear, Quality, quality, read_table
+from seaopt.logs.align import Rule
 from seaopt.logs.quality import CHANNEL_HEAD, channel_row
 
 WIDTH = 200  # columns: a narrower terminal wraps the table, and cuts nothing off
+RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
 def inspect_log(
-    path: Path, *, time: str | None, channels: Sequence[str], inputs: Sequence[str], units: Sequence[str],
-    folder: Path | None, json: bool,
+    path: Path, *, time: str | None = None, channels: Sequence[str] = (), inputs: Sequence[str] = (),
+    units: Sequence[str] = (), align: str | None = None, counter: str | None = None, folder: Path | None = None,
+    json: bool = False,
 ) -> None:  # fmt: skip
     """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
 
@@ -41,7 +44,7 @@ def inspect_log(
         raise SeaoptError(f"--unit time={known['time']}: name its column too, --time COLUMN")
     clock = Column(column=time, unit=known.get("time")) if time is not None else None
     columns = {name: Column(column=column, unit=known.get(name)) for name, column in given.items()}
-    table = read_table(path, time=clock, channels=columns or None)
+    table = read_table(path, time=clock, channels=columns or None, align=_rule(align), counter=_counter(counter))
     found = quality(table, inputs=list(inputs) or None)
     written: list[Path] = []
     if folder is not None:
@@ -53,6 +56,23 @@ def inspect_log(
         sys.stdout.write(to_json(found.to_dict()))
         return
     _show(found, written)
+
+
+def _rule(align: str | None) -> Rule | None:
+    if align is None:
+        return None
+    if align not in RULES:
+        raise SeaoptError(f'--align "{align}" is not known; give {" or ".join(RULES)}')
+    return RULES[align]
+
+
+def _counter(given: str | None) -> Counter | None:
+    if given is None:
+        return None
+    ((column, count),) = _pairs("--counter", [given]).items()
+    if not count.isdecimal():
+        raise SeaoptError(f'--counter "{given}": "{count}" is not how many samples a count stands for; give 1 or more')
+    return Counter(column=column, samples_per_count=int(count))
 
 
 def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:

@@ -115,6 +115,13 @@ def inspect(
         list[str] | None,
         typer.Option("--input", metavar="NAME", help="A channel that drives the others. Repeatable."),
     ] = None,
+    align: Annotated[
+        str | None, typer.Option(metavar="RULE", help="How channels of other clocks come to this one: hold or linear.")
+    ] = None,
+    counter: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN=SAMPLES", help="A column that counts samples, and how many a count stands for."),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write quality.json and the figure there.")
     ] = None,
@@ -124,8 +131,9 @@ def inspect(
     from seaopt.cli.inspect import inspect_log
 
     inspect_log(
-        log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), folder=output, json=json
-    )
+        log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
+        counter=counter, folder=output, json=json,
+    )  # fmt: skip
 
 
 def _stage(name: str, text: str) -> Callable[..., None]:

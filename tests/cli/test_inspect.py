@@ -36,12 +36,9 @@ def folder(tmp_path_factory, stand, thor):
 def inspect(folder, monkeypatch, capsys):
     """Return a call of what the command does; `seaopt` below is the command itself."""
 
-    def run(name, *, time=None, channels=(), inputs=(), units=(), out=None, json=False):
+    def run(name, *, out=None, **options):
         monkeypatch.chdir(folder)
-        inspect_log(
-            Path(name), time=time, channels=channels, inputs=inputs, units=units,
-            folder=Path(out) if out else None, json=json,
-        )  # fmt: skip
+        inspect_log(Path(name), folder=Path(out) if out else None, **options)
         return capsys.readouterr().out
 
     return run
@@ -99,6 +96,14 @@ def test_a_broken_clock_is_a_finding_and_can_be_drawn(inspect):
     assert "1 row of 5 with a time before" in out
 
 
+def test_a_counter_opens_the_gap_that_it_shows(inspect, data):
+    file = str(data / "formats" / "acqtools" / "Wmsr2_loss.csv")
+    shown = json.loads(inspect(file, json=True))
+    opened = json.loads(inspect(file, counter="CH1(msr)=2", json=True))
+    assert (shown["gaps"]["count"], opened["gaps"]["count"]) == (0, 1)
+    assert [item["kind"] for item in shown["findings"] if item["severity"] == "error"] == ["gap"]
+
+
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
@@ -109,6 +114,8 @@ def test_a_broken_clock_is_a_finding_and_can_be_drawn(inspect):
         ("bad.csv", {"units": ["time=s"]}, "name its column too"),
         ("bad.csv", {"inputs": ["cur"]}, "no channel"),
         ("bad.csv", {"out": "bad.csv"}, "is a file"),
+        ("bad.csv", {"align": "nearest"}, "give hold or linear"),
+        ("bad.csv", {"counter": "n=two"}, "how many samples"),
         ("still.csv", {}, "never increases"),
     ],
 )
