@@ -7,7 +7,7 @@ export MPLCONFIGDIR := $(CURDIR)/$(CACHE)/matplotlib
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test check lint types contract notebooks bench bench-peers nocompiler clean setup
+.PHONY: demo test check lint types contract notebooks bench bench-peers fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -54,6 +54,13 @@ bench: $(READY)
 # Other estimators on one problem, each in an environment of its own; ARGS="--only jax,seaopt" for some of them.
 bench-peers: $(READY)
 	$(BIN)/python benchmarks/peers/run.py $(ARGS)
+
+# Random and mutated CSV, JSON and MAT files, so many seconds each; needs atheris (CPython on Linux).
+FUZZ_SECONDS := 60
+fuzz: $(READY)
+	$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/python -m pip install --quiet --constraint constraints.txt atheris \
+		|| VIRTUAL_ENV=$(VENV) uv pip install --quiet --constraint constraints.txt atheris
+	for target in csv json mat; do $(BIN)/python tools/fuzz.py $$target --seconds $(FUZZ_SECONDS) || exit 1; done
 
 clean:
 	rm -rf $(VENV) out

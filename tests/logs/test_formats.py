@@ -336,15 +336,13 @@ def test_a_matrix_inside_a_struct_cannot_claim_more_than_its_bytes(tmp_path):
         flags = element(6, struct.pack("<II", kind, 0))
         return element(14, flags + element(5, struct.pack(f"<{len(dims)}i", *dims)) + b"".join(rest))
 
-    cell = matrix(1, (1 << 30, 1 << 10), element(1, b""))
-    run = matrix(
-        2, (1, 1), element(1, b"run"), element(5, struct.pack("<i", 8)), element(1, b"F".ljust(8, b"\0")), cell
-    )
-    packed = zlib.compress(run)
+    huge = matrix(6, (1 << 30, 1), element(1, b""), element(9, b"\0" * 80))
+    keys = element(5, struct.pack("<i", 8)) + element(1, b"F".ljust(8, b"\0"))
+    packed = zlib.compress(matrix(2, (1, 1), element(1, b"run"), keys, huge))
     path = tmp_path / "log.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed)
-    with pytest.raises(LogError, match="more than it holds"):
-        contents(path)
+    with pytest.raises(LogError, match="claims 1073741824x1 elements and holds 80 bytes"):
+        one(path, "run.F", time=Column(column="run.F", unit="s"))
 
 
 @pytest.mark.parametrize(

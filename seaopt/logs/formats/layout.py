@@ -19,6 +19,7 @@ from seaopt.units import si_unit
 
 MAX_LINE = 1 << 20
 HEAD = 2 * MAX_LINE  # bytes in which the data must begin
+LINES = 2000  # lines in which the data must begin
 SAMPLE = 200  # lines that decide on delimiter and decimal sign
 COMMENTS = ("#", "%", "//")
 BLANK = frozenset({"", "nan", "na", "n/a"})
@@ -119,10 +120,11 @@ def _head(path: Path) -> tuple[str, list[str]]:
     except UnicodeError as error:
         raise not_text(path, encoding, error) from error
     whole = len(raw) < HEAD
-    lines = text.rstrip("\x1a" if whole else "").split("\n")
-    if (long := next((at for at, line in enumerate(lines, start=1) if len(line) > MAX_LINE), None)) is not None:
+    lines = text.rstrip("\x1a" if whole else "").split("\n", LINES)
+    rest = len(lines) > LINES  # the last item is all that is left
+    if (long := next((at for at, line in enumerate(lines[:LINES], start=1) if len(line) > MAX_LINE), None)) is not None:
         raise too_long(path, long)
-    if not whole:
+    if not whole or rest:
         lines.pop()
     if len(lines) <= 1 and "\r" in text.rstrip("\r\n"):
         raise LogError(f"{path}: its lines end in CR alone; save it with LF line ends")

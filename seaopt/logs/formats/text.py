@@ -6,10 +6,14 @@ it walked line by line, to name that cell. Memory holds the wanted columns and o
 
 from __future__ import annotations
 
+import codecs
 import re
-from collections.abc import Generator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 BLOCK = 8 << 20
+AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
 _RUNS = re.compile(rb"[ \t]+")
 _BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
 
@@ -44,10 +49,16 @@ def _load(path: Path, form: Layout, names: Sequence[str], _: Window | None) -> d
     index = {name: form.headers.index(name) for name in names}
     columns = _Columns(names)
     size = path.stat().st_size
+    pending: deque[tuple[float, Future[dict[str, Any]]]] = deque()
     try:
-        with closing(_blocks(path, form)) as blocks:
-            for line, block in blocks:
-                columns.add(_parse(path, form, block, index, line), size / len(block))
+        with closing(_blocks(path, form)) as blocks, ThreadPoolExecutor(AHEAD) as pool:
+            for number, block in enumerate(blocks):
+                if not block.isspace():
+                    pending.append((size / len(block), pool.submit(_parse, path, form, block, index, number)))
+                if len(pending) > AHEAD:
+                    columns.add(*pending.popleft())
+            while pending:
+                columns.add(*pending.popleft())
     except UnicodeError as error:
         raise not_text(path, form.encoding, error) from error
     return columns.whole()
@@ -60,13 +71,16 @@ class _Columns:
         self.rows = 0
         self.arrays: dict[str, np.ndarray] = {name: np.empty(0) for name in names}
 
-    def add(self, parsed: dict[str, Float[np.ndarray, " n"]], blocks: float) -> None:
+    def add(self, blocks: float, future: Future[dict[str, Any]]) -> None:
+        parsed = future.result()
         count = next(iter(parsed.values())).size
         stop = self.rows + count
         for name, values in parsed.items():
             array = self.arrays[name]
-            if stop > array.size:
-                array.resize(int(max(stop * 1.25, count * blocks * 1.02)), refcheck=False)
+            if not self.rows:  # not filled, so that memory is taken as it is written
+                array = self.arrays[name] = np.empty(int(count * max(blocks, 1.0) * 1.02) + 1)
+            elif stop > array.size:
+                array.resize(int(stop * 1.25), refcheck=False)
             array[self.rows : stop] = values
         self.rows = stop
 
@@ -76,22 +90,28 @@ class _Columns:
         return self.arrays
 
 
-def _blocks(path: Path, form: Layout) -> Generator[tuple[int, bytes]]:
-    """Return blocks of whole lines as UTF-8, each with the number of its first line."""
-    line = 1
+def _blocks(path: Path, form: Layout) -> Generator[bytes]:
+    """Return blocks of whole lines as UTF-8."""
     with _opened(path, form.encoding) as stream:
         for _ in range(form.first):
             stream.readline()
-        line += form.first
+        number = 0
         while part := stream.read(BLOCK):
             rest = stream.readline(MAX_LINE + 1)
             block = part + rest if isinstance(part, bytes) else (part + rest).encode()
-            _check_lines(path, block, line)
+            _check_lines(path, form, block, number)
+            if not number:
+                block = block.removeprefix(codecs.BOM_UTF8)
             if len(part) < BLOCK:  # the last one may end in blank lines, and in the end-of-file mark of DOS
                 block = block.rstrip(b"\x1a \t\r\n") + b"\n"
-            if block.strip():
-                yield line, block
-            line += block.count(b"\n")
+            yield block
+            number += 1
+
+
+def _first_line(path: Path, form: Layout, number: int) -> int:
+    """Return the line on which a block begins; counted only to name a line, as it takes a while."""
+    with closing(_blocks(path, form)) as blocks:
+        return form.first + 1 + sum(block.count(b"\n") for block in islice(blocks, number))
 
 
 def _opened(path: Path, encoding: str) -> IO[Any]:
@@ -100,30 +120,36 @@ def _opened(path: Path, encoding: str) -> IO[Any]:
     return path.open("rb")
 
 
-def _check_lines(path: Path, block: bytes, line: int) -> None:
+def _check_lines(path: Path, form: Layout, block: bytes, number: int) -> None:
     start = 0
     while len(block) - start > MAX_LINE:
         end = block.rfind(b"\n", start, start + MAX_LINE)
         if end < start:
-            raise too_long(path, line + block.count(b"\n", 0, start))
+            raise too_long(path, _first_line(path, form, number) + block.count(b"\n", 0, start))
         start = end + 1
 
 
-def _parse(path: Path, form: Layout, block: bytes, index: dict[str, int], line: int) -> dict[str, Any]:
+def _parse(path: Path, form: Layout, block: bytes, index: dict[str, int], number: int) -> dict[str, Any]:
     import polars as pl
 
-    gaps = b"\n\n" in block or b"\n\r\n" in block or block[:1] in b"\r\n"
-    clean = _BLANK_LINES.sub(b"", block) if gaps else block
-    if form.delimiter == " ":
-        clean = re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", clean))
+    def bad(reason: str) -> LogError:
+        return _bad_cell(path, form, block, index, _first_line(path, form, number), reason)
+
     try:
-        frame = _frame(clean, form, index, pl.Float64)
+        frame = _frame(_blanks_as_tabs(block, form), form, index, pl.Float64)
     except (pl.exceptions.PolarsError, ValueError):
-        return _parse_text(path, form, block, clean, index, line)
+        return _parse_text(form, block, index, bad)
+    if frame.to_series(0).null_count() and _BLANK_LINES.search(block):
+        return _parse_text(form, block, index, bad)
     parsed = {name: frame[f"column_{at}"].to_numpy() for name, at in index.items()}
     if any(np.isinf(values).any() for values in parsed.values()):
-        raise _bad_cell(path, form, block, index, line, "a cell is infinite")
+        raise bad("a cell is infinite")
     return parsed
+
+
+def _blanks_as_tabs(block: bytes, form: Layout) -> bytes:
+    """Return a block whose delimiter is one byte."""
+    return re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", block)) if form.delimiter == " " else block
 
 
 def _frame(block: bytes, form: Layout, index: dict[str, int], kind: Any) -> pl.DataFrame:
@@ -144,23 +170,21 @@ def _frame(block: bytes, form: Layout, index: dict[str, int], kind: Any) -> pl.D
     )
 
 
-def _parse_text(
-    path: Path, form: Layout, block: bytes, clean: bytes, index: dict[str, int], line: int
-) -> dict[str, Any]:
-    """Parse cells with blanks around their numbers; what is still no number is named."""
+def _parse_text(form: Layout, block: bytes, index: dict[str, int], bad: Callable[[str], LogError]) -> dict[str, Any]:
+    """Parse a block with blank lines, or with blanks around its numbers; what is still no number is named."""
     import polars as pl
 
     try:
-        frame = _frame(clean, form, index, pl.String)
+        frame = _frame(_blanks_as_tabs(_BLANK_LINES.sub(b"", block), form), form, index, pl.String)
     except (pl.exceptions.PolarsError, ValueError) as error:
-        raise _bad_cell(path, form, block, index, line, one_line(error)) from error
+        raise bad(one_line(error)) from error
     parsed: dict[str, Any] = {}
     for name, at in index.items():
         text = frame[f"column_{at}"].str.strip_chars()
         values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
         blank = text.is_null() | text.str.to_lowercase().is_in(list(BLANK))
         if (values.is_null() & ~blank).any() or values.is_infinite().any():
-            raise _bad_cell(path, form, block, index, line, "a cell is no number")
+            raise bad("a cell is no number")
         parsed[name] = values.to_numpy()
     return parsed
 
