@@ -24,6 +24,7 @@ CHOICES = (
     ("double", "float"),
     ("zero", "first"),
     ("split", "error"),
+    ("auto", "declared", "none"),
     ("pd", "pid"),
     ("error", "measurement"),
     ("disturbance", "noise"),

@@ -109,6 +109,18 @@ def test_the_estimator_and_the_controller_of_the_mpc_page_work(tmp_path, monkeyp
     assert (tmp_path / "force_mpc" / "force_mpc.h").exists()
 
 
+def test_the_log_of_the_quality_page_is_clipped_and_masked():
+    space: dict = {}
+    for code in blocks("log_quality.md", "python"):
+        exec(re.sub(r"(?m)^print\(.*", "", code), space)
+    eta = {name: space[name].parameters["eta"] for name in ("masked", "declared", "biased")}
+    assert len(space["clipped"]) == 2
+    assert abs(eta["masked"].value - 1) < 3 * eta["masked"].std
+    assert eta["declared"].value == pytest.approx(eta["masked"].value)
+    assert eta["biased"].value < 1 - 10 * eta["biased"].std
+    assert space["again"].rate_hz == 200
+
+
 def test_every_figure_of_the_docs_is_there():
     for page in DOCS.glob("*.md"):
         for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):

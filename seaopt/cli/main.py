@@ -101,6 +101,42 @@ def frf(
     _finish(session, json, ["frf"])
 
 
+@app.command()
+def inspect(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A raw log, of any format.", show_default=False)],
+    time: Annotated[str | None, typer.Option(metavar="COLUMN", help="The clock's column.")] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=COLUMN", help="A channel; every column of numbers if left out. Repeatable."),
+    ] = None,
+    unit: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=UNIT", help="Unit of a channel, or of time. Repeatable.")
+    ] = None,
+    driven_by: Annotated[
+        list[str] | None,
+        typer.Option("--input", metavar="NAME", help="A channel that drives the others. Repeatable."),
+    ] = None,
+    align: Annotated[
+        str | None, typer.Option(metavar="RULE", help="How channels of other clocks come to this one: hold or linear.")
+    ] = None,
+    counter: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN=SAMPLES", help="A column that counts samples, and how many a count stands for."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write quality.json and the figure there.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Look for every fault in a log, and say what it excites."""
+    from seaopt.cli.inspect import inspect_log
+
+    inspect_log(
+        log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
+        counter=counter, folder=output, json=json,
+    )  # fmt: skip
+
+
 def _stage(name: str, text: str) -> Callable[..., None]:
     def command(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
         from seaopt.cli.session import Session

@@ -13,6 +13,7 @@ from jaxtyping import Int
 
 from seaopt.errors import EstimationError, suggestion
 from seaopt.logs import Log
+from seaopt.logs.mask import mask_saturated
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.simulation import Hold, Segment
@@ -21,6 +22,7 @@ from seaopt.units import same_dimension
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
+Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
@@ -59,6 +61,12 @@ class Experiment:
         The input between samples: a command is held, a measured current is better drawn as a line.
     gaps : {"split", "error"}
         A gap in the log starts a new segment with its own initial state, or is an error.
+    saturation : mapping of output to (low, high)
+        Ranges of the sensors: samples at an end or beyond it become missing.
+    mask : {"auto", "declared", "none"}
+        Saturated samples of outputs become missing, which `notes` says: those outside the declared ranges, and those at
+        clear flat tops where no range is declared; the declared ones alone; or none. An input that saturates is what
+        the plant got.
     shots : int
         Cut each segment into so many that start from states of their own: for a plant that runs away in simulation, at
         the price of what the joints would tell.
@@ -89,6 +97,8 @@ class Experiment:
     delay_s: float | Parameter = 0.0
     hold: Hold = "zero"
     gaps: Literal["split", "error"] = "split"
+    saturation: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    mask: Mask = "auto"
     shots: int = 1
     stretches: tuple[slice, ...] = field(init=False)
 
@@ -117,6 +127,28 @@ class Experiment:
         self._check_units()
         object.__setattr__(self, "stretches", tuple(self.log.segments))
         self._check_settings()
+        self._mask()
+
+    def _mask(self) -> None:
+        """Make saturated samples missing in the experiment's own log."""
+        if self.mask not in ("auto", "declared", "none"):
+            raise EstimationError(
+                f'experiment {self.name}: mask = "{self.mask}" is not known; use "auto", "declared" or "none"'
+            )
+        for name, ends in self.saturation.items():
+            if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
+                raise EstimationError(
+                    f"experiment {self.name}: saturation of {name} = {ends} is no range; give [low, high]"
+                )
+        if self.mask == "none":
+            return
+        log = mask_saturated(self.log, self.outputs, ranges=self.saturation, search=self.mask == "auto")
+        for name in self.outputs:
+            if not np.any(np.isfinite(log[name])):
+                raise EstimationError(
+                    f"experiment {self.name}: every sample of {name} is saturated; correct saturation, or leave it out"
+                )
+        object.__setattr__(self, "log", log)
 
     def _check_units(self) -> None:
         for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
@@ -129,13 +161,14 @@ class Experiment:
                     )
 
     def _check_settings(self) -> None:
-        for what, given in (("sigma", self.sigma), ("gain", self.gain)):
+        for what, given in (("sigma", self.sigma), ("gain", self.gain), ("saturation", self.saturation)):
             if not isinstance(given, Mapping):
                 raise EstimationError(f"experiment {self.name}: {what} = {given!r}; give a mapping of output to value")
         known = {
             "sigma": self.sigma,
             "gain": self.gain,
             "offset": self.offset if self.offset is not True else {},
+            "saturation": self.saturation,
         }
         for what, given in known.items():
             for name in given if isinstance(given, Mapping) else ():
@@ -181,6 +214,23 @@ class Experiment:
     def __repr__(self) -> str:
         count = _counted(len(self.stretches), "segment")
         return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the log, and which of its samples have no weight, one sentence each."""
+        log, pieces = self.log, self.log.segments
+        notes = list(log.notes)
+        if log.gaps:
+            alone = len(log) - sum(piece.stop - piece.start for piece in pieces)
+            notes.append(
+                f"{_counted(len(log.gaps), 'gap')} split the log into {_counted(len(pieces), 'segment')}"
+                + (f", {_counted(alone, 'sample')} alone between gaps left out" if alone else "")
+            )
+        for name in self.outputs:
+            missing = int(np.count_nonzero(~np.isfinite(log[name])))
+            if missing:
+                notes.append(f"{name}: {missing} of {len(log)} samples are missing or masked and have no weight")
+        return tuple(notes)
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
         """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""

@@ -71,6 +71,8 @@ class Fit:
         All that was estimated, experiments' own included, sigmas not.
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
+    notes : tuple of str
+        What was done to the logs, and which samples had no weight, one sentence each.
     experiments : tuple of Experiment
         The data; empty when read from a file.
     minimum : Minimum or None
@@ -96,6 +98,7 @@ class Fit:
     log_likelihood: float = math.nan
     unknowns: int = 0
     method: str = "output_error"
+    notes: tuple[str, ...] = ()
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
     minimum: Minimum | None = field(default=None, repr=False)
 
@@ -197,6 +200,7 @@ class Fit:
             "unknowns": self.unknowns,
             "aic": self.aic,
             "bic": self.bic,
+            "notes": list(self.notes),
         }
 
     @classmethod
@@ -233,6 +237,7 @@ class Fit:
                     f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
                     f"rms residual {item.rms_residual:.4g} {item.unit}"
                 )
+        lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -324,5 +329,6 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
         log_likelihood=_number(content.get("log_likelihood"), math.nan),
         unknowns=int(content.get("unknowns", 0)),
         method=str(content.get("method", "output_error")),
+        notes=tuple(str(note) for note in content.get("notes", ())),
         experiments=experiments,
     )  # fmt: skip

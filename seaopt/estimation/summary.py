@@ -87,6 +87,7 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         log_likelihood=_log_likelihood(problem, found),
         unknowns=z.size,
         method=_method_name(method),
+        notes=tuple(f"{e.name}: {note}" for e in problem.experiments for note in e.notes),
         experiments=problem.experiments,
         minimum=Minimum(problem=problem, z=z),
     )

@@ -221,7 +221,7 @@ def _check(log: Log, names: Sequence[str]) -> None:
         lost = int(np.count_nonzero(~np.isfinite(log[name])))
         if lost:
             raise LogError(
-                f"{log.source}: {lost} samples of {name} are missing and a frequency response takes all; "
+                f"{log.source}: {lost} samples of {name} are missing or masked and a frequency response takes all; "
                 "choose a stretch with slice_s"
             )
 

@@ -6,7 +6,7 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +14,13 @@ from jaxtyping import Float
 from seaopt.errors import LogError, suggestion
 from seaopt.signals import Signal
 from seaopt.units import factor, si_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+
+    from seaopt.logs.align import Rule
+    from seaopt.logs.quality import Quality
 
 JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
 GAP = 1.5  # periods between two samples that make a gap
@@ -31,6 +38,8 @@ class Log:
         Channels of n samples each, in SI.
     source : str
         Where the log came from, for messages and reports.
+    notes : tuple of str
+        What was done to it since, one sentence each.
 
     Examples
     --------
@@ -45,6 +54,7 @@ class Log:
     time: Float[np.ndarray, " n"]
     signals: Mapping[str, Signal]
     source: str = "arrays"
+    notes: tuple[str, ...] = ()
     period: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -156,7 +166,8 @@ class Log:
             if worst > JITTER_LIMIT * self.period:
                 raise LogError(
                     f"{self.source}: a step of time strays {worst / self.period:.0%} from the period "
-                    f"{self.period:.4g} s (5 % is allowed); resample the log on a uniform clock first"
+                    f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={self._round_rate:g}), or "
+                    "log.restamp() where only the timestamps are rounded (in a problem file: resample)"
                 )
         return pieces
 
@@ -176,8 +187,83 @@ class Log:
                 f"{self.source}: slice_s = [{start_s:g}, {stop_s:g}] holds fewer than 2 of its samples; "
                 f"the log runs from 0 to {self.duration_s:g} s"
             )
-        signals = {name: replace(item, values=item.values[keep].copy()) for name, item in self.signals.items()}
-        return Log(time=self.time[keep].copy(), signals=signals, source=self.source)
+        note = f"cut to {start_s:g} to {stop_s:g} s: {np.count_nonzero(keep)} of {len(self)} samples"
+        return self.with_values(self.time[keep], {name: self[name][keep] for name in self.signals}, note)
+
+    def with_values(
+        self, time: Float[np.ndarray, " n"], values: Mapping[str, Float[np.ndarray, " n"]], note: str
+    ) -> Log:
+        """Return the log's channels, units and origins with other samples, and a note of what was done."""
+        signals = {name: replace(self.signals[name], values=array.copy()) for name, array in values.items()}
+        return replace(self, time=time.copy(), signals=signals, notes=(*self.notes, note))
+
+    @property
+    def quality(self) -> Quality:
+        """What is wrong with the data, and what they can tell: see `seaopt.logs.quality`."""
+        from seaopt.logs.quality import quality
+
+        return quality(self)
+
+    def resample(self, *, rate_hz: float, rule: Rule | None = None, bridge_s: float | None = None) -> Log:
+        """Return the log on a uniform clock: see `seaopt.logs.resample.resample`."""
+        from seaopt.logs.resample import resample
+
+        return resample(self, rate_hz=rate_hz, rule=rule, bridge_s=bridge_s)
+
+    def restamp(self) -> Log:
+        """Return the log with rounded timestamps made uniform: see `seaopt.logs.resample.restamp`."""
+        from seaopt.logs.resample import restamp
+
+        return restamp(self)
+
+    def decimate(self, factor: int) -> Log:
+        """Return every `factor`-th sample behind an anti-alias filter: see `seaopt.logs.decimate.decimate`."""
+        from seaopt.logs.decimate import decimate
+
+        return decimate(self, factor)
+
+    def to_arrays(self) -> dict[str, Float[np.ndarray, " n"]]:
+        """Return copies of time and channels by name, as `from_arrays` takes them."""
+        return {"time": self.time.copy()} | {name: self[name].copy() for name in self.signals}
+
+    def to_polars(self) -> pl.DataFrame:
+        """Return a polars frame, units in the column names' brackets: "time [s]", "F1 [N]"."""
+        from seaopt.logs.frames import to_polars
+
+        return to_polars(self)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a pandas frame with the columns of `to_polars`.
+
+        Raises
+        ------
+        LogError
+            pandas is not installed.
+
+        """
+        from seaopt.logs.frames import to_pandas
+
+        return to_pandas(self)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        *,
+        time: str = "time [s]",
+        channels: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        source: str = "frame",
+    ) -> Log:
+        """Build a log from a polars or pandas frame: see `seaopt.logs.frames.from_frame`."""
+        from seaopt.logs.frames import from_frame
+
+        return from_frame(frame, time=time, channels=channels, units=units, source=source)
+
+    @property
+    def _round_rate(self) -> float:
+        """The rate to three digits: what one would resample to."""
+        return float(f"{1.0 / self.period:.3g}")
 
     def __repr__(self) -> str:
         lines = [f"Log {self.source}: {len(self)} samples, {self.duration_s:.6g} s at {self.rate_hz:.6g} Hz"]
@@ -186,6 +272,7 @@ class Log:
             span = f"{good.min():.4g} to {good.max():.4g}" if good.size else "no finite sample"
             lost = signal.values.size - good.size
             lines.append(f"  {name} [{signal.unit or 'SI'}]  {span}" + (f", {lost} missing" if lost else ""))
+        lines += [f"  {note}" for note in self.notes]
         count = len(self.gaps)
         if count:
             shown = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])

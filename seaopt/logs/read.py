@@ -136,17 +136,12 @@ def read_log(
     for signal in table.signals.values():
         if not np.any(np.isfinite(signal.values)):
             raise LogError(f'{table.source}: column "{signal.origin.column}" holds no number; choose another column')
-    return Log(time=table.time, signals=table.signals, source=table.source)
+    return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes)
 
 
 def write_log(log: Log, path: str | Path) -> Path:
     """Write a log as CSV, units in the header's brackets, numbers with all their digits."""
-    import polars as pl
-
-    columns = {"time [s]": log.time}
-    for name, signal in log.signals.items():
-        columns[f"{name} [{signal.unit}]" if signal.unit else name] = signal.values
-    return write_text(path, pl.DataFrame(columns).write_csv())
+    return write_text(path, log.to_polars().write_csv())
 
 
 def _digest(path: Path) -> str:

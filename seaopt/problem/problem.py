@@ -145,6 +145,7 @@ class Problem:
         log = self._virtual(plant, table.virtual) if table.virtual else self._read(table)
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
+        log = _on_its_clock(log, table).decimate(table.decimate)
         sigma = dict(table.sigma)
         for name, item in table.outputs.items():
             if isinstance(item, ColumnTable) and item.sigma is not None:
@@ -154,7 +155,7 @@ class Problem:
             plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
             offset=table.offset, gain={name: _unknown(name, "-", item) for name, item in table.gain.items()},
             delay_s=_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
-            drift=table.drift, shots=table.shots,
+            drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask,
         )  # fmt: skip
 
     def _read(self, table: ExperimentTable) -> Log:
@@ -192,6 +193,16 @@ class Problem:
             plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
             seed=table.seed, sensors=sensors,
         )  # fmt: skip
+
+
+def _on_its_clock(log: Log, table: ExperimentTable) -> Log:
+    """Return the log on the uniform clock that the file asks for; as it is, if it asks for none."""
+    asked = table.resample
+    if asked is None:
+        return log
+    if asked == "restamp":
+        return log.restamp()
+    return log.resample(rate_hz=asked.rate_hz, rule=rule_of(asked.rule), bridge_s=asked.bridge_s)
 
 
 def _method(table: FitTable) -> Method:

@@ -155,6 +155,14 @@ class VirtualTable(_Strict):
     outputs: list[str] = []
 
 
+class ResampleTable(_Strict):
+    """A uniform clock that a log is interpolated to, by lines where no rule is given."""
+
+    rate_hz: Annotated[Number, Field(gt=0, le=1e9)]
+    rule: AlignTable | None = None
+    bridge_s: Annotated[Number, Field(gt=0)] | None = None
+
+
 class ExperimentTable(_Strict):
     """One log, or one virtual experiment, of one plant."""
 
@@ -177,6 +185,10 @@ class ExperimentTable(_Strict):
     drift: Annotated[Whole, Field(ge=0, le=5)] = 0
     shots: Annotated[Whole, Field(ge=1, le=100_000)] = 1
     slice_s: tuple[Number, Number] | None = None
+    resample: Literal["restamp"] | ResampleTable | None = None
+    decimate: Annotated[Whole, Field(ge=1, le=10_000)] = 1
+    saturation: dict[str, tuple[Number, Number]] = {}
+    mask: Literal["auto", "declared", "none"] = "auto"
     gaps: Literal["split", "error"] = "split"
 
 

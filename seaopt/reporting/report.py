@@ -80,9 +80,9 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     target = Path(path)
     drawn: list[dict[str, str]] = []
     for name, figure in figures.items():
-        svg = _rendered(figure, "svg")
+        svg = rendered(figure, "svg")
         write_bytes(target.parent / "figures" / f"{name}.svg", svg)
-        write_bytes(target.parent / "figures" / f"{name}.png", _rendered(figure, "png"))
+        write_bytes(target.parent / "figures" / f"{name}.png", rendered(figure, "png"))
         drawn.append(
             {
                 "name": name,
@@ -137,7 +137,7 @@ def write_frequency_figure(
 
     """
     figure = survey_figure(surveys, given, fitted)
-    return [write_bytes(f"{path}.{kind}", _rendered(figure, kind)) for kind in ("svg", "png")]
+    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
 
 
 def _only(results: Sequence[Result], kind: type) -> Any:
@@ -157,7 +157,8 @@ def _plants(controller: Controller | None, certificate: Certificate | None) -> d
     return {}
 
 
-def _rendered(figure: Any, kind: str) -> bytes:
+def rendered(figure: Any, kind: str) -> bytes:
+    """Return a figure as a file of a kind, the same bytes each time."""
     import matplotlib as mpl
 
     stream = io.BytesIO()

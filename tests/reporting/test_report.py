@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import seaopt as so
@@ -68,3 +69,11 @@ def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path):
     read = so.Fit.from_dict(so.fit([bench], thor.free("J")).to_dict(), (bench,))
     page = so.write_report([read], tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Measured against model" in page and "Diagnostics" not in page
+
+
+def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, tmp_path):
+    limit = 0.6 * np.max(np.abs(short_log["F1"]))
+    experiment = so.Experiment(plant=stand, log=short_log, outputs=("F1",), saturation={"F1": (-limit, limit)})
+    fit = so.fit([experiment], thor.free("J", "b_r"))
+    page = so.write_report([fit], tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "at or beyond its declared range" in page

@@ -1,0 +1,134 @@
+"""The clock of a log: its rate, its jitter, and where it stands still, runs backwards or skips samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.errors import LogError
+from seaopt.logs.log import GAP
+
+LOOKED_AT = 200_000  # steps that are enough to see the rounding of timestamps
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClockQuality:
+    """What the timestamps say; rows are counted from 0.
+
+    Parameters
+    ----------
+    samples : int
+    period : float
+        Mean step between samples that are not across a gap, in s.
+    jitter_rms, jitter_max : float
+        Of those steps, from the period, in s.
+    rounding : float
+        Step that the timestamps are rounded to, in s; 0 where none is seen.
+    rounded_only : bool
+        Whether the rounding explains the jitter: behind it the sampling may be perfect.
+    not_numbers, backwards, repeated, gaps : array of int
+        Rows whose time is no number, lies before or at that of the row ahead of it, or follows a gap.
+    lost : array of int
+        Samples that are missing in each gap.
+
+    """
+
+    samples: int
+    period: float
+    jitter_rms: float
+    jitter_max: float
+    rounding: float
+    rounded_only: bool
+    not_numbers: Int[np.ndarray, " a"]
+    backwards: Int[np.ndarray, " b"]
+    repeated: Int[np.ndarray, " c"]
+    gaps: Int[np.ndarray, " d"]
+    lost: Int[np.ndarray, " d"]
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate in Hz."""
+        return float(f"{1.0 / self.period:.9g}")
+
+
+def clock_of(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
+    """Return what the timestamps of a log or table say.
+
+    Raises
+    ------
+    LogError
+        Fewer than two of them increase: there is no clock.
+
+    Examples
+    --------
+    >>> clock = clock_of(np.array([0.0, 0.1, 0.2, 0.5, 0.6]), "log")
+    >>> clock.rate_hz, clock.gaps.tolist(), clock.lost.tolist()
+    (10.0, [3], [2])
+
+    """
+    finite = np.flatnonzero(np.isfinite(time))
+    stamps = time if finite.size == time.size else time[finite]
+    step = np.diff(stamps)
+    onward = step[step > 0.0]
+    if not onward.size:
+        raise LogError(f"{source}: time never increases; name the column that is the clock")
+    period = float(np.mean(onward[onward <= GAP * np.median(onward)]))
+    across = step > GAP * period
+    inside = step[(step > 0.0) & ~across]
+    strays = inside - period
+    rounding = resolution(stamps)
+    return ClockQuality(
+        samples=time.size,
+        period=period,
+        jitter_rms=float(np.sqrt(np.mean(strays**2))),
+        jitter_max=float(np.max(np.abs(strays))),
+        rounding=rounding,
+        rounded_only=rounding > 0.0 and _explained(stamps, step, across, rounding, period),
+        not_numbers=np.flatnonzero(~np.isfinite(time)),
+        backwards=finite[1:][step < 0.0],
+        repeated=finite[1:][step == 0.0],
+        gaps=finite[1:][across],
+        lost=np.maximum(np.round(step[across] / period).astype(int) - 1, 1),
+    )
+
+
+def resolution(time: Float[np.ndarray, " n"]) -> float:
+    """Return the step that timestamps are rounded to; 0 where they are as fine as floats.
+
+    Examples
+    --------
+    >>> float(round(resolution(np.round(np.arange(400) / 400, 3)), 9))
+    0.001
+    >>> resolution(np.arange(400) / 400)
+    0.0
+
+    """
+    step = np.diff(time[:LOOKED_AT])
+    noise = 16.0 * np.finfo(float).eps * float(np.max(np.abs(time[: step.size + 1])))
+    kinds = np.unique(step)
+    apart = np.diff(kinds)
+    apart = apart[apart > noise]
+    if not apart.size or float(np.ptp(step)) <= 1e-6 * float(np.median(np.abs(step))):
+        return 0.0
+    unit = float(np.min(apart))
+    multiples = kinds / unit
+    off = np.abs(multiples - np.round(multiples)) * unit
+    return unit if float(np.max(off)) <= max(0.02 * unit, noise) and unit > 4.0 * noise else 0.0
+
+
+def _explained(
+    stamps: Float[np.ndarray, " n"], step: Float[np.ndarray, " m"], across: Float[np.ndarray, " m"] | np.ndarray,
+    rounding: float, period: float,
+) -> bool:  # fmt: skip
+    """Tell whether every stretch between gaps lies on a line through its timestamps, within their rounding."""
+    if np.any(step < 0.0):
+        return False
+    breaks = np.flatnonzero(across) + 1
+    for first, last in pairwise([0, *breaks.tolist(), stamps.size]):
+        strays = stamps[first:last] - period * np.arange(last - first)
+        if np.ptp(strays) > 2.0 * rounding + 1e-9 * period:
+            return False
+    return True

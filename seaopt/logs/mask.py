@@ -1,0 +1,93 @@
+"""Saturated samples of a measured output: what the sensor could not follow says nothing of the plant.
+
+They become missing samples (NaN), which have no weight in a fit, and the log's notes say how many and why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.logs.faults import outliers, quantisation, rails, stillness
+from seaopt.logs.log import Log
+
+TOP = 16  # extreme samples among which equal ones give a rail away
+
+
+def mask_saturated(
+    log: Log, outputs: Collection[str], *, ranges: Mapping[str, tuple[float, float]], search: bool
+) -> Log:
+    """Make the saturated samples of outputs missing.
+
+    Parameters
+    ----------
+    log : Log
+        The log.
+    outputs : collection of str
+        Channels to look at.
+    ranges : mapping of channel to (low, high)
+        Declared ranges of sensors, in SI: samples at an end or beyond it are saturated.
+    search : bool
+        Whether to look for clear flat tops, as the quality report does, where no range is declared.
+
+    Returns
+    -------
+    Log
+        The log itself where nothing is saturated.
+
+    Examples
+    --------
+    >>> log = Log.from_arrays(time=np.arange(5) / 10, F1=[0.0, 8.0, 9.0, 9.0, 3.0], units={"F1": "N"})
+    >>> masked = mask_saturated(log, ["F1"], ranges={"F1": (-9.0, 9.0)}, search=True)
+    >>> masked["F1"].tolist(), masked.notes
+    ([0.0, 8.0, nan, nan, 3.0], ('F1: 2 samples (40 %) at or beyond its declared range of -9 to 9 N masked',))
+
+    """
+    for name in outputs:
+        if name in ranges:
+            low, high = ranges[name]
+            rows = (log[name] <= low) | (log[name] >= high)
+            why = f"at or beyond its declared range of {low:g} to {high:g}"
+            log = _masked(log, name, rows, why, "")
+        elif search:
+            rows, why = _flat(log[name])
+            log = _masked(log, name, rows, why, ' (flat tops; mask = "declared" keeps them)')
+    return log
+
+
+def _masked(log: Log, name: str, rows: Bool[np.ndarray, " n"], why: str, after: str) -> Log:
+    count = int(np.count_nonzero(rows))
+    if not count:
+        return log
+    signal = log.signal(name)
+    plural = "sample" if count == 1 else "samples"
+    note = f"{name}: {count} {plural} ({100 * count / len(log):.2g} %) {why} {signal.unit}".rstrip() + f" masked{after}"
+    signals = {**log.signals, name: replace(signal, values=np.where(rows, np.nan, signal.values))}
+    return replace(log, signals=signals, notes=(*log.notes, note))
+
+
+def _flat(values: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], str]:
+    """Return which samples lie at a clear rail, and where the rails are."""
+    rows = np.zeros(values.size, dtype=bool)
+    if not _may_be_flat(values):
+        return rows, ""
+    quantum = quantisation(values)
+    tame = values.copy()
+    tame[outliers(values, quantum)] = np.nan
+    found = [rail for rail in rails(tame, quantum, stillness(values)) if rail.clear]
+    for rail in found:
+        for start, stop in zip(rail.runs.start, rail.runs.stop, strict=True):
+            rows[start:stop] = True
+    return rows, "clipped at " + " and ".join(f"{rail.value:.5g}" for rail in found)
+
+
+def _may_be_flat(values: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether some of the largest, or of the least, samples are equal: nearly every log ends here."""
+    good = values[np.isfinite(values)]
+    if good.size <= 2 * TOP:
+        return False
+    ordered = np.partition(good, (TOP, good.size - TOP))
+    return any(np.unique(end).size <= TOP - 2 for end in (ordered[:TOP], ordered[-TOP:]))

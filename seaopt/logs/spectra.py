@@ -1,0 +1,177 @@
+r"""Spectra of a log's channels on the same stretches: mains hum, excitation, coherence and delays.
+
+Hann-windowed stretches that overlap by half (Welch 1967), none across a gap. Long logs are sampled: at most 64
+stretches
+of at most 32,768 samples, spread over the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+SHORTEST, LONGEST, FEWEST, MOST = 32, 1 << 15, 4, 64
+MAINS_HZ = (50.0, 60.0)
+HARMONICS = 5
+BESIDE_HZ = 12.0  # from a line: where the noise floor is read
+LINE = 4.0  # times the noise floor: 6 dB
+FAMILY = 3  # lines beside the mains' in the same channel that make a multisine
+BRIDGED = 0.02  # share of a stretch's samples that may be missing: they are bridged by lines
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spectra:
+    """Windowed spectra of every channel, one row a stretch, from 0 Hz on.
+
+    Parameters
+    ----------
+    frequency_hz : array, shape (m,)
+    period : float
+        Seconds between samples.
+    channels : mapping of name to complex array, shape (stretches, m)
+        Channels that have samples missing in most stretches are left out, and then stretches that have holes.
+
+    """
+
+    frequency_hz: Float[np.ndarray, " m"]
+    period: float
+    channels: Mapping[str, Complex[np.ndarray, "d m"]]
+
+    @property
+    def stretches(self) -> int:
+        """Number of stretches."""
+        return next((len(item) for item in self.channels.values()), 0)
+
+    @property
+    def averages(self) -> float:
+        """Independent averages that the overlapping stretches are worth."""
+        return max(1.0, 0.947 * self.stretches)
+
+    def power(self, name: str) -> Float[np.ndarray, " m"]:
+        """Return the mean power of each line, up to a factor common to all channels."""
+        return np.mean(np.abs(self.channels[name]) ** 2, axis=0)
+
+    def cross(self, first: str, second: str) -> Complex[np.ndarray, " m"]:
+        """Return the mean cross-spectrum, first's conjugate times second."""
+        return np.mean(np.conj(self.channels[first]) * self.channels[second], axis=0)
+
+    def coherence(self, first: str, second: str) -> Float[np.ndarray, " m"]:
+        """Return the squared coherence of each line."""
+        floor = np.maximum(self.power(first) * self.power(second), 1e-300)
+        return np.abs(self.cross(first, second)) ** 2 / floor
+
+
+def spectra(channels: Mapping[str, Float[np.ndarray, " n"]], pieces: Sequence[slice], period: float) -> Spectra | None:
+    """Return the spectra of the channels over the stretches without a gap; None where there is no stretch.
+
+    Parameters
+    ----------
+    channels : mapping of name to array, shape (n,)
+        Samples.
+    pieces : sequence of slice
+        Rows without a gap.
+    period : float
+        Seconds between samples.
+
+    """
+    total = sum(piece.stop - piece.start for piece in pieces)
+    length = 2 * (min(max(total // 16, SHORTEST), LONGEST) // 2)
+    starts = np.array(
+        [row for piece in pieces for row in range(piece.start, piece.stop - length + 1, max(length // 2, 1))], dtype=int
+    )
+    if starts.size < FEWEST:
+        return None
+    if starts.size > MOST:
+        starts = starts[np.linspace(0, starts.size - 1, MOST).astype(int)]
+    cuts = {name: np.stack([values[start : start + length] for start in starts]) for name, values in channels.items()}
+    holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED for name, cut in cuts.items()}
+    kept = [name for name in cuts if np.mean(holed[name]) <= 0.5]
+    whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(starts.size, dtype=bool)
+    if np.count_nonzero(whole) < FEWEST:
+        return None
+    window = np.hanning(length)
+    found = {name: _spectrum(cuts[name][whole], window) for name in kept}
+    return Spectra(frequency_hz=np.fft.rfftfreq(length, period), period=period, channels=found)
+
+
+def _spectrum(cut: Float[np.ndarray, "d n"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
+    """Return the spectra of stretches without their means; missing samples are bridged."""
+    rows = np.arange(window.size)
+    for row in np.flatnonzero(~np.all(np.isfinite(cut), axis=1)):
+        good = np.flatnonzero(np.isfinite(cut[row]))
+        cut[row] = np.interp(rows, good, cut[row, good])
+    return np.fft.rfft((cut - cut.mean(axis=1, keepdims=True)) * window, axis=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hum:
+    """Lines of the mains in one channel: each line's frequency and height over the noise floor, and their rms."""
+
+    mains_hz: float
+    lines_hz: tuple[float, ...]
+    over_floor_db: tuple[float, ...]
+    rms: float
+
+
+def hum(found: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
+    """Return the mains' lines of a channel, None where there are none or the stretches are too short to tell.
+
+    A line stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median stretch: what comes and goes,
+    such as a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines
+    stand out as well it is a multisine.
+    """
+    f = found.frequency_hz
+    width = f[1] - f[0]
+    if width > 1.5 or found.stretches < 6:
+        return None
+    square = np.abs(found.channels[name]) ** 2
+    steady = np.median(square, axis=0)
+    others = [found.coherence(other, name) for other in inputs if other in found.channels and other != name]
+    own = 1.0 - np.max(others, axis=0) if others else np.ones(f.size)
+    limit = LINE * (1.0 + 2.0 / np.sqrt(found.averages))
+    for mains in MAINS_HZ:
+        lines: list[tuple[float, float, float]] = []
+        for k in range(1, HARMONICS + 1):
+            line = k * mains
+            if line > f[-1] - 2.0 * width:
+                break
+            at = np.abs(f - line) <= max(0.5, width)
+            floor = _floor(f, steady, line)
+            ratio = float(np.max(steady[at] * own[at])) / max(floor, 1e-300)
+            if k == 1 and (ratio < limit or _lines_beside(f, steady, line, limit) >= FAMILY):
+                break
+            if ratio >= limit:
+                lines.append((line, 10.0 * np.log10(ratio), float(np.sum(np.mean(square[:, at], axis=0) - floor))))
+        if lines:
+            # Parseval for a Hann window of n samples: a line's power in its bins is a^2/4 times 3 n^2/8.
+            n = 2 * (f.size - 1)
+            power = sum(max(item[2], 0.0) for item in lines)
+            return Hum(
+                mains_hz=mains,
+                lines_hz=tuple(item[0] for item in lines),
+                over_floor_db=tuple(round(float(item[1]), 1) for item in lines),
+                rms=float(np.sqrt(2.0 * power / (0.375 * n**2))),
+            )
+    return None
+
+
+def _lines_beside(f: Float[np.ndarray, " m"], steady: Float[np.ndarray, " m"], line: float, limit: float) -> int:
+    """Return how many other lines stand out as much within an octave each side, the mains' own multiples left out."""
+    inside = np.flatnonzero((f > 0.5 * line) & (f < 2.0 * line))
+    count = 0
+    for row in inside[1:-1]:
+        multiple = any(abs(f[row] - k * mains) <= 2.0 + 3.0 * (f[1] - f[0]) for k in (1, 2, 3) for mains in MAINS_HZ)
+        if multiple or steady[row] < max(steady[row - 1], steady[row + 1]):
+            continue
+        count += bool(steady[row] > limit * _floor(f, steady, float(f[row])))
+    return count
+
+
+def _floor(f: Float[np.ndarray, " m"], steady: Float[np.ndarray, " m"], line: float) -> float:
+    """Return the spectrum beside a line: the larger of the medians below and above it, for it may slope."""
+    apart, clear = f - line, 3.0 * (f[1] - f[0]) + 0.5
+    sides = [steady[(sign * apart > clear) & (sign * apart <= BESIDE_HZ)] for sign in (-1.0, 1.0)]
+    return max((float(np.median(side)) for side in sides if side.size >= 3), default=np.inf)

@@ -1,0 +1,124 @@
+"""`seaopt inspect` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.bench import PAPER_STAND
+from seaopt.cli.inspect import inspect_log
+from seaopt.errors import SeaoptError
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, stand, thor):
+    path = tmp_path_factory.mktemp("inspect")
+    sensors = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}, saturation={"F1": 300.0})
+    log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=10, rate_hz=400, seed=1, sensors=sensors)
+    arrays = log.to_arrays()
+    arrays["F2"][100:130] = np.nan
+    arrays = {name: np.delete(values, slice(2000, 2100)) for name, values in arrays.items()}
+    units = {"I": "A", "F1": "N", "F2": "N"}
+    so.write_log(so.Log.from_arrays(units=units, **arrays), path / "bad.csv")
+    so.write_log(so.Log.from_arrays(**arrays), path / "bare.csv")
+    (path / "twice.csv").write_text("time [s],F1 [N]\n0,1\n0.1,2\n0.1,3\n0.05,4\n0.2,5\n", encoding="utf-8")
+    (path / "still.csv").write_text("time [s],F1 [N]\n0,1\n0,2\n0,3\n", encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def inspect(folder, monkeypatch, capsys):
+    """Return a call of what the command does; `seaopt` below is the command itself."""
+
+    def run(name, *, out=None, **options):
+        monkeypatch.chdir(folder)
+        inspect_log(Path(name), folder=Path(out) if out else None, **options)
+        return capsys.readouterr().out
+
+    return run
+
+
+def seaopt(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-m", "seaopt.cli", "inspect", *arguments],
+        capture_output=True, text=True, check=False, cwd=cwd,
+    )  # fmt: skip
+
+
+def test_faults_are_said_and_the_exit_code_is_0(folder):
+    done = seaopt("bad.csv", cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    for words in (
+        "3900 samples", "1 gap, 100 samples lost", "F2 lacks 30 samples", "F1 is flat at its largest value, 300 N",
+        "I is answered to from",
+    ):  # fmt: skip
+        assert words in done.stdout
+
+
+def test_json_stands_alone_on_stdout(folder):
+    arguments = ["--time", "time [s]", "--channel", "cur=I", "--unit", "cur=mA", "--input", "cur", "--json"]
+    done = seaopt("bare.csv", *arguments, cwd=folder)
+    content = json.loads(done.stdout)
+    assert done.returncode == 0 and content["schema"] == "seaopt/quality/1"
+    assert content["inputs"] == ["cur"] and list(content["channels"]) == ["cur"]
+    assert content["channels"]["cur"]["unit"] == "A"
+
+
+def test_bad_input_exits_2(folder):
+    done = seaopt("nothing.csv", cwd=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "no such file" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_figures_of_the_json_are_those_put_in(inspect):
+    content = json.loads(inspect("bad.csv", json=True))
+    assert content["channels"]["F1"]["rails"][0]["clear"]
+    assert content["gaps"] == {"count": 1, "samples_lost": 100, "longest_samples": 100}
+    assert content["channels"]["F2"]["missing"] == 30
+
+
+def test_results_are_written_when_asked(inspect, folder):
+    assert "wrote" in inspect("bad.csv", out="made")
+    assert json.loads((folder / "made" / "quality.json").read_text(encoding="utf-8"))["source"] == "bad.csv"
+    assert (folder / "made" / "quality.svg").stat().st_size > 5000
+    assert (folder / "made" / "quality.png").stat().st_size > 5000
+
+
+def test_a_broken_clock_is_a_finding_and_can_be_drawn(inspect):
+    out = inspect("twice.csv", out="twice")
+    assert "1 row of 5 with the time of the row ahead" in out
+    assert "1 row of 5 with a time before" in out
+
+
+def test_a_counter_opens_the_gap_that_it_shows(inspect, data):
+    file = str(data / "formats" / "acqtools" / "Wmsr2_loss.csv")
+    shown = json.loads(inspect(file, json=True))
+    opened = json.loads(inspect(file, counter="CH1(msr)=2", json=True))
+    assert (shown["gaps"]["count"], opened["gaps"]["count"]) == (0, 1)
+    assert [item["kind"] for item in shown["findings"] if item["severity"] == "error"] == ["gap"]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("bad.csv", {"channels": ["F1"]}, "is no pair"),
+        ("bad.csv", {"channels": ["F1=F1 [N]", "F1=F2 [N]"]}, "twice"),
+        ("bad.csv", {"channels": ["F1=F1 [kN]"]}, 'no column "F1 \\[kN\\]"'),
+        ("bad.csv", {"units": ["F1=N"]}, "name its column too"),
+        ("bad.csv", {"units": ["time=s"]}, "name its column too"),
+        ("bad.csv", {"inputs": ["cur"]}, "no channel"),
+        ("bad.csv", {"out": "bad.csv"}, "is a file"),
+        ("bad.csv", {"align": "nearest"}, "give hold or linear"),
+        ("bad.csv", {"counter": "n=two"}, "how many samples"),
+        ("still.csv", {}, "never increases"),
+    ],
+)
+def test_bad_options_are_refused(inspect, name, options, words):
+    with pytest.raises(SeaoptError, match=words):
+        inspect(name, **options)

@@ -1,0 +1,187 @@
+"""Slicing, resampling, decimating and appending logs, and their way to frames and back."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import polars as pl
+import pytest
+
+import seaopt as so
+from seaopt.errors import LogError, UnitError
+from seaopt.logs import Hold, Linear, Nearest, concatenate
+from seaopt.signals import Origin, Signal
+
+ORIGIN = Origin(file="chirp.csv", sha256="ab", column="F1 [kN]", conversion="kN to N")
+
+
+def sine(t, f=3.0):
+    return np.sin(2 * np.pi * f * t + 0.3)
+
+
+def make(t, **channels):
+    signals = {name: Signal(name=name, values=values, unit="N", origin=ORIGIN) for name, values in channels.items()}
+    return so.Log(time=t, signals=signals, source="chirp.csv")
+
+
+@pytest.fixture
+def gapped():
+    t = np.arange(4000) / 1000
+    return make(np.delete(t, slice(1500, 1700)), F1=np.delete(sine(t), slice(1500, 1700)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda log: log.between(0.1, 0.9),
+        lambda log: log.resample(rate_hz=1000),
+        lambda log: log.decimate(4),
+        lambda log: concatenate([log, log], gap_s=1.0),
+    ],
+)
+def test_what_is_done_is_noted_and_the_origin_kept(gapped, change):
+    log = change(gapped)
+    assert log.signal("F1").origin == ORIGIN and log.signal("F1").unit == "N"
+    assert len(log.notes) == 1 and log.notes[0] in repr(log)
+
+
+def test_resampling_a_jittered_log_is_a_line_between_samples():
+    rng = np.random.default_rng(0)
+    t = np.arange(2000) / 500 + rng.uniform(-4e-4, 4e-4, 2000)
+    log = make(t, F1=sine(t))
+    with pytest.raises(LogError, match=r"log.resample\(rate_hz=500\)"):
+        _ = log.segments
+    even = log.resample(rate_hz=500)
+    assert len(even.segments) == 1
+    np.testing.assert_allclose(even.time, t[0] + np.arange(len(even)) / 500, atol=1e-12)
+    np.testing.assert_allclose(even["F1"], np.interp(even.time, t, sine(t)), atol=1e-12)
+
+
+def test_holding_takes_the_latest_sample():
+    log = make(np.array([0.0, 0.9, 2.1, 3.0]), F1=np.array([1.0, 2.0, 3.0, 4.0]))
+    assert log.resample(rate_hz=1, rule=Hold())["F1"].tolist() == [1.0, 2.0, 2.0, 4.0]
+    assert log.resample(rate_hz=1, rule=Nearest(tolerance_s=0.2))["F1"].tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_gaps_stay_gaps(gapped):
+    even = gapped.resample(rate_hz=900)
+    assert len(even.gaps) == 1
+    assert even.gaps[0] == pytest.approx((1.499, 1.7), abs=1 / 900)
+    np.testing.assert_allclose(even["F1"], sine(even.time), atol=1e-4)
+
+
+def test_bridging_joins_what_is_declared(gapped):
+    assert not gapped.resample(rate_hz=1000, rule=Linear(), bridge_s=0.3).gaps
+
+
+def test_a_missing_sample_stays_missing():
+    values = sine(np.arange(50) / 50)
+    values[20] = np.nan
+    even = make(np.arange(50) / 50, F1=values).resample(rate_hz=100)
+    assert np.flatnonzero(np.isnan(even["F1"])).tolist() == [39, 40, 41]
+
+
+def test_restamping_straightens_rounded_timestamps_and_touches_no_sample():
+    t = np.arange(3000) / 400
+    log = make(np.round(t, 3), F1=sine(t))
+    even = log.restamp()
+    assert np.max(np.abs(even.time - t)) < 5e-4
+    assert len(even.segments) == 1
+    np.testing.assert_array_equal(even["F1"], log["F1"])
+
+
+def test_restamping_refuses_real_jitter():
+    t = np.arange(1000) / 400 + np.random.default_rng(0).uniform(-5e-4, 5e-4, 1000)
+    with pytest.raises(LogError, match="more than their rounding"):
+        make(t, F1=sine(t)).restamp()
+
+
+@pytest.mark.parametrize("factor", [2, 5, 7])
+def test_decimation_passes_the_pass_band_and_stops_what_would_fold(factor):
+    rate, n = 1000.0, 12000
+    t = np.arange(n) / rate
+    edge = 0.4 * rate / factor  # 0.8 of the new Nyquist frequency
+    log = make(t, low=sine(t, 3.0), edge=sine(t, edge), folds=sine(t, 1.01 * 0.5 * rate / factor))
+    slow = log.decimate(factor)
+    assert slow.rate_hz == pytest.approx(rate / factor)
+    np.testing.assert_allclose(slow["low"], sine(slow.time, 3.0), atol=2e-4)
+    np.testing.assert_allclose(slow["edge"], sine(slow.time, edge), atol=1.2e-3)  # 0.01 dB
+    assert np.max(np.abs(slow["folds"])) < 1e-4  # 80 dB
+    assert "pass band 0 to" in slow.notes[0]
+
+
+def test_decimation_filters_each_stretch_alone(gapped):
+    slow = gapped.decimate(4)
+    assert len(slow.segments) == 2
+    np.testing.assert_allclose(slow["F1"], sine(slow.time), atol=2e-4)
+
+
+def test_decimation_leaves_out_what_missing_samples_carry():
+    t = np.arange(6000) / 1000
+    values = sine(t)
+    values[3000:3200] = np.nan
+    values[1000] = np.nan  # one sample that a line bridges
+    slow = make(t, F1=values).decimate(5)
+    lost = slow.time[np.isnan(slow["F1"])]
+    assert lost.min() > 2.9 and lost.max() < 3.3 and lost.size >= 40
+    good = np.isfinite(slow["F1"]) & ((slow.time < 2.9) | (slow.time > 3.3))
+    np.testing.assert_allclose(slow["F1"][good], sine(slow.time)[good], atol=3e-4)
+
+
+def test_appending_on_one_clock_keeps_the_times():
+    t = np.arange(100) / 10
+    both = concatenate([make(t[:40], F1=sine(t[:40])), make(t[40:], F1=sine(t[40:]))])
+    np.testing.assert_array_equal(both.time, t)
+    assert not both.gaps
+
+
+def test_polars_round_trip(short_log):
+    again = so.Log.from_frame(short_log.to_polars())
+    assert again.signal("F1").unit == "N"
+    for name in short_log.signals:
+        np.testing.assert_array_equal(again[name], short_log[name])
+
+
+def test_pandas_round_trip(short_log):
+    pandas = pytest.importorskip("pandas")
+    frame = short_log.to_pandas()
+    assert isinstance(frame, pandas.DataFrame)
+    frame.loc[3, "F1 [N]"] = None
+    again = so.Log.from_frame(frame, channels={"force": "F1 [N]"})
+    assert np.isnan(again["force"][3])
+    np.testing.assert_array_equal(again["force"][4:], short_log["F1"][4:])
+
+
+def test_without_pandas_the_remedy_is_named(short_log, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(LogError, match="pip install pandas"):
+        short_log.to_pandas()
+
+
+def test_arrays_round_trip(short_log):
+    again = so.Log.from_arrays(**short_log.to_arrays())
+    np.testing.assert_array_equal(again["F1"], short_log["F1"])
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda log: log.resample(rate_hz=0), LogError, "not positive"),
+        (lambda log: log.resample(rate_hz=100), LogError, "would alias"),
+        (lambda log: log.decimate(0), LogError, "not a whole number"),
+        (lambda log: log.decimate(100), LogError, "without a gap"),
+        (lambda log: concatenate([log, log]), LogError, "before the log ahead"),
+        (lambda log: concatenate([log, log], gap_s=1e-3), LogError, "is no gap"),
+        (lambda log: concatenate([]), LogError, "at least one"),
+        (lambda log: concatenate([log, log.decimate(2)], gap_s=1), LogError, "resample or decimate"),
+        (lambda log: concatenate([log, make(log.time, F2=log["F1"])], gap_s=1), LogError, "same channels"),
+        (lambda log: so.Log.from_frame(3), LogError, "no frame"),
+        (lambda log: so.Log.from_frame(pl.DataFrame({"t": [1.0]})), LogError, "no column"),
+        (lambda log: so.Log.from_frame(pl.DataFrame({"t [ms]": ["a"]}), time="t [ms]"), LogError, "not numeric"),
+        (lambda log: so.Log.from_frame(pl.DataFrame({"t [N]": [1.0, 2.0]}), time="t [N]"), UnitError, "not one of s"),
+    ],
+)
+def test_bad_arguments_are_refused(gapped, call, error, words):
+    with pytest.raises(error, match=words):
+        call(gapped)
