@@ -73,6 +73,8 @@ def measured(system: ClosedLoop) -> Measured:
     pencils = [system.equal(), system.real(), *(system.modulus(k, level) for k, level in levels)]
     edges = arcs([*pencils, *proofs])
     peaks, at = _proved(system, peaks, at, present, edges[len(pencils) :])
+    own = system.sensitivity(at[:3])
+    peaks[:3] = np.abs([own[0], 1.0 - own[1], 2.0 * own[2] - 1.0])
 
     def function(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
         values = system.curves(theta)

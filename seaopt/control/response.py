@@ -58,6 +58,8 @@ class ClosedLoop:
         Shapes (n, n), (n, 2), (2, n) and (2, 2).
     triangle, right, left
         The complex Schur form of `a`, and `b` and `c` in its basis.
+    opened
+        The poles of plant and law, which are the zeros of S.
 
     """
 
@@ -68,6 +70,7 @@ class ClosedLoop:
     triangle: Complex[np.ndarray, "n n"]
     right: Complex[np.ndarray, "n 2"]
     left: Complex[np.ndarray, "2 n"]
+    opened: Complex[np.ndarray, " n"]
 
     @property
     def poles(self) -> Complex[np.ndarray, " n"]:
@@ -77,6 +80,11 @@ class ClosedLoop:
     def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "5 m"]:
         """Return S, T, S - T, C_y S and F/F_ref at angles (rad) on the unit circle."""
         return self._named(self._solved(np.exp(1j * theta), self.right[:, :, None]), direct=True)
+
+    def sensitivity(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
+        z = np.exp(1j * theta)[:, None]
+        return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
 
     def slopes(self, theta: Float[np.ndarray, " m"]) -> Float[np.ndarray, "5 m"]:
         """Return half the derivative of -1/abs(curve)^2 along the angle.
@@ -164,7 +172,10 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     scale = scale[: n + m] / np.sqrt(scale[-2] * scale[-1])
     a, b, c = a * scale / scale[:, None], b / scale[:, None], c * scale
     triangle, basis = (np.asarray(item) for item in schur(a, output="complex")[:2])
-    return ClosedLoop(a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis)
+    opened = np.concatenate([np.linalg.eigvals(ap), np.linalg.eigvals(ak)]).astype(complex)
+    return ClosedLoop(
+        a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened
+    )  # fmt: skip
 
 
 def law_state_space(
