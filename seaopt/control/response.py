@@ -38,7 +38,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.digital import StateSpace
 from seaopt.control.law import TransferFunction
 
-SHIFT = 1.5  # of the pencils' inverse: real, off the circle
+SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
 SAME_ROOT = 1e-7
 NEAR = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction
 MAX_STEPS = 100
@@ -213,12 +213,22 @@ def _common(
 
 def arcs(pencils: Sequence[Pencil]) -> list[Float[np.ndarray, " _"]]:
     """Return, for each pencil, the angles from 0 to pi that separate where its function is positive and negative."""
-    m, k = np.stack([p[0] for p in pencils]), np.stack([p[1] for p in pencils])
-    found: Any = np.linalg.eigvals(np.linalg.solve(m - SHIFT * k, k)).astype(complex)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        angle = np.abs(np.angle(SHIFT + 1.0 / found))
-    rows = [row[np.isfinite(row)] for row in angle]
-    return [np.unique(np.concatenate([[0.0], row, [np.pi]])) for row in rows]
+    whole = _on_circle(np.stack([p[0] for p in pencils]), np.stack([p[1] for p in pencils]))
+    rows = [_on_circle(m[None], k[None]) for m, k in pencils] if whole is None else list(whole[:, None])
+    angles = [np.empty(0) if row is None else row[np.isfinite(row)] for row in rows]
+    return [np.unique(np.concatenate([[0.0], row, [np.pi]])) for row in angles]
+
+
+def _on_circle(m: Float[np.ndarray, "p k k"], k: Float[np.ndarray, "p k k"]) -> Float[np.ndarray, "p k"] | None:
+    """Return the angles of the pencils' eigenvalues; None where one is singular, its function being constant."""
+    for shift in SHIFTS:
+        try:
+            found: Any = np.linalg.eigvals(np.linalg.solve(m - shift * k, k)).astype(complex)
+        except np.linalg.LinAlgError:
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.abs(np.angle(shift + 1.0 / found))
+    return None
 
 
 def sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]]:

@@ -224,18 +224,8 @@ def _refined(
     low, x, high = low.copy(), x.copy(), high.copy()
     small = 1e-6 * (high - low)
     for _ in range(NEWTON_STEPS):
-        own = loop.rows(live)
-        z = np.exp(1j * x[live])[:, None]
-        s, (first, second) = own.sensitivity(z), own.logarithmic(z)
-        curvature = second + first**2
-        if complement:
-            value = 1.0 - s
-            first, curvature = -s * first / value, -s * curvature / value
-        else:
-            value = s
-        g = 2.0 * np.real(1j * z * first)[:, 0]
-        slope = -2.0 * np.real(z * first + z**2 * (curvature - first**2))[:, 0]
-        best[live] = np.maximum(best[live], np.abs(value)[:, 0])
+        value, g, slope = _slopes(loop.rows(live), x[live], complement)
+        best[live] = np.maximum(best[live], value)
         low[live] = np.where(g > 0.0, x[live], low[live])
         high[live] = np.where(g > 0.0, high[live], x[live])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -249,3 +239,19 @@ def _refined(
         if not live.size:
             break
     return best
+
+
+@np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
+def _slopes(
+    loop: _Products, x: Float[np.ndarray, " n"], complement: bool
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""
+    z = np.exp(1j * x)[:, None]
+    s, (first, second) = loop.sensitivity(z), loop.logarithmic(z)
+    value, curvature = s, second + first**2
+    if complement:
+        value = 1.0 - s
+        first, curvature = -s * first / value, -s * curvature / value
+    rise = 2.0 * np.real(1j * z * first)[:, 0]
+    bend = -2.0 * np.real(z * first + z**2 * (curvature - first**2))[:, 0]
+    return np.abs(value)[:, 0], np.where(np.isfinite(rise), rise, 1.0), bend
