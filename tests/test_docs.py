@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,17 @@ def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
     shown = " ".join(page.replace(">", " ").split())
     for sentence in said:  # the numbers may move in their last digits
         assert sentence.split(":")[0] in shown
+
+
+def test_the_certificate_of_the_docs_works():
+    """The pages on margins and on the certificate run, and the table of ranges is a problem file's."""
+    space: dict = {}
+    for page in ("margins.md", "certificate.md"):
+        exec(re.sub(r"print\(.*", "", blocks(page, "python")[0]), space)
+    assert space["disk"].alpha > 0.8
+    assert space["worst"].verify(space["controller"])
+    (table,) = blocks("certificate.md", "toml")
+    assert set(tomllib.loads(table)["robustness"]["parameters"]) == set(space["ranges"])
 
 
 def test_every_figure_of_the_docs_is_there():

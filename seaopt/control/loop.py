@@ -171,7 +171,8 @@ def _phase_margins(found: Measured) -> tuple[float | None, float | None]:
 def _tracking_band(system: ClosedLoop, inner: Float[np.ndarray, " k"]) -> tuple[float, float] | None:
     edges = np.concatenate([[0.0], inner, [np.pi]])
     middles = 0.5 * (edges[:-1] + edges[1:])
-    inside = np.abs(np.log(np.abs(system.curves(middles)[TRACKING]))) < -np.log(HALF_POWER)
+    size = np.abs(system.curves(middles)[TRACKING])
+    inside = (size > HALF_POWER) & (size < 1.0 / HALF_POWER)
     if not np.any(inside):
         return None
     best = int(np.argmax(np.where(inside, np.diff(edges), -1.0)))
