@@ -145,7 +145,7 @@ class Certificate:
         )
         for item in self.requirements:
             if not item.met:
-                lines.append(f"  NOT MET: {item.name} = {item.value:.4g}, limit {item.limit:.4g} ({item.where})")
+                lines.append(f"  NOT MET: {item.name} = {item.value:.6g}, limit {item.limit:.6g} ({item.where})")
         return "\n".join(lines)
 
     def _plant_lines(self, name: str) -> list[str]:

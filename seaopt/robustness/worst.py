@@ -174,7 +174,7 @@ def _search(
         scores = score(trials.reshape(-1, x.shape[1])).reshape(trials.shape[:2])
         best = np.argmax(scores, axis=1)
         rows = np.arange(x.shape[0])
-        better = scores[rows, best] > value * (1.0 + 1e-7)
+        better = scores[rows, best] - value > 1e-7 * np.minimum(np.abs(value), 1.0)
         x = np.where(better[:, None], trials[rows, best], x)
         value = np.where(better, scores[rows, best], value)
         if not np.any(better):
