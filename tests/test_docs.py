@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,17 @@ def test_the_log_of_the_quality_page_is_clipped_and_masked():
     assert eta["declared"].value == pytest.approx(eta["masked"].value)
     assert eta["biased"].value < 1 - 10 * eta["biased"].std
     assert space["again"].rate_hz == 200
+
+
+def test_the_certificate_of_the_docs_works():
+    """The pages on margins and on the certificate run, and the table of ranges is a problem file's."""
+    space: dict = {}
+    for page in ("margins.md", "certificate.md"):
+        exec(re.sub(r"print\(.*", "", blocks(page, "python")[0]), space)
+    assert space["disk"].alpha > 0.8
+    assert space["worst"].verify(space["controller"])
+    (table,) = blocks("certificate.md", "toml")
+    assert set(tomllib.loads(table)["robustness"]["parameters"]) == set(space["ranges"])
 
 
 def test_every_figure_of_the_docs_is_there():

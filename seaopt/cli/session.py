@@ -256,7 +256,9 @@ class Session:
         result = certify(
             controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
             others=self.problem.parameters,
+            progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
         )  # fmt: skip
+        tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 

@@ -1,18 +1,43 @@
-"""A plant as a digital controller sees it: sampled through a zero-order hold, one input to one output, with delay."""
+r"""A plant as a digital controller sees it: sampled through a zero-order hold, one input to one output, with delay.
+
+Besides parameters, a plant has conditions, which stand in the same `ParameterSet` under these names:
+
+a state of the plant (``phi``)
+    It is linearised at rest there, the first input and the other states being what keeps it at rest, instead of at
+    zero.
+``delay_s``
+    Seconds of delay besides the controller's whole samples. With :math:`w` whole samples and a rest :math:`\tau` in
+    it, the older of two commands acts for :math:`\tau` and the newer for what is left of a period:
+    :math:`x^+ = e^{AT} x + [\Gamma(T) - \Gamma(T - \tau)] u_{k-w-1} + \Gamma(T - \tau) u_{k-w}` with
+    :math:`\Gamma(t) = \int_0^t e^{As} ds\, B` (Astrom, Wittenmark, Computer-Controlled Systems, 3rd ed., 2.3).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.errors import ControlError, suggestion
-from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, state_space
-from seaopt.simulation.discretisation import expm_with_derivatives
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant, jacobians
 
 StateSpace = tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]
+Linear = tuple[
+    Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k n"], Float[np.ndarray, " k"]
+]  # fmt: skip
+Held = tuple[
+    Float[np.ndarray, "k m m"], Float[np.ndarray, "k m"], Float[np.ndarray, "k m"], Float[np.ndarray, " k"]
+]  # fmt: skip
+
+DELAY = "delay_s"
+MAPPED = 512  # plants in one call of CasADi
+REACH, DEGREE = 0.125, 10  # of the exponential's Taylor polynomial: 0.125^11 / 11! = 3e-18
+NEWTON_STEPS = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,7 +102,7 @@ def sample(
     Parameters
     ----------
     plant, params
-        The plant; its first input is the motor current.
+        The plant; its first input is the motor current. `params` may hold conditions too.
     measured : str
         The output that is fed back.
     gain : float
@@ -90,26 +115,161 @@ def sample(
     Raises
     ------
     ControlError
-        The plant has no such output.
+        The plant has no such output, or cannot rest where it is to be linearised.
+
+    """
+    values = np.array(plant.parameter_values(params))[:, None]
+    given = {name: np.array([params[name].value]) for name in conditions((plant,)) if name in params}
+    a, b, c, d = linearised(plant, values, given, measured, gain)
+    held = hold(a, b, c, d, sample_time_s, given.get(DELAY, np.zeros(1)))
+    return DigitalPlant(
+        a=held[0][0], b=held[1][0], c=held[2][0], d=float(held[3][0]), sample_time_s=sample_time_s,
+        delay_samples=delay_samples, static_gain=_static(a[0], b[0], c[0], float(d[0])),
+    )  # fmt: skip
+
+
+def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
+    """Return what a plant's `ParameterSet` may hold besides its parameters."""
+    found = {DELAY: Parameter(name=DELAY, value=0.0, unit="s", min=0.0, description="delay besides the controller's")}
+    for plant in plants:
+        found |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
+    return found
+
+
+def linearised(
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float
+) -> Linear:
+    """Return (a, b, c, d) from motor force to a measured output of k plants, one column of parameters each.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output, or cannot rest where it is to be linearised.
 
     """
     if measured not in plant.outputs:
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
-    a, b, c, d = state_space(plant, params)
     row = list(plant.outputs).index(measured)
-    b0, c0, d0 = gain * b[:, 0], c[row], gain * float(d[row, 0])
-    n = a.shape[0]
-    block = np.zeros((n + 1, n + 1))
-    block[:n, :n], block[:n, n] = a, b0
-    whole, _ = expm_with_derivatives(block * sample_time_s, np.zeros((0, n + 1, n + 1)))
+    a, b, c, d = _jacobians(plant, *_rest(plant, p, at), p)
+    return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
+
+
+def _rest(
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]]
+) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
+    """Return states and inputs at rest, by Newton's method in the first input and the states that are not given."""
+    count, names = p.shape[1], list(plant.states)
+    x, u = np.zeros((len(names), count)), np.zeros((len(plant.inputs), count))
+    fixed = [names.index(name) for name in at if name in names]
+    if not fixed or not any(np.any(at[names[i]]) for i in fixed):
+        return x, u
+    for i in fixed:
+        x[i] = at[names[i]]
+    loose = [i for i in range(len(names)) if i not in fixed]
+    if len(fixed) > 1:
+        raise ControlError(f"{', '.join(names[i] for i in fixed)} are both given; a plant rests at one of them")
+    for _ in range(NEWTON_STEPS):
+        (rates,) = _mapped(plant, "dynamics", x, u, p)
+        a, b, _, _ = _jacobians(plant, x, u, p)
+        try:
+            step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), rates.T[:, :, None])[..., 0].T
+        except np.linalg.LinAlgError:
+            break
+        x[loose] -= step[:-1]
+        u[0] -= step[-1]
+        size = np.max(np.abs(np.concatenate([x[loose], u[:1]])), axis=0)
+        if np.all(np.max(np.abs(step), axis=0) <= 1e-12 * np.maximum(size, 1e-6)):
+            return x, u
+    given = ", ".join(f"{names[i]} = {at[names[i]][0]:g}" for i in fixed)
+    raise ControlError(f"plant {plant.name} cannot rest at {given}, so it cannot be linearised there; give another")
+
+
+def _jacobians(
+    plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
+) -> tuple[Float[np.ndarray, "k _ _"], ...]:
+    """Return A, B, C and D of k plants."""
+    nx, nu, ny, count = len(plant.states), len(plant.inputs), len(plant.outputs), p.shape[1]
+    found = _mapped(plant, "jacobians", x, u, p)
+    shapes = ((nx, nx), (nx, nu), (ny, nx), (ny, nu))
+    return tuple(
+        item.reshape(rows, count, columns).transpose(1, 0, 2)
+        for item, (rows, columns) in zip(found, shapes, strict=True)
+    )
+
+
+def _mapped(plant: Plant, what: str, *arguments: Float[np.ndarray, "_ k"]) -> list[Float[np.ndarray, "_ _"]]:
+    """Return the plant's Jacobians or dynamics at every column, in blocks that CasADi maps over."""
+    if what == "dynamics" and what not in plant.cache:
+        dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
+        plant.cache[what] = ca.Function(what, [plant.x, plant.u, plant.p], [dynamics])
+    function = jacobians(plant) if what == "jacobians" else plant.cache[what]
+    count = arguments[0].shape[1]
+    block = 1 if count == 1 else MAPPED
+    key = f"{what} of {block}"
+    if key not in plant.cache:
+        plant.cache[key] = function if block == 1 else function.map(block)
+    parts: list[list[Any]] = []
+    for start in range(0, count, block):
+        own = [item[:, start : start + block] for item in arguments]
+        width = own[0].shape[1]
+        found = plant.cache[key].call([ca.DM(np.pad(item, ((0, 0), (0, block - width)), "edge")) for item in own])
+        columns = [item.shape[1] // block for item in found]
+        parts.append([np.array(item)[:, : each * width] for item, each in zip(found, columns, strict=True)])
+    return [np.concatenate(items, axis=1) for items in zip(*parts, strict=True)]
+
+
+def hold(
+    a: Float[np.ndarray, "k n n"], b: Float[np.ndarray, "k n"], c: Float[np.ndarray, "k n"], d: Float[np.ndarray, " k"],
+    sample_time_s: float, delay_s: Float[np.ndarray, " k"],
+) -> Held:  # fmt: skip
+    """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's."""
+    whole_period, gamma = _exponential(a, b, np.full(delay_s.size, sample_time_s))
+    if not np.any(delay_s):
+        return whole_period, gamma, c, d
+    whole = np.floor(delay_s / sample_time_s + 1e-9).astype(int)
+    rest = np.maximum(delay_s - whole * sample_time_s, 0.0)
+    newer = _exponential(a, b, sample_time_s - rest)[1]
+    count, n, chain = a.shape[0], a.shape[1], int(whole.max()) + 1
+    rows = np.arange(count)
+    drive = np.zeros((count, n, chain + 1))  # column i: the command i samples ago
+    through = np.zeros((count, chain + 1))
+    drive[rows, :, whole] = newer
+    drive[rows, :, whole + 1] += gamma - newer
+    through[rows, np.where(rest > 0.0, whole + 1, whole)] = d  # the output is read before the command changes
+    big, late = np.zeros((count, n + chain, n + chain)), np.zeros((count, n + chain))
+    big[:, :n, :n], big[:, :n, n:] = whole_period, drive[:, :, 1:]
+    late[:, :n], late[:, n] = drive[:, :, 0], 1.0
+    for i in range(1, chain):
+        big[:, n + i, n + i - 1] = 1.0
+    return big, late, np.concatenate([c, through[:, 1:]], axis=1), through[:, 0]
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a plant far off may overflow: the loop is then not stable
+def _exponential(
+    a: Float[np.ndarray, "k n n"], b: Float[np.ndarray, "k n"], t: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"]]:
+    """Return exp(a t) and the integral of exp(a s) b from 0 to t: Taylor's polynomial, scaled and squared."""
+    n = a.shape[1]
+    block = np.zeros((a.shape[0], n + 1, n + 1))
+    block[:, :n, :n], block[:, :n, n] = a, b
+    block *= t[:, None, None]
+    norm = float(np.max(np.sum(np.abs(block), axis=2), initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / REACH)))) if np.isfinite(norm) else 0
+    block *= 2.0**-squarings
+    one = np.eye(n + 1)
+    out = one + block / DEGREE
+    for k in range(DEGREE - 1, 0, -1):
+        out = one + block @ out / k
+    for _ in range(squarings):
+        out = out @ out
+    return out[:, :n, :n], out[:, :n, n]
+
+
+def _static(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float) -> float:
     with np.errstate(divide="ignore", invalid="ignore"):
         try:
-            static = float(d0 - c0 @ np.linalg.solve(a, b0)) if np.linalg.cond(a) < 1e14 else np.inf
+            return float(d - c @ np.linalg.solve(a, b)) if np.linalg.cond(a) < 1e14 else np.inf
         except np.linalg.LinAlgError:
-            static = np.inf
-    return DigitalPlant(
-        a=whole[:n, :n], b=whole[:n, n], c=c0, d=d0, sample_time_s=sample_time_s, delay_samples=delay_samples,
-        static_gain=static,
-    )  # fmt: skip
+            return np.inf

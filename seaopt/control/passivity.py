@@ -41,8 +41,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.controller import Controller
+from seaopt.control.crossings import crossings
 from seaopt.control.law import TransferFunction
-from seaopt.control.loop import crossings
 from seaopt.control.spec import ControllerSpec
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet

@@ -38,6 +38,7 @@ from seaopt.problem.schema import (
     UnknownTable,
     VirtualTable,
 )
+from seaopt.robustness import check_ranges, placed
 
 MAX_BYTES = 4 << 20
 
@@ -116,9 +117,10 @@ class Problem:
             values = plant.complete(parameters)
             out[name] = (plant, values)
             for parameter, ends in self.ranges.items():
-                if parameter in values:
-                    for end in ends:
-                        out[f"{name}, {parameter} = {end:g}"] = (plant, values.update(**{parameter: end}))
+                for end in ends:
+                    corner = placed(plant, values, parameter, end, self.certified_plants())
+                    if corner is not None:
+                        out[f"{name}, {parameter} = {end:g}"] = (plant, corner)
         return out
 
     def experiments(self) -> tuple[Experiment, ...]:
@@ -413,12 +415,10 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 
 
 def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    known = {name for plant in plants.values() for name in plant.parameters}
-    for name, (low, high) in (table.robustness.parameters if table.robustness else {}).items():
-        if name not in known:
-            raise ProblemError(f'robustness.parameters names "{name}", which no plant has; {suggestion(name, known)}')
-        if not low <= high:
-            raise ProblemError(f"robustness.parameters.{name} = [{low:g}, {high:g}] is empty; give [low, high]")
+    try:
+        check_ranges(table.robustness.parameters if table.robustness else {}, plants)
+    except SeaoptError as error:
+        raise ProblemError(f"robustness.parameters: {error}") from error
 
 
 def _check_experiment(item: ExperimentTable, plant: Plant) -> None:

@@ -1,24 +1,38 @@
-"""Many plants at once: closed-loop eigenvalues and peaks of S and T for every draw, vectorised."""
+r"""Many plants at once: closed-loop eigenvalues and peaks of S and T for every draw, vectorised.
+
+With the eigenvalues :math:`o_i` of the open loop (plant, delay, controller) and :math:`c_i` of the closed one,
+
+.. math:: S(z) = \frac{1}{1 + d\, d_c} \prod_i \frac{z - o_i}{z - c_i}, \qquad T = 1 - S,
+
+so that no linear system is solved at any frequency and the derivatives along the circle are sums of simple fractions.
+Every draw's grid has points of its own about the poles of its loop. About a peak :math:`1/|S|^2` is close to a
+parabola in the angle: Newton's method on its derivative, kept between the neighbouring grid points, ends at rounding.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
-from seaopt.control import Controller, TransferFunction
-from seaopt.control.loop import LOWEST_HZ
+from seaopt.control import Controller
+from seaopt.control.digital import DELAY, Linear, conditions, hold, linearised
+from seaopt.control.loop import STABLE
+from seaopt.control.response import law_state_space
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, jacobians
+from seaopt.plants import Plant
 
-Curves = Callable[[Float[np.ndarray, "n m"]], Float[np.ndarray, "n m"]]
-
-CHUNK = 128
-BASE_POINTS = 160
+BLOCK = 8192  # draws linearised at once: bounds the memory
+CHUNK = 512  # draws whose curves are evaluated at once: bounds the cache
+BASE = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 60)])
+FAN = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # about a pole, in distances of it from the circle
 MAXIMA = 3  # local maxima refined
-FAN = np.array([0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0])
+NEWTON_STEPS = 40
+
+Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,131 +45,213 @@ class BatchFigures:
 
 
 def batch_figures(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: dict[str, Float[np.ndarray, " n"]]
-) -> BatchFigures:
+    controller: Controller, plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]],
+    progress: Progress | None = None, threads: int = 2, peaks: bool = True,
+) -> BatchFigures:  # fmt: skip
     """Close `controller` around `plant` at every draw.
 
-    Peaks are found on a grid of each draw's own, with points about the poles of its plant and of its loop, and
-    refined by zooming.
+    Parameters
+    ----------
+    controller : Controller
+        The law.
+    plant, nominal
+        The plant, and the values of what is not drawn.
+    draws : mapping of name to array, shape (n,)
+        Parameters of the plant and conditions (`seaopt.control.digital`); names it does not have are left out.
+    progress : callable, optional
+        Called with the number of draws done, now and then.
+    threads : int
+        Blocks of draws worked on at once.
+    peaks : bool
+        Whether Ms and Mt are wanted; if not, they are nan where stable.
+
     """
     count = len(next(iter(draws.values()))) if draws else 1
     values = np.repeat(np.array(plant.parameter_values(nominal))[:, None], count, axis=1)
     for row, name in enumerate(plant.parameters):
         if name in draws:
             values[row] = draws[name]
-    parts = [_chunk(controller, plant, values[:, k : k + CHUNK]) for k in range(0, count, CHUNK)]
+    extra = {
+        name: draws[name] if name in draws else np.full(count, nominal[name].value)
+        for name in conditions((plant,))
+        if name in draws or name in nominal
+    }
+    chain = float(np.max(extra.get(DELAY, np.zeros(1))))
+    parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for start in range(0, count, BLOCK):
+            own = slice(start, min(start + BLOCK, count))
+            at = {name: item[own] for name, item in extra.items()}
+            late = at.get(DELAY, np.zeros(own.stop - own.start)) if chain else np.zeros(own.stop - own.start)
+            continuous = linearised(
+                plant, values[:, own], at, controller.spec.measured, controller.current_per_force_A_per_N
+            )
+            pieces = [slice(k, k + CHUNK) for k in range(0, own.stop - own.start, CHUNK)]
+            parts += pool.map(
+                lambda piece, given=continuous, delay=late: _chunk(
+                    controller, tuple(item[piece] for item in given), delay[piece], peaks
+                ),
+                pieces,
+            )
+            if progress is not None:
+                progress(own.stop)
     radius, ms, mt = (np.concatenate(items) for items in zip(*parts, strict=True))
     return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
 
 
-def _chunk(controller: Controller, plant: Plant, p: Float[np.ndarray, "np n"]) -> tuple[Float[np.ndarray, " n"], ...]:
-    a, b, c, d = _sampled(controller, plant, p)
-    eigenvalues = _closed_eigenvalues(controller, a, b, c, d)
-    radius = np.max(np.abs(eigenvalues), axis=1)
-    f = _grids(controller.sample_time_s, np.linalg.eigvals(a).astype(complex), eigenvalues)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Products:
+    """S of every draw as a product over poles, open and closed."""
 
-    def loop_gain(x: Float[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
-        z = np.exp(2j * np.pi * x * controller.sample_time_s)
-        inner = z[:, :, None, None] * np.eye(a.shape[1]) - a[:, None]
-        state = np.linalg.solve(inner, np.broadcast_to(b[:, None, :, None].astype(complex), (*x.shape, a.shape[1], 1)))
-        p_z = np.einsum("nmi,ni->nm", state[..., 0], c) + d[:, None]
-        return p_z * z**-controller.delay_samples * _response(controller.measurement, z)
+    opened: Complex[np.ndarray, "n k"]
+    closed: Complex[np.ndarray, "n k"]
+    scale: Float[np.ndarray, " n"]
 
-    def s(x: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-        return np.abs(1.0 / (1.0 + loop_gain(x)))
+    def sensitivity(self, z: Complex[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
+        above, below = np.ones_like(z), np.ones_like(z)
+        for k in range(self.opened.shape[1]):
+            above *= z - self.opened[:, k, None]
+            below *= z - self.closed[:, k, None]
+        return above / below * self.scale[:, None]
 
-    def t(x: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-        gain = loop_gain(x)
-        return np.abs(gain / (1.0 + gain))
+    def logarithmic(
+        self, z: Complex[np.ndarray, "n m"]
+    ) -> tuple[Complex[np.ndarray, "n m"], Complex[np.ndarray, "n m"]]:
+        """Return S'/S and its derivative."""
+        first, second = np.zeros_like(z), np.zeros_like(z)
+        for k in range(self.opened.shape[1]):
+            above, below = 1.0 / (z - self.opened[:, k, None]), 1.0 / (z - self.closed[:, k, None])
+            first += above - below
+            second += below**2 - above**2
+        return first, second
 
-    stable = radius < 1.0
-    return radius, np.where(stable, _peaks(s, f), np.inf), np.where(stable, _peaks(t, f), np.inf)
-
-
-def _response(tf: TransferFunction, z: Complex[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
-    q = 1.0 / z
-    return np.polynomial.polynomial.polyval(q, tf.num) / np.polynomial.polynomial.polyval(q, tf.den)
-
-
-def _sampled(
-    controller: Controller, plant: Plant, p: Float[np.ndarray, "np n"]
-) -> tuple[Float[np.ndarray, "..."], ...]:
-    """Return the sampled matrices of every draw: exact zero-order hold."""
-    from scipy.linalg import expm
-
-    n, nx, nu, ny = p.shape[1], len(plant.states), len(plant.inputs), len(plant.outputs)
-    row = list(plant.outputs).index(controller.spec.measured)
-    key = f"jacobians{n}"
-    if key not in plant.cache:
-        plant.cache[key] = jacobians(plant).map(n)
-    found = [np.array(item) for item in plant.cache[key](np.zeros((nx, n)), np.zeros((nu, n)), p)]
-    a = found[0].reshape(nx, n, nx).transpose(1, 0, 2)
-    b = found[1].reshape(nx, n, nu).transpose(1, 0, 2)[:, :, 0] * controller.current_per_force_A_per_N
-    c = found[2].reshape(ny, n, nx).transpose(1, 0, 2)[:, row]
-    d = found[3].reshape(ny, n, nu).transpose(1, 0, 2)[:, row, 0] * controller.current_per_force_A_per_N
-    block = np.zeros((n, nx + 1, nx + 1))
-    block[:, :nx, :nx], block[:, :nx, nx] = a, b
-    whole = np.asarray(expm(block * controller.sample_time_s))
-    return whole[:, :nx, :nx], whole[:, :nx, nx], c, d
+    def rows(self, index: Int[np.ndarray, " r"]) -> _Products:
+        return _Products(opened=self.opened[index], closed=self.closed[index], scale=self.scale[index])
 
 
-def _closed_eigenvalues(
+def _chunk(
+    controller: Controller, continuous: Linear, delay: Float[np.ndarray, " k"], peaks: bool
+) -> tuple[Float[np.ndarray, " k"], ...]:
+    a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
+    products = _products(controller, a, b, c, d)
+    radius = np.max(np.abs(products.closed), axis=1)
+    ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
+    stable = np.flatnonzero(radius < STABLE)
+    if stable.size:
+        ms[stable], mt[stable] = _peaks(products.rows(stable)) if peaks else (np.nan, np.nan)
+    return radius, ms, mt
+
+
+def _products(
     controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n x"],
     d: Float[np.ndarray, " n"],
-) -> Complex[np.ndarray, "n m"]:  # fmt: skip
-    k, count, nx = controller.delay_samples, a.shape[0], a.shape[1]
-    ac, bc, cc, dc = controller.measurement.state_space()
-    n, m = nx + k, bc.size
-    big, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
-    big[:, :nx, :nx], sense[:, :nx] = a, c
+) -> _Products:  # fmt: skip
+    """Return the eigenvalues of the open and of the closed loop."""
+    ac, bc, cc, dc = law_state_space(controller.reference, controller.measurement)
+    count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
+    n, m = nx + k, cc.size
+    plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
+    plant[:, :nx, :nx], sense[:, :nx] = a, c
     through = d
     if k:
-        big[:, :nx, n - 1], sense[:, n - 1], drive[:, nx] = b, d, 1.0
+        plant[:, :nx, n - 1], sense[:, n - 1], drive[:, nx] = b, d, 1.0
         for i in range(1, k):
-            big[:, nx + i, nx + i - 1] = 1.0
+            plant[:, nx + i, nx + i - 1] = 1.0
         through = np.zeros(count)
     else:
         drive = b
-    loop = 1.0 / (1.0 + through * dc)
+    scale = 1.0 / (1.0 + through * dc[1])
     closed = np.zeros((count, n + m, n + m))
-    closed[:, :n, :n] = big - (dc * loop)[:, None, None] * drive[:, :, None] * sense[:, None, :]
-    closed[:, :n, n:] = -loop[:, None, None] * drive[:, :, None] * cc
-    closed[:, n:, :n] = loop[:, None, None] * bc[:, None] * sense[:, None, :]
-    closed[:, n:, n:] = ac - (loop * through)[:, None, None] * np.outer(bc, cc)
-    return np.linalg.eigvals(closed).astype(complex)
+    closed[:, :n, :n] = plant - (dc[1] * scale)[:, None, None] * drive[:, :, None] * sense[:, None, :]
+    closed[:, :n, n:] = scale[:, None, None] * drive[:, :, None] * cc
+    closed[:, n:, :n] = -scale[:, None, None] * bc[:, 1, None] * sense[:, None, :]
+    closed[:, n:, n:] = ac - (scale * through)[:, None, None] * np.outer(bc[:, 1], cc)
+    fixed = np.concatenate([np.linalg.eigvals(ac), np.zeros(k)])
+    opened = np.concatenate([np.linalg.eigvals(a), np.broadcast_to(fixed, (count, m + k))], axis=1)
+    return _Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
 
 
-def _grids(
-    ts: float, plant_poles: Complex[np.ndarray, "n x"], loop_poles: Complex[np.ndarray, "n m"]
-) -> Float[np.ndarray, "n k"]:
-    nyquist = 0.5 / ts
-    base = np.geomspace(LOWEST_HZ, nyquist, BASE_POINTS)
-    poles = np.concatenate([plant_poles, loop_poles], axis=1)
-    f0 = np.abs(np.angle(poles)) / (2 * np.pi * ts)
-    width = np.abs(1.0 - np.abs(poles)) * nyquist / np.pi
-    fan = np.concatenate([-FAN[:0:-1], FAN])
-    near = (f0[:, :, None] + width[:, :, None] * fan).reshape(poles.shape[0], -1)
-    whole = np.concatenate([np.broadcast_to(base, (poles.shape[0], base.size)), near], axis=1)
-    return np.sort(np.clip(whole, LOWEST_HZ, nyquist), axis=1)
+def _peaks(loop: _Products) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the largest abs(S) and abs(T) of every row."""
+    angle, distance = np.abs(np.angle(loop.closed)), np.abs(1.0 - np.abs(loop.closed))
+    own = (angle[:, :, None] + distance[:, :, None] * FAN).reshape(angle.shape[0], -1)
+    base = np.broadcast_to(BASE, (angle.shape[0], BASE.size))
+    theta = np.sort(np.clip(np.concatenate([base, own], axis=1), 0.0, np.pi), axis=1)
+    s = loop.sensitivity(np.exp(1j * theta))
+    return _highest(loop, theta, np.abs(s), False), _highest(loop, theta, np.abs(1.0 - s), True)
 
 
-def _peaks(curve: Curves, f: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
-    """Return the largest value of each row's curve: the highest local maxima of its grid, refined by zooming."""
-    values = curve(f)
-    rows = np.arange(f.shape[0])
+def _highest(
+    loop: _Products, theta: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n m"], complement: bool
+) -> Float[np.ndarray, " n"]:
+    """Return the largest value of each row: the highest local maxima of its grid, refined by Newton's method."""
+    rows = np.arange(theta.shape[0])
     top = np.max(values, axis=1)
     inner = values[:, 1:-1]
     local = np.where((inner >= values[:, :-2]) & (inner >= values[:, 2:]), inner, -np.inf)
     for _ in range(MAXIMA):
         at = np.argmax(local, axis=1)
+        worth = np.flatnonzero(local[rows, at] > 0.5 * top)
+        if not worth.size:
+            break
         # Of a plateau or of doubled points, the neighbours are the same maximum.
         for near in (at - 1, at, at + 1):
             local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
-        low, high = f[rows, np.maximum(at - 1, 0)], f[rows, np.minimum(at + 3, f.shape[1] - 1)]
-        for _ in range(6):
-            x = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-            y = curve(x)
-            top = np.maximum(top, np.max(y, axis=1))
-            k = np.clip(np.argmax(y, axis=1), 1, x.shape[1] - 2)
-            low, high = x[rows, k - 1], x[rows, k + 1]
+        own, point = loop.rows(worth), at[worth] + 1
+        low, high = _around(theta[worth], point)
+        top[worth] = np.maximum(top[worth], _refined(own, low, theta[worth, point], high, complement))
     return top
+
+
+def _around(
+    theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the neighbours of a grid point that do not coincide with it."""
+    rows, last = np.arange(point.size), theta.shape[1] - 1
+    here = theta[rows, point]
+    low = np.max(np.where(theta < here[:, None] - 1e-14, theta, 0.0), axis=1)
+    high = np.min(np.where(theta > here[:, None] + 1e-14, theta, np.pi), axis=1)
+    return low, np.where(point < last, high, here)
+
+
+def _refined(
+    loop: _Products, low: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"],
+    complement: bool,
+) -> Float[np.ndarray, " n"]:  # fmt: skip
+    """Return the curve's value at its maximum between `low` and `high`."""
+    best = np.zeros(x.size)
+    live = np.arange(x.size)
+    low, x, high = low.copy(), x.copy(), high.copy()
+    small = 1e-6 * (high - low)
+    for _ in range(NEWTON_STEPS):
+        value, g, slope = _slopes(loop.rows(live), x[live], complement)
+        best[live] = np.maximum(best[live], value)
+        low[live] = np.where(g > 0.0, x[live], low[live])
+        high[live] = np.where(g > 0.0, high[live], x[live])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = g / (g**2 - slope)  # Newton on the derivative of 1/abs(curve)^2
+        new = x[live] + step
+        inside = (new > low[live]) & (new < high[live])
+        new = np.where(inside, new, 0.5 * (low[live] + high[live]))
+        moving = np.abs(new - x[live]) > small[live]
+        x[live] = new
+        live = live[moving]
+        if not live.size:
+            break
+    return best
+
+
+@np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
+def _slopes(
+    loop: _Products, x: Float[np.ndarray, " n"], complement: bool
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""
+    z = np.exp(1j * x)[:, None]
+    s, (first, second) = loop.sensitivity(z), loop.logarithmic(z)
+    value, curvature = s, second + first**2
+    if complement:
+        value = 1.0 - s
+        first, curvature = -s * first / value, -s * curvature / value
+    rise = 2.0 * np.real(1j * z * first)[:, 0]
+    bend = -2.0 * np.real(z * first + z**2 * (curvature - first**2))[:, 0]
+    return np.abs(value)[:, 0], np.where(np.isfinite(rise), rise, 1.0), bend

@@ -1,19 +1,26 @@
-"""Parameter draws: the fit's joint distribution, truncated to the bounds, and the declared ranges."""
+"""Parameter draws: the fit's joint distribution, truncated to the bounds, and the declared ranges.
+
+A range may name a parameter of a plant, a condition (`seaopt.control.digital`: an angle such as phi, delay_s), or
+``screw_mode_hz``: the frequency of the screw's mode, which its effective mass m_n sets, all else being nominal, on the
+first plant that has the part; the other plants get that mass.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from seaopt.control.digital import conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import Plant, state_space
 
 MAX_REJECTION = 200
+SCREW_MODE, SCREW_MASS = "screw_mode_hz", "m_n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,6 +35,8 @@ class Uncertainty:
         The uncertain ones of the Gaussian part, with `covariance`, shape (n, n).
     ranges : mapping of name to (low, high)
         Uniform, independent of the rest.
+    screw : (frequencies, masses)
+        Which effective mass m_n puts the screw's mode where, ascending in frequency; for a range of screw_mode_hz.
 
     """
 
@@ -35,9 +44,18 @@ class Uncertainty:
     names: tuple[str, ...]
     covariance: Float[np.ndarray, "n n"]
     ranges: Mapping[str, tuple[float, float]]
+    screw: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]] = (np.empty(0), np.empty(0))
 
-    def draw(self, count: int, rng: np.random.Generator) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return `count` draws by name; Gaussian draws outside a bound are drawn again.
+    @property
+    def size(self) -> int:
+        """Number of coordinates: of the Gaussian part, then of the ranges."""
+        return len(self.names) + len(self.ranges)
+
+    def draw(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n k"]:
+        """Return `count` draws as coordinates; Gaussian draws outside a bound are drawn again.
+
+        A coordinate of the Gaussian part is in standard deviations along a principal axis; one of a range runs from
+        -1 to 1.
 
         Raises
         ------
@@ -45,28 +63,42 @@ class Uncertainty:
             The bounds leave next to nothing of the distribution.
 
         """
-        out: dict[str, Float[np.ndarray, " n"]] = {}
-        if self.names:
-            mean = np.array(self.nominal.values_of(self.names))
-            low = np.array([self.nominal[name].min for name in self.names])
-            high = np.array([self.nominal[name].max for name in self.names])
-            values, vectors = np.linalg.eigh(self.covariance)
-            root = vectors * np.sqrt(np.maximum(values, 0.0))
-            kept = np.empty((0, mean.size))
-            for _ in range(MAX_REJECTION):
-                fresh = mean + rng.normal(size=(count, mean.size)) @ root.T
-                kept = np.vstack([kept, fresh[np.all((fresh >= low) & (fresh <= high), axis=1)]])
-                if len(kept) >= count:
-                    break
+        width = len(self.names)
+        kept = np.empty((0 if width else count, width))
+        for _ in range(MAX_REJECTION):
+            if len(kept) >= count:
+                break
+            fresh = rng.normal(size=(count, width))
+            kept = np.vstack([kept, fresh[self.inside(fresh)]])
+        if len(kept) < count:
+            raise ControlError(
+                f"fewer than 1 in {MAX_REJECTION} draws of {', '.join(self.names)} lie inside their bounds; "
+                "widen the bounds or measure more"
+            )
+        return np.hstack([kept[:count], rng.uniform(-1.0, 1.0, (count, len(self.ranges)))])
+
+    def inside(self, coordinates: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
+        """Tell which points of the Gaussian part lie inside the parameters' bounds."""
+        low = np.array([self.nominal[name].min for name in self.names])
+        high = np.array([self.nominal[name].max for name in self.names])
+        values = self._gaussian(coordinates)
+        return np.all((values >= low) & (values <= high), axis=1)
+
+    def values(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, " n"]]:
+        """Return the parameters and conditions at the coordinates, by name."""
+        out = dict(zip(self.names, self._gaussian(coordinates).T, strict=True))
+        for (name, (low, high)), t in zip(self.ranges.items(), coordinates[:, len(self.names) :].T, strict=True):
+            value = 0.5 * (low + high) + 0.5 * (high - low) * t
+            if name == SCREW_MODE:
+                out[SCREW_MASS] = np.interp(value, self.screw[0], self.screw[1])
             else:
-                raise ControlError(
-                    f"fewer than 1 in {MAX_REJECTION} draws of {', '.join(self.names)} lie inside their bounds; "
-                    "widen the bounds or measure more"
-                )
-            out |= dict(zip(self.names, kept[:count].T, strict=True))
-        for name, (low_end, high_end) in self.ranges.items():
-            out[name] = rng.uniform(low_end, high_end, count)
+                out[name] = value
         return out
+
+    def _gaussian(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
+        mean = np.array(self.nominal.values_of(self.names))
+        values, vectors = np.linalg.eigh(self.covariance)
+        return mean + coordinates[:, : mean.size] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
 def uncertainty(
@@ -86,17 +118,7 @@ def uncertainty(
 
     """
     known = {name for plant in plants.values() for name in plant.parameters}
-    for name, (low, high) in ranges.items():
-        if name not in known:
-            raise ControlError(f'range of "{name}": no plant has it; {suggestion(name, known)}')
-        if not low <= high:
-            raise ControlError(f"range of {name} = [{low:g}, {high:g}] is empty; give [low, high]")
-        bounds = [plant.defaults[name] for plant in plants.values() if name in plant.defaults]
-        if any(low < item.min or high > item.max for item in bounds):
-            raise ControlError(
-                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{bounds[0].min:g}, {bounds[0].max:g}]; "
-                "keep inside them"
-            )
+    check_ranges(ranges, plants)
     if isinstance(source, Fit):
         nominal, names, matrix = source.parameters, source.covariance.names, source.covariance.matrix
         if source.status not in ("converged", "not_identifiable"):
@@ -122,7 +144,82 @@ def uncertainty(
     whole[len(names) :, len(names) :] = np.diag(np.square(list(stds.values())))
     every = (*names, *stds)
     used = [i for i, name in enumerate(every) if name not in ranges and name in known and np.isfinite(whole[i, i])]
+    nominal = nominal.with_parameters(*others.values())
+    screw = _screw_masses(plants, nominal, ranges[SCREW_MODE]) if SCREW_MODE in ranges else (np.empty(0), np.empty(0))
     return Uncertainty(
-        nominal=nominal.with_parameters(*others.values()), names=tuple(every[i] for i in used),
-        covariance=whole[np.ix_(used, used)], ranges=dict(ranges),
+        nominal=nominal, names=tuple(every[i] for i in used), covariance=whole[np.ix_(used, used)],
+        ranges=dict(ranges), screw=screw,
     )  # fmt: skip
+
+
+def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]) -> None:
+    """Refuse ranges that are empty, leave a parameter's bounds or name nothing.
+
+    Raises
+    ------
+    ControlError
+        As said.
+
+    """
+    extra = conditions(tuple(plants.values()))
+    parameters = {name: plant.defaults.get(name) for plant in plants.values() for name in plant.parameters}
+    known = [*parameters, *extra, *([SCREW_MODE] if SCREW_MASS in parameters else [])]
+    for name, (low, high) in ranges.items():
+        if name not in known:
+            raise ControlError(f'range of "{name}": no plant has it; {suggestion(name, known)}')
+        if not (np.isfinite(low) and np.isfinite(high)):
+            raise ControlError(f"range of {name} = [{low:g}, {high:g}] is not finite; give [low, high]")
+        if not low <= high:
+            raise ControlError(f"range of {name} = [{low:g}, {high:g}] is empty; give [low, high]")
+        item = extra.get(name) or parameters.get(name)
+        if item is not None and (low < item.min or high > item.max):
+            raise ControlError(
+                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{item.min:g}, {item.max:g}]; "
+                "keep inside them"
+            )
+    if SCREW_MODE in ranges and SCREW_MASS in ranges:
+        raise ControlError(f"ranges of {SCREW_MODE} and {SCREW_MASS} say the same thing; keep one")
+
+
+def placed(
+    plant: Plant, params: ParameterSet, name: str, value: float, plants: Mapping[str, Plant]
+) -> ParameterSet | None:
+    """Return a plant's parameters with what a range may name at a value; None where the plant does not have it.
+
+    Raises
+    ------
+    ControlError
+        The screw's mode cannot be there.
+
+    """
+    values, extra = plant.complete(params), conditions((plant,))
+    if name == SCREW_MODE and SCREW_MASS in values:
+        frequencies, masses = _screw_masses(plants, params, (value, value))
+        return values.update(**{SCREW_MASS: float(np.interp(value, frequencies, masses))})
+    if name in values:
+        return values.update(**{name: value})
+    return values.with_parameters(replace(extra[name], value=value)) if name in extra else None
+
+
+def _screw_masses(
+    plants: Mapping[str, Plant], nominal: ParameterSet, wanted: tuple[float, float]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return frequencies of the screw's mode and the masses that give them, ascending in frequency."""
+    plant = next(item for item in plants.values() if SCREW_MASS in item.parameters)
+    complete = plant.complete(nominal)
+    masses = complete[SCREW_MASS].value * np.geomspace(20.0, 0.05, 400)
+    place = list(plant.states).index("s")
+    found = np.empty(masses.size)
+    for k, mass in enumerate(masses):
+        values, vectors = np.linalg.eig(state_space(plant, complete.update(**{SCREW_MASS: float(mass)}))[0])
+        part = np.abs(vectors[place] * np.linalg.inv(vectors)[:, place]) * (np.imag(values) > 0.0)
+        found[k] = np.abs(values[np.argmax(part)]) / (2 * np.pi)
+    turns = np.flatnonzero(np.diff(found) <= 0.0)
+    start = int(turns[-1]) + 1 if turns.size else 0
+    frequencies, masses = found[start:], masses[start:]
+    if wanted[0] < frequencies[0] or wanted[1] > frequencies[-1]:
+        raise ControlError(
+            f"range of {SCREW_MODE} = [{wanted[0]:g}, {wanted[1]:g}] is beyond what {SCREW_MASS} alone can do, "
+            f"{frequencies[0]:.3g} to {frequencies[-1]:.3g} Hz; keep inside, or give ranges of k_b and {SCREW_MASS}"
+        )
+    return frequencies, masses

@@ -1,0 +1,90 @@
+"""What a plant's loop is at nominal parameters beyond its figures: margins, sampled delay margin, gap to the design."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.control.digital import DELAY
+from seaopt.control.loop import STABLE
+from seaopt.control.margins import Margins, margins, nu_gap
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.robustness.batch import batch_figures
+
+SEARCHED = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
+POINTS = 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantMargins:
+    """Margins of a plant's loop.
+
+    Parameters
+    ----------
+    margins : Margins
+        Gain, phase and delay both ways, every crossing, and disk margins with their witnesses.
+    sampled_delay_s : float or None
+        The smallest delay that makes the loop unstable when the plant is sampled with that delay in it; None: none
+        as long as was looked for, `searched_delay_s`. The classical `margins.delay_s` takes the delay for a phase,
+        which is exact for whole samples only.
+    searched_delay_s : float
+        How far it was looked for.
+    nu_gap, nu_gap_hz : float and float or None
+        Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: see docs/margins.md.
+
+    """
+
+    margins: Margins
+    sampled_delay_s: float | None
+    searched_delay_s: float
+    nu_gap: float
+    nu_gap_hz: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as they stand in robustness.json."""
+        found = self.margins
+        return {
+            "gain_margin_up_db": found.gain_up_db,
+            "gain_margin_down_db": found.gain_down_db,
+            "sampled_delay_margin_s": self.sampled_delay_s,
+            "disk_margins": {
+                kind: {
+                    "alpha": item.alpha, "frequency_hz": item.frequency_hz,
+                    "perturbation": [item.perturbation.real, item.perturbation.imag],
+                    "gain_range": list(item.gain_range), "phase_deg": item.phase_deg,
+                }
+                for kind, item in found.disks.items()
+            },
+            "nu_gap": self.nu_gap,
+        }  # fmt: skip
+
+
+def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:
+    """Return the margins of a controller on a plant; the controller knows its design plant."""
+    loop = controller.close(plant, params)
+    found = margins(loop)
+    assert controller.design is not None
+    gap, gap_hz = nu_gap(controller.close(*controller.design), loop)
+    reach = SEARCHED * ((found.delay_s or 0.0) + 2 * controller.sample_time_s)
+    exact = sampled_delay_margin(controller, plant, params, reach) if found.disks else 0.0
+    return PlantMargins(margins=found, sampled_delay_s=exact, searched_delay_s=reach, nu_gap=gap, nu_gap_hz=gap_hz)
+
+
+def sampled_delay_margin(controller: Controller, plant: Plant, params: ParameterSet, reach_s: float) -> float | None:
+    """Return the smallest extra delay (s) that makes the sampled loop unstable; None if none up to `reach_s` does."""
+    low, high, first = 0.0, reach_s, True
+    while high - low > 1e-9 * reach_s:
+        delays = np.linspace(low, high, POINTS)
+        radius = batch_figures(controller, plant, params, {DELAY: delays}, peaks=False).spectral_radius
+        unstable = np.flatnonzero(radius >= STABLE)
+        if not unstable.size:
+            return None if first else high
+        k, first = int(unstable[0]), False
+        if k == 0:
+            return float(low)
+        low, high = float(delays[k - 1]), float(delays[k])
+    return high

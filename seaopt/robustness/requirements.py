@@ -1,0 +1,83 @@
+"""What a certificate requires: the specification's limits, each figure against its own, and what decides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from seaopt.control import Controller, LoopFigures
+from seaopt.control.tuner import BANDWIDTH_TOLERANCE
+from seaopt.robustness.certificate import MonteCarlo, Requirement
+from seaopt.robustness.worst import ROUNDING, UNSTABLE, Worst
+
+REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
+
+
+def design_requirements(controller: Controller, achieved: LoopFigures) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal parameters."""
+    spec = controller.spec
+    reached = achieved.bandwidth_hz if achieved.bandwidth_hz is not None else np.inf
+    rows = [
+        Requirement(
+            name="bandwidth_hz", limit=spec.bandwidth_hz, value=reached, where="design",
+            met=bool(abs(reached / spec.bandwidth_hz - 1.0) <= BANDWIDTH_TOLERANCE),
+        ),
+        Requirement(
+            name="min_sensitivity_bandwidth_hz", limit=spec.sensitivity_bandwidth_limit_hz,
+            value=achieved.sensitivity_bandwidth_hz, where="design",
+            met=achieved.sensitivity_bandwidth_hz >= spec.sensitivity_bandwidth_limit_hz * (1 - 1e-3),
+        ),
+    ]  # fmt: skip
+    peaks = (("max_reference_peak", achieved.reference_peak), ("max_noise_gain", achieved.noise_gain))
+    rows += [item for name, value in peaks for item in _upper(name, getattr(spec, name), value, "design")]
+    return rows
+
+
+def plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
+    """Return what is required of every plant at the nominal parameters."""
+    spec = controller.spec
+    return [
+        Requirement(name="spectral_radius", limit=1.0, value=figures.spectral_radius, met=figures.stable, where=name),
+        *_upper("max_sensitivity", spec.max_sensitivity, figures.ms, name),
+        *_upper("max_complementary", spec.max_complementary, figures.mt, name),
+    ]
+
+
+def _upper(name: str, limit: float | None, value: float, where: str) -> list[Requirement]:
+    if limit is None:
+        return []
+    return [Requirement(name=name, limit=limit, value=value, met=bool(value <= limit * (1 + ROUNDING)), where=where)]
+
+
+def draw_requirements(result: MonteCarlo, worst: Mapping[str, Worst]) -> list[Requirement]:
+    """Return what the draws require; where none fails, that the worst case found by search does not either."""
+    if not result.samples:
+        return []
+    name = max(worst, key=lambda key: worst[key].severity)
+    found = worst[name]
+    where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
+    witness = f"{name}: worst case has Ms {found.ms:.4g}, Mt {found.mt:.4g}" + (f" at {where}" if where else "")
+    rows = [
+        Requirement(
+            name="monte_carlo_failures", limit=0.0, value=float(result.failures), met=result.failures == 0,
+            where=witness + (REMEDY if result.failures else ""),
+        )
+    ]  # fmt: skip
+    if not result.failures:
+        rows += [row for key, item in worst.items() for row in _worst_requirements(key, item)]
+    return rows
+
+
+def _worst_requirements(name: str, found: Worst) -> list[Requirement]:
+    """Return how much of the limits the worst case uses: 1 is all of it."""
+    if not found.limited and found.severity < UNSTABLE:
+        return []
+    where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
+    met = found.severity <= 1.0 + ROUNDING
+    used = found.severity if found.severity < UNSTABLE else np.inf
+    return [
+        Requirement(
+            name="worst_case", limit=1.0, value=used, met=met, where=f"{name} at {where}" + ("" if met else REMEDY)
+        )
+    ]

@@ -1,0 +1,220 @@
+r"""The worst case: the parameters, of all that the fit and the ranges allow, with the largest Ms or spectral radius.
+
+The set is an ellipsoid of the fit's covariance that holds `LEVEL` of its probability, cut by the physical bounds, times
+the box of the ranges. From the worst draws, each round takes the gradient of how much of the limits a point uses (by
+central differences of the batch figures, which are exact to 1e-9) and tries points along it and towards the vertex of
+the set that it points to (Frank, Wolfe, Naval Research Logistics 3, 1956), all starts and plants of a round in one
+batch. What it finds is a lower bound on the true worst case: a witness, checked by `Worst.verify`, and no proof that
+there is none worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control import Controller, LoopFigures
+from seaopt.control.digital import conditions
+from seaopt.control.loop import STABLE
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.robustness.batch import BatchFigures, batch_figures
+from seaopt.robustness.draws import Uncertainty
+
+LEVEL = 0.999
+STARTS = 8
+ROUNDS = 30
+STEP = 1e-4
+VERTEX_STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.01])
+GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
+UNSTABLE = 1e6
+MATCH = 1e-6
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Witness:
+    """The figures of a worst case, and the parameters that produce them."""
+
+    parameters: dict[str, float]
+    ms: float
+    mt: float
+    ms_hz: float
+    spectral_radius: float
+    severity: float
+
+
+class Worst(tuple[Plant, ParameterSet]):
+    """A plant and the parameters at which it comes nearest to failing, or fails most.
+
+    It is the pair (plant, parameters) that `tune(..., robust_to=...)` takes, with the figures found there. Points are
+    ranked by instability, then by how much of the Ms or Mt limit they use; by Ms where there is no limit.
+    """
+
+    witness: Witness
+    limited: bool
+
+    def __new__(cls, plant: Plant, values: ParameterSet, witness: Witness, *, limited: bool) -> Worst:
+        """Return the pair with its figures; `limited` if the specification limits Ms or Mt."""
+        self = super().__new__(cls, (plant, values))
+        self.witness, self.limited = witness, limited
+        return self
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What is uncertain of the plant, at its worst."""
+        return self.witness.parameters
+
+    @property
+    def ms(self) -> float:
+        """Peak of abs(S) there; infinite if unstable."""
+        return self.witness.ms
+
+    @property
+    def mt(self) -> float:
+        """Peak of abs(T) there; infinite if unstable."""
+        return self.witness.mt
+
+    @property
+    def severity(self) -> float:
+        """The fraction of the limits that is used, or a million and the spectral radius if unstable."""
+        return self.witness.severity
+
+    def figures(self, controller: Controller) -> LoopFigures:
+        """Return every figure of the loop there, computed again."""
+        return controller.close(*self).figures()
+
+    def verify(self, controller: Controller) -> bool:
+        """Tell whether the loop, closed again, has the figures that the witness states."""
+        again, said = self.figures(controller), self.witness
+        pairs = ((again.ms, said.ms), (again.mt, said.mt), (again.spectral_radius, said.spectral_radius))
+        return all(now == then or abs(now - then) <= MATCH * abs(then) for now, then in pairs)
+
+    def __repr__(self) -> str:
+        where = ", ".join(f"{name} = {value:.5g}" for name, value in self.parameters.items()) or "the nominal values"
+        return (
+            f"Worst(Ms {self.ms:.5g}, Mt {self.mt:.5g}, spectral radius {self.witness.spectral_radius:.6g} at {where})"
+        )
+
+
+def severities(controller: Controller, found: BatchFigures) -> Float[np.ndarray, " n"]:
+    """Return how bad every draw is: instability first, then the fraction of the limits that it uses."""
+    ms, mt = limits(controller)
+    with np.errstate(invalid="ignore"):  # infinite over infinite, of unstable draws, which are ranked apart
+        used = np.maximum(found.ms / ms, found.mt / mt) if np.isfinite(min(ms, mt)) else found.ms
+    return np.where(found.spectral_radius >= STABLE, UNSTABLE + found.spectral_radius, used)
+
+
+def limits(controller: Controller) -> tuple[float, float]:
+    """Return the limits on Ms and Mt; infinite where none is imposed."""
+    given = (controller.spec.max_sensitivity, controller.spec.max_complementary)
+    return (np.inf if given[0] is None else given[0]), (np.inf if given[1] is None else given[1])
+
+
+def find_worst(
+    controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"],
+    severity: Float[np.ndarray, " n"],
+) -> Worst:  # fmt: skip
+    """Return the worst point that the draws and a search from the worst of them find.
+
+    Parameters
+    ----------
+    controller, plant, unknown
+        What is closed around what, and over what.
+    drawn, severity
+        Draws as coordinates, and how bad each is; none if nothing is uncertain.
+
+    """
+    points, scores = drawn, severity
+    if unknown.size:
+        order = np.argsort(severity)[::-1]
+        best = order[: min(STARTS, order.size)]
+        found, value = _search(controller, plant, unknown, _into_set(unknown, drawn[best]))
+        points, scores = np.vstack([drawn[best[:1]], found]), np.concatenate([severity[best[:1]], value])
+    k = int(np.argmax(scores)) if scores.size else 0
+    at = unknown.values(points[k : k + 1]) if unknown.size else {}
+    return witnessed(controller, plant, unknown.nominal, {name: float(item[0]) for name, item in at.items()})
+
+
+def witnessed(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
+    """Return the worst case at given parameters and conditions, measured one by one."""
+    extra = conditions((plant,))
+    values = plant.complete(nominal)
+    own = {name: value for name, value in at.items() if name in values}
+    given = {name: value for name, value in at.items() if name in extra}
+    values = values.update(**own).with_parameters(*(replace(extra[name], value=given[name]) for name in given))
+    figures = controller.close(plant, values).figures()
+    single = BatchFigures(
+        spectral_radius=np.array([figures.spectral_radius]), ms=np.array([figures.ms]), mt=np.array([figures.mt])
+    )
+    witness = Witness(
+        parameters=own | given, ms=figures.ms, mt=figures.mt, ms_hz=figures.ms_hz,
+        spectral_radius=figures.spectral_radius, severity=float(severities(controller, single)[0]),
+    )  # fmt: skip
+    return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))
+
+
+def _search(
+    controller: Controller, plant: Plant, unknown: Uncertainty, x: Float[np.ndarray, "s k"]
+) -> tuple[Float[np.ndarray, "s k"], Float[np.ndarray, " s"]]:
+    """Climb from every start until none gets worse."""
+
+    def score(points: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " m"]:
+        found = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
+        return np.where(unknown.inside(points), severities(controller, found), -np.inf)
+
+    value = score(x)
+    for _ in range(ROUNDS):
+        slope = _gradient(score, x)
+        trials = _trials(unknown, x, slope)
+        scores = score(trials.reshape(-1, x.shape[1])).reshape(trials.shape[:2])
+        best = np.argmax(scores, axis=1)
+        rows = np.arange(x.shape[0])
+        better = scores[rows, best] - value > 1e-7 * np.minimum(np.abs(value), 1.0)
+        x = np.where(better[:, None], trials[rows, best], x)
+        value = np.where(better, scores[rows, best], value)
+        if not np.any(better):
+            break
+    return x, value
+
+
+def _gradient(score: Any, x: Float[np.ndarray, "s k"]) -> Float[np.ndarray, "s k"]:
+    """Return central differences, zero across a bound or between stable and unstable."""
+    count, size = x.shape
+    ends = [score((x[:, None] + sign * STEP * np.eye(size)).reshape(-1, size)).reshape(count, size) for sign in (1, -1)]
+    with np.errstate(invalid="ignore"):
+        slope = (ends[0] - ends[1]) / (2 * STEP)
+    return np.where(np.isfinite(slope) & (np.abs(ends[0] - ends[1]) < 0.5 * UNSTABLE), slope, 0.0)
+
+
+def _trials(
+    unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Float[np.ndarray, "s k"]
+) -> Float[np.ndarray, "s t k"]:
+    """Return points towards the set's vertex in the slope's direction, and along the slope."""
+    g = len(unknown.names)
+    size = np.linalg.norm(slope, axis=1, keepdims=True)
+    unit = slope / np.maximum(size, 1e-300)
+    inner = np.linalg.norm(unit[:, :g], axis=1, keepdims=True)
+    vertex = np.hstack([_radius(g) * unit[:, :g] / np.maximum(inner, 1e-300), np.sign(unit[:, g:])])
+    towards = x[:, None] + VERTEX_STEPS[:, None] * (vertex - x)[:, None]
+    along = x[:, None] + GRADIENT_STEPS[:, None] * unit[:, None]
+    whole = np.concatenate([towards, along], axis=1)
+    return _into_set(unknown, whole.reshape(-1, x.shape[1])).reshape(whole.shape)
+
+
+def _into_set(unknown: Uncertainty, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Return the points, those outside the ellipsoid or the box moved onto its edge."""
+    g = len(unknown.names)
+    size = np.linalg.norm(x[:, :g], axis=1, keepdims=True)
+    return np.hstack([x[:, :g] * np.minimum(1.0, _radius(g) / np.maximum(size, 1e-300)), np.clip(x[:, g:], -1.0, 1.0)])
+
+
+def _radius(dimensions: int) -> float:
+    """Return the radius in standard deviations that holds LEVEL of a Gaussian."""
+    from scipy.special import gammaincinv
+
+    return float(np.sqrt(2.0 * gammaincinv(0.5 * dimensions, LEVEL))) if dimensions else 0.0

@@ -1,0 +1,314 @@
+"""Margins with their witnesses, peaks with proof, and the traps: against NumPy alone, python-control where right."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import cont2discrete
+
+from seaopt.control import DigitalPlant, Loop, TransferFunction
+from seaopt.control.margins import margins, nu_gap
+from seaopt.errors import ControlError
+from tests.control.test_loop import loop_of
+
+ONE = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
+
+
+def gained(factor):
+    return TransferFunction(num=np.array([float(factor)]), den=np.array([1.0]))
+
+
+def modal(modes, ts=1e-3, delay=0, law=ONE):
+    """A sum of second-order modes (hz, zeta, gain) behind a hold, under a law."""
+    n = 2 * len(modes)
+    a, b, c = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n))
+    for k, (hz, zeta, gain) in enumerate(modes):
+        w = 2 * np.pi * hz
+        a[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = [[0, w], [-w, -2 * zeta * w]]
+        b[2 * k + 1], c[0, 2 * k] = w, gain
+    a, b, c, _, _ = cont2discrete((a, b, c, np.zeros((1, 1))), ts)
+    plant = DigitalPlant(
+        a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=delay, static_gain=sum(m[2] for m in modes)
+    )
+    return Loop(plant=plant, reference=law, measurement=law)
+
+
+def independent(loop, f):
+    """L in NumPy alone, from matrices and coefficients."""
+    z, plant = np.exp(2j * np.pi * f * loop.plant.sample_time_s), loop.plant
+    rhs = np.broadcast_to(plant.b[:, None].astype(complex), (f.size, plant.b.size, 1))
+    x = np.linalg.solve(z[:, None, None] * np.eye(plant.b.size) - plant.a, rhs)[..., 0]
+    value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
+    return (x @ plant.c + plant.d) * z**-plant.delay_samples * value(loop.measurement.num) / value(loop.measurement.den)
+
+
+def poles_of(loop, factor=1.0, extra=0):
+    """The poles with a (complex) factor and extra samples of delay in the loop."""
+    a, b, c, d = DigitalPlant(
+        a=loop.plant.a, b=loop.plant.b, c=loop.plant.c, d=loop.plant.d, sample_time_s=1.0,
+        delay_samples=loop.plant.delay_samples + extra, static_gain=1.0,
+    ).delayed()  # fmt: skip
+    ac, bc, cc, dc = loop.measurement.state_space()
+    inner = 1.0 + factor * d * dc
+    u_x, u_k = -factor * dc * c / inner, -factor * cc / inner
+    closed = np.block([
+        [a + np.outer(b, u_x), np.outer(b, u_k)],
+        [np.outer(bc, c + d * u_x), ac + np.outer(bc, d * u_k)],
+    ])  # fmt: skip
+    return np.linalg.eigvals(closed)
+
+
+@pytest.mark.parametrize("name", ["stand", "swing"])
+@pytest.mark.parametrize("kind", ["symmetric", "S-based", "T-based"])
+def test_a_disk_margins_witness_puts_a_pole_on_the_circle(name, kind, request, thor):
+    loop = loop_of("pid", request.getfixturevalue(name), thor)
+    found = margins(loop).disks[kind]
+    poles = poles_of(loop, found.perturbation)
+    z = np.exp(2j * np.pi * found.frequency_hz * 1e-3)
+    assert np.min(np.abs(poles - z)) < 1e-7
+    f, skew = found.perturbation, found.skew
+    delta = 2 * (f - 1) / ((1 + skew) * f + (1 - skew))
+    assert abs(delta) == pytest.approx(found.alpha, rel=1e-9)
+
+
+@given(st.floats(0, 2 * np.pi), st.sampled_from(["symmetric", "S-based", "T-based"]))
+@settings(max_examples=25)
+def test_every_perturbation_inside_the_disk_is_survived(angle, kind):
+    loop = loop_of("pid")
+    found = margins(loop).disks[kind]
+    delta = 0.999 * found.alpha * np.exp(1j * angle)
+    f = (2 + (1 - found.skew) * delta) / (2 - (1 + found.skew) * delta)
+    assert np.max(np.abs(poles_of(loop, f))) < 1.0
+
+
+@pytest.mark.parametrize("name", ["stand", "swing"])
+def test_gain_and_delay_margins_are_where_stability_ends(name, request, thor):
+    loop = loop_of("pid", request.getfixturevalue(name), thor)
+    found = margins(loop)
+    factor = 10 ** (found.gain_up_db / 20)
+    assert (
+        np.max(np.abs(poles_of(loop, factor * (1 - 1e-6)))) < 1.0 < np.max(np.abs(poles_of(loop, factor * (1 + 1e-6))))
+    )
+    assert found.gain_down_db is None
+    whole = int(found.delay_s / 1e-3)
+    assert np.max(np.abs(poles_of(loop, extra=whole))) < 1.0 < np.max(np.abs(poles_of(loop, extra=whole + 1)))
+
+
+def test_a_gain_margin_downwards():
+    """A double integrator with lag needs its gain: raising and lowering it both end stability."""
+    ts = 1e-2
+    a, b = np.array([[1, ts], [0, 1]]), np.array([ts**2 / 2, ts])
+    plant = DigitalPlant(a=a, b=b, c=np.array([1.0, 0]), d=0.0, sample_time_s=ts, delay_samples=0, static_gain=np.inf)
+    lead = TransferFunction(num=np.convolve([40.0, -38.4], [1.0, -0.995]), den=np.convolve([1.0, -0.4], [1.0, -1.0]))
+    loop = Loop(plant=plant, reference=lead, measurement=lead)
+    found = margins(loop)
+    for db in (found.gain_up_db, found.gain_down_db):
+        assert np.max(np.abs(poles_of(loop, 10 ** (db / 20)))) == pytest.approx(1.0, abs=1e-9)
+    assert found.gain_down_db < 0 < found.gain_up_db
+    assert loop.figures().gain_margin_db == pytest.approx(min(found.gain_up_db, -found.gain_down_db))
+
+
+def test_an_unstable_loop_that_python_control_calls_comfortable(stand, thor):
+    """python-control's disk margins of this unstable loop, from the same S - T, look good; there are none."""
+    loop = loop_of("pd", stand, thor, k_p=400.0, k_d=3.0)
+    assert np.max(np.abs(poles_of(loop))) > 1.5
+    f = np.geomspace(0.1, 499.9, 20_000)
+    s = 1 / (1 + independent(loop, f))
+    assert 2 / np.abs(2 * s - 1).max() > 0.5
+    model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3)
+    law = control.ss(control.tf(loop.measurement.num, loop.measurement.den, 1e-3))
+    open_loop = model * control.ss(control.tf([1], [1, 0], 1e-3)) * law
+    assert control.disk_margins(open_loop, 2 * np.pi * f)[0] > 0.5
+    found = margins(loop)
+    assert (found.gain_up_db, found.gain_down_db, found.phase_deg, found.delay_s, found.disks) == (0, 0, 0, 0, {})
+
+
+@pytest.mark.parametrize("zeta", [1e-3, 1e-5])
+@pytest.mark.parametrize("hz", [3.21, 77.123, 431.7])
+def test_a_light_mode_between_grid_points(zeta, hz):
+    """The peak lies on a line zeta wide; a dense grid laid about the mode itself finds the same."""
+    loop = modal([(20.0, 0.7, 1.0), (hz, zeta, 0.4 * zeta)])
+    f = hz + 40 * zeta * hz * np.linspace(-1, 1, 100_001)
+    open_loop = independent(loop, f)
+    s, t = np.abs(1 / (1 + open_loop)), np.abs(open_loop / (1 + open_loop))
+    figures = loop.figures()
+    base = np.geomspace(1e-3, 499.9, 100_000)
+    wide = independent(loop, base)
+    assert figures.ms == pytest.approx(max(s.max(), np.abs(1 / (1 + wide)).max()), rel=1e-6)
+    assert figures.mt == pytest.approx(max(t.max(), np.abs(wide / (1 + wide)).max()), rel=1e-6)
+
+
+def test_several_crossings_are_all_there():
+    loop = modal([(5.0, 0.5, 1.5), (15.0, 0.02, 0.08), (33.0, 0.02, 0.05), (60.0, 0.03, 0.07)], law=gained(1.0))
+    f = np.linspace(0.01, 499.9, 400_000)
+    open_loop = independent(loop, f)
+    dense = f[np.flatnonzero(np.diff(np.sign(np.abs(open_loop) - 1)))]
+    found = margins(loop)
+    np.testing.assert_allclose([hz for hz, _ in found.phase_crossings], dense, atol=2e-3)
+    assert len(dense) >= 5
+    turns = np.flatnonzero(np.diff(np.sign(open_loop.imag)))
+    turns = turns[open_loop.real[turns] < 0]
+    assert len(found.gain_crossings) >= len(turns) >= 1
+    for k in turns:
+        assert min(abs(hz - f[k]) for hz, _ in found.gain_crossings) < 2e-3
+
+
+def test_a_response_near_nyquist_is_not_cut_off():
+    """The loop comes nearest to -1 at the Nyquist frequency itself, where L is real."""
+    loop = modal([(5.0, 0.7, 1.0), (499.0, 0.3, 0.5)], law=gained(0.9))
+    nyquist = independent(loop, np.array([500.0]))[0].real
+    f = np.linspace(0.01, 500.0, 200_001)
+    s = np.abs(1 / (1 + independent(loop, f)))
+    assert loop.figures().ms == pytest.approx(s.max(), rel=1e-8)
+    if nyquist < 0:
+        assert any(hz == pytest.approx(500.0) for hz, _ in margins(loop).gain_crossings)
+
+
+def test_no_feedback_has_no_crossings():
+    loop = modal([(10.0, 0.5, 1.0)], law=gained(0.0))
+    figures = loop.figures()
+    assert (figures.ms, figures.mt) == (pytest.approx(1.0), pytest.approx(0.0, abs=1e-12))
+    assert (figures.gain_margin_db, figures.phase_margin_deg, figures.crossover_hz) == (None, None, None)
+
+
+def test_laws_with_denominators_of_their_own_share_an_integrator():
+    """C_r over (1 - q) alone and C_y over (1 - q)(1 - q/2): the integrator is one, and the loop is stable."""
+    loop = modal([(10.0, 0.7, 1.0)])
+    reference = TransferFunction(num=np.array([0.02]), den=np.array([1.0, -1.0]))
+    measurement = TransferFunction(num=np.array([0.02, -0.01]), den=np.convolve([1.0, -1.0], [1.0, -0.5]))
+    figures = Loop(plant=loop.plant, reference=reference, measurement=measurement).figures()
+    same = Loop(plant=loop.plant, reference=reference, measurement=reference).figures()
+    assert figures.stable
+    assert figures.reference_peak == pytest.approx(same.reference_peak, rel=1e-8)
+
+
+@given(st.floats(0.3, 3.0))
+@settings(max_examples=10)
+def test_gain_takes_itself_off_the_gain_margins(factor):
+    base, scaled = loop_of("pd"), loop_of("pd", k_p=3.2 * factor, k_d=0.033 * factor)
+    shift = 20 * np.log10(factor)
+    assert margins(scaled).gain_up_db == pytest.approx(margins(base).gain_up_db - shift, abs=1e-8)
+
+
+@given(st.floats(0.1, 10.0))
+@settings(max_examples=10)
+def test_figures_scale_with_time(scale):
+    """A plant and a clock that are both slower have the same peaks at frequencies slower as much."""
+    modes = [(12.0, 0.3, 1.0), (90.0, 0.02, 0.02)]
+    base = modal(modes, delay=1)
+    slow = modal([(hz / scale, zeta, gain) for hz, zeta, gain in modes], ts=1e-3 * scale, delay=1)
+    a, b = base.figures(), slow.figures()
+    assert (b.ms, b.mt, b.disk_margin) == (pytest.approx(a.ms), pytest.approx(a.mt), pytest.approx(a.disk_margin))
+    assert b.delay_margin_s == pytest.approx(a.delay_margin_s * scale, rel=1e-7)
+    assert b.crossover_hz == pytest.approx(a.crossover_hz / scale, rel=1e-7)
+
+
+@given(st.data())
+@settings(max_examples=25)
+def test_peaks_of_random_loops_are_at_least_any_grids(data):
+    """Against a dense grid in NumPy: never below it, and above it by no more than the grid's step explains."""
+    count = data.draw(st.integers(1, 3))
+    modes = [
+        (data.draw(st.floats(0.5, 480.0)), data.draw(st.floats(1e-3, 1.0)), data.draw(st.floats(0.01, 0.4)))
+        for _ in range(count)
+    ]
+    loop = modal(modes, delay=data.draw(st.integers(0, 2)), law=gained(data.draw(st.floats(0.01, 2.0))))
+    figures = loop.figures()
+    poles = poles_of(loop)
+    assert figures.stable == (np.max(np.abs(poles)) < 1.0) or abs(np.max(np.abs(poles)) - 1) < 1e-9
+    if not figures.stable:
+        return
+    at, width = np.abs(np.angle(poles)), np.maximum(1 - np.abs(poles), 1e-9)
+    theta = np.concatenate(
+        [np.linspace(1e-6, np.pi, 4000), *(c + w * np.linspace(-9, 9, 1001) for c, w in zip(at, width, strict=True))]
+    )
+    f = np.clip(theta, 1e-6, np.pi) / (2 * np.pi * 1e-3)
+    open_loop = independent(loop, f)
+    s = 1 / (1 + open_loop)
+    for found, curve in ((figures.ms, s), (figures.mt, 1 - s), (2 / figures.disk_margin, 2 * s - 1)):
+        assert found >= np.abs(curve).max() * (1 - 1e-9)
+        assert found == pytest.approx(np.abs(curve).max(), rel=1e-3)
+
+
+def test_the_nu_gap_is_near_one_though_the_loop_is_fine(stand, swing, thor):
+    """Vinnicombe's gap from the definition on a dense grid; the controller survives the plant all the same."""
+    bench, moving = loop_of("pid", stand, thor), loop_of("pid", swing, thor)
+    f = np.geomspace(1e-3, 499.9, 200_000)
+    l1, l2 = independent(bench, f), independent(moving, f)
+    chord = np.abs(l1 - l2) / np.sqrt((1 + np.abs(l1) ** 2) * (1 + np.abs(l2) ** 2))
+    gap, at = nu_gap(bench, moving)
+    assert gap == pytest.approx(chord.max(), rel=1e-3)
+    assert gap > 0.9
+    assert at == pytest.approx(f[chord.argmax()], rel=1e-2)
+    assert moving.figures().ms < 1.5
+    assert nu_gap(bench, bench)[0] == 0.0
+
+
+def test_a_nu_gap_across_the_winding_is_one():
+    """P and -P: 1 + P2~ P1 = 1 - |P|^2 passes through zero, the winding differs or the gap is reached: never small."""
+    a, b = modal([(10.0, 0.5, 2.0)]), modal([(10.0, 0.5, -2.0)])
+    assert nu_gap(a, b)[0] > 0.79
+    with pytest.raises(ControlError, match="sample time"):
+        nu_gap(a, modal([(10.0, 0.5, 2.0)], ts=2e-3))
+
+
+def test_a_delay_in_the_plant_is_pythons_exact_one(stand, thor):
+    """A fraction of a sample: simulate the continuous plant at 100 times the rate with the late command."""
+    from seaopt.control import current_per_force, sample
+    from seaopt.control.digital import conditions
+
+    delay = conditions((stand,))["delay_s"]
+    late = sample(
+        stand, thor.with_parameters(type(delay)(name="delay_s", value=1.37e-3, unit="s")), "F1",
+        current_per_force(stand, thor), 1e-3, 0,
+    )  # fmt: skip
+    fine = sample(stand, thor, "F1", current_per_force(stand, thor), 1e-5, 0)
+    u = np.random.default_rng(0).normal(size=40)
+    x, y = np.zeros(2), []
+    for k in range(40 * 100):
+        if k % 100 == 0:
+            y.append(fine.c @ x)
+        command = (k - 137) // 100
+        x = fine.a @ x + fine.b * (u[command] if command >= 0 else 0.0)
+    z, found = np.zeros(late.b.size), []
+    for value in u:
+        found.append(late.c @ z + late.d * value)
+        z = late.a @ z + late.b * value
+    np.testing.assert_allclose(found, y, rtol=1e-8, atol=1e-10)
+
+
+def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
+    """At phi = 0.4 the motor holds the pendulum: python's own equilibrium, Jacobian by differences of the equations."""
+    import casadi as ca
+    from scipy.optimize import fsolve
+
+    from seaopt.control.digital import conditions, linearised
+    from seaopt.parameters import Parameter
+
+    f = ca.Function("f", [swing.x, swing.u, swing.p], [swing.dynamics])
+    h = ca.Function("h", [swing.x, swing.u, swing.p], [swing.output])
+    p = swing.parameter_values(thor)
+    names = list(swing.states)
+    k = names.index("phi")
+    params = thor.with_parameters(Parameter(name="phi", value=0.4, unit="rad"))
+    assert "phi" in conditions((swing,))
+    force = -4 * 9.81 * 0.3 * np.tan(0.4) / 0.0725  # F L_a cos(phi) = -m g L sin(phi)
+    q = force / 655e3 - 0.0725 * np.sin(0.4)
+    x0 = np.zeros(len(names))
+    x0[k], x0[names.index("q")] = 0.4, q
+    current = float(fsolve(lambda i: float(np.array(f(x0, i, p)).ravel()[names.index("qd")]), 0.0)[0])
+    assert np.abs(np.array(f(x0, current, p))).max() < 1e-6
+    a, _, c, _ = linearised(swing, np.array(p)[:, None], {"phi": np.array([0.4])}, "F1", 1.0)
+    for i in range(len(names)):
+        step = np.zeros(len(names))
+        step[i] = 1e-6
+        ends = [np.array(f(x0 + s * step, current, p)).ravel() for s in (1, -1)]
+        np.testing.assert_allclose(
+            a[0][:, i], (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-3 * np.abs(a).max() * 1e-3
+        )
+        ends = [np.array(h(x0 + s * step, current, p)).ravel()[0] for s in (1, -1)]
+        assert c[0][i] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-4, abs=1e-2)
+    assert params["phi"].value == 0.4

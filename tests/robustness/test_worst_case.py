@@ -1,0 +1,159 @@
+"""Conditions, worst cases and batches: recomputed one by one, by scipy's global search, and from other models."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+import seaopt as so
+from seaopt.errors import ControlError
+from seaopt.parameters import Parameter
+from seaopt.robustness import batch_figures, plant_margins
+
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+
+
+@pytest.fixture(scope="module")
+def controller(stand, swing, thor):
+    return so.tune(stand, thor, SPEC, robust_to={"swing": swing})
+
+
+def with_(params, name, value, unit):
+    return params.with_parameters(Parameter(name=name, value=value, unit=unit))
+
+
+def test_a_batch_with_conditions_is_the_one_by_one_path(controller, swing, thor):
+    rng = np.random.default_rng(0)
+    draws = {
+        "I_p": rng.uniform(0.2, 0.6, 25), "d": rng.uniform(0, 2e-3, 25), "phi": rng.uniform(-0.8, 0.8, 25),
+        "delay_s": rng.uniform(0, 2.5e-3, 25),
+    }  # fmt: skip
+    found = batch_figures(controller, swing, thor, draws)
+    for k in range(25):
+        at = thor.update(I_p=float(draws["I_p"][k]), d=float(draws["d"][k]))
+        at = with_(with_(at, "phi", float(draws["phi"][k]), "rad"), "delay_s", float(draws["delay_s"][k]), "s")
+        figures = controller.close(swing, at).figures()
+        assert found.spectral_radius[k] == pytest.approx(figures.spectral_radius, rel=1e-9)
+        assert found.ms[k] == pytest.approx(figures.ms, rel=1e-9)
+        assert found.mt[k] == pytest.approx(figures.mt, rel=1e-9)
+
+
+def test_whole_samples_of_delay_are_the_controllers_own(controller, stand, thor):
+    from dataclasses import replace
+
+    late = controller.close(stand, with_(thor, "delay_s", 2e-3, "s")).figures()
+    own = replace(controller, delay_samples=controller.delay_samples + 2).close(stand, thor).figures()
+    assert late.ms == pytest.approx(own.ms, rel=1e-10)
+    assert late.spectral_radius == pytest.approx(own.spectral_radius, rel=1e-9)
+
+
+def test_the_worst_case_is_scipys_on_one_range(controller, swing, thor):
+    """One parameter: a bounded scalar search over Ms, and both ends."""
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.1, 0.6)}, samples=40)
+
+    def minus_ms(value):
+        return -controller.close(swing, thor.update(I_p=float(value))).figures().ms
+
+    inner = minimize_scalar(minus_ms, bounds=(0.1, 0.6), method="bounded")
+    best = max(-inner.fun, -minus_ms(0.1), -minus_ms(0.6))
+    assert certificate.worst["swing"].ms == pytest.approx(best, rel=1e-6)
+
+
+def test_the_worst_case_of_several_is_no_less_than_any_corner_or_draw(controller, swing, thor):
+    ranges = {"I_p": (0.2, 0.6), "L_a": (0.065, 0.08), "eta": (0.9, 1.1), "delay_s": (0.0, 3e-4)}
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=200)
+    corners = np.array(np.meshgrid(*ranges.values())).reshape(4, -1)
+    found = batch_figures(controller, swing, thor, dict(zip(ranges, corners, strict=True)))
+    fresh = np.random.default_rng(7)
+    draws = {name: fresh.uniform(*ends, 2000) for name, ends in ranges.items()}
+    assert certificate.worst["swing"].ms >= max(
+        found.ms.max(), batch_figures(controller, swing, thor, draws).ms.max()
+    ) * (1 - 1e-6)
+
+
+def test_the_gaussian_part_stays_inside_its_ellipsoid(controller, swing, thor):
+    from scipy.stats import chi2
+
+    params = thor.prior(J=1e-7, b_r=1e-5)
+    certificate = so.certify(controller, {"swing": swing}, params, samples=100)
+    at = certificate.worst["swing"].parameters
+    size = ((at["J"] - 3.31e-6) / 1e-7) ** 2 + ((at["b_r"] - 1.31e-4) / 1e-5) ** 2
+    assert size == pytest.approx(chi2.ppf(0.999, 2), rel=1e-3)
+
+
+def test_a_witness_verifies_itself_and_goes_back_to_the_tuner(controller, stand, swing, thor):
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.15, 0.6)}, samples=60)
+    worst = certificate.worst["swing"]
+    assert worst.verify(controller)
+    plant, values = worst
+    assert controller.close(plant, values).figures().ms == pytest.approx(worst.ms, rel=1e-9)
+    other = so.tune(stand, thor, SPEC)
+    assert not worst.verify(other)
+    again = so.tune(stand, thor, SPEC, robust_to=certificate.worst)
+    assert again.close(plant, values).figures().ms <= 1.6
+
+
+def test_a_worst_case_that_no_draw_hit_fails_the_certificate(controller, swing, thor):
+    """The edge lies at an end of the range that five draws miss; the search finds it, and the requirement names it."""
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.02, 1.0)}, samples=5, seed=3)
+    assert certificate.monte_carlo.failures == 0
+    assert controller.close(swing, thor.update(I_p=0.02)).figures().ms > 1.6
+    (row,) = [item for item in certificate.requirements if not item.met]
+    assert row.name == "worst_case"
+    assert "I_p = 0.02" in row.where
+    assert not certificate.passed
+
+
+def test_the_screws_mode_is_where_it_was_asked(thor):
+    plant = so.plants.high_impedance(parts=["screw_mode"])
+    from seaopt.robustness import placed
+
+    for hz in (70.0, 75.0, 80.0):
+        values = placed(plant, thor, "screw_mode_hz", hz, {"stand": plant})
+        modes = np.abs(plant.linearize(values).poles()) / (2 * np.pi)
+        assert np.min(np.abs(modes - hz)) < 0.02
+
+
+def test_the_sampled_delay_margin_ends_stability(controller, stand, thor):
+    found = plant_margins(controller, stand, thor)
+    edge = found.sampled_delay_s
+    assert controller.close(stand, with_(thor, "delay_s", edge * (1 - 1e-6), "s")).figures().stable
+    assert not controller.close(stand, with_(thor, "delay_s", edge * (1 + 1e-6), "s")).figures().stable
+    assert found.margins.delay_s == pytest.approx(edge, rel=5e-3)  # a phase at the crossover, not the hold itself
+
+
+def test_draws_are_not_the_callers_stream(controller, swing, thor):
+    """A tuner that drew from the same seed has not seen these draws."""
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.2, 0.6)}, samples=3, seed=1)
+    first = np.random.default_rng(1).uniform(0.2, 0.6, 3)
+    assert not np.any(np.isclose(certificate.worst["swing"].parameters["I_p"], first))
+
+
+def test_progress_runs_to_the_end(controller, swing, thor):
+    seen = []
+    so.certify(
+        controller, {"swing": swing}, thor, ranges={"I_p": (0.2, 0.6)}, samples=50,
+        progress=lambda done, of: seen.append((done, of)),
+    )  # fmt: skip
+    assert seen[-1] == (50, 50)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({"delay_s": (-1e-3, 1e-3)}, "bounds"),
+        ({"screw_mode_hz": (70.0, 80.0)}, "no plant has it"),
+        ({"phi": (0.0, np.inf)}, "not finite"),
+        ({"phi": (0.0, 0.3), "q": (0.0, 1e-3)}, "rests at one"),
+    ],
+)
+def test_bad_conditions(controller, swing, thor, ranges, words):
+    with pytest.raises(ControlError, match=words):
+        so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=5)
+
+
+def test_a_screw_mode_out_of_reach(controller, thor):
+    plant = so.plants.high_impedance(parts=["screw_mode"])
+    with pytest.raises(ControlError, match="beyond what m_n alone can do"):
+        so.certify(controller, {"stand": plant}, thor, ranges={"screw_mode_hz": (70.0, 800.0)}, samples=5)
