@@ -40,6 +40,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import casadi as ca
@@ -167,6 +168,7 @@ class _Motion:
     rates: list[tuple[Any, Any]]
     forces: tuple[Any, Any]
     links: tuple[_LinkModel, _LinkModel]
+    energy: Any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +232,11 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
         forces = (tension, -bolt if screw else tension + thrust(sprung, x_s))
     else:
         forces = (tension - thrust(sprung, x_s) - (thrust(nut, x_n) if screw else 0.0), tension)
-    return _Motion(rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]))
+    stored = kinetic + potential + part_laws.spring_energy(build.parts, compression, p)
+    return _Motion(
+        rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]),
+        energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
+    )  # fmt: skip
 
 
 def _pendulum_parameters(suffix: str) -> list[Parameter]:
@@ -285,6 +291,9 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
             values |= {f"x_{number}": link.position, f"phi{build.suffixes[number - 1]}": link.coordinate}
         return {name: values[name] for name in outputs}
 
+    def energy(x: Any, p: Any) -> Any:
+        return _motion(x, SimpleNamespace(I=0.0), p, build).energy
+
     plant = Plant(
         name=name,
         states=states,
@@ -295,6 +304,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         h=h,
         derived=lambda p: derived_figures(p, housing_rides=build.drive == "unlumped" and build.spring == "link2"),
         optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
+        energy=energy if part_laws.stores_in_closed_form(build.parts) else None,
     )
     return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])
 
