@@ -6,8 +6,8 @@ Between a moment before and one after, positions stay and finite forces do nothi
 .. math:: H (\dot y^+ - \dot y^-) = \hat Q
 
 with the generalised impulses :math:`\hat Q`. A blow P (N s) along an output :math:`x_2(y)` has
-:math:`\hat Q = (\partial x_2/\partial y)^\top P`. A coordinate j that is caught stops, :math:`\dot y_j^+ = 0`; its impulse acts on
-j alone, so that the momenta of the others o stay:
+:math:`\hat Q = (\partial x_2/\partial y)^\top P`. A coordinate j that is caught stops, :math:`\dot y_j^+ = 0`; its
+impulse acts on j alone, so that the momenta of the others o stay:
 
 .. math:: \dot y_o^+ = \dot y_o^- + H_{oo}^{-1} H_{oj} \dot y_j^-, \qquad
           \hat Q_j = H_{jo} (\dot y_o^+ - \dot y_o^-) - H_{jj} \dot y_j^-
@@ -16,8 +16,9 @@ Of the unlumped actuator with the spring at link 1 and its pendulum caught this 
 :math:`\dot q^+ = \dot q^- + \tfrac{m_l}{M + m_l} \dot x_2`: the sprung mass, which moved with the nut, has to turn the
 screw. H is the second derivative of the plant's declared `energy` by the rates.
 
-A link held at :math:`x_2 = x_c` is the same plant as one held at 0 with q counted from another zero: all that the spring
-knows is :math:`\delta = q + x_2 - x_1`. So a plant without that link takes over with :math:`q + x_2` in the place of q.
+A link held at :math:`x_2 = x_c` is the same plant as one held at 0 with q counted from another zero: all that the
+spring knows is :math:`\delta = q + x_2 - x_1`. So a plant without that link takes over with :math:`q + x_2` in
+the place of q.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def caught(
     loss = 0.5 * float(before @ inertia @ before - after @ inertia @ after)
     moved = state.copy()
     moved[rates] = after
-    moved[names.index("q")] += _position(plant, params, state, output)
+    moved[names.index("q")] += position(plant, params, state, output)
     return moved[[names.index(name) for name in held.states]], impulse, loss
 
 
@@ -153,14 +154,31 @@ def released(
             raise PlantError(f'link = {{"{name}": ...}} is no state of the link of {plant.name}; '
                              + suggestion(name, [n for n in plant.states if n not in known]))  # fmt: skip
     after = np.array([{**link, **known}.get(name, 0.0) for name in plant.states], dtype=float)
-    after[list(plant.states).index("q")] -= _position(plant, params, after, output)
+    after[list(plant.states).index("q")] -= position(plant, params, after, output)
     return after
 
 
 def is_pair(plant: Plant, held: Plant) -> bool:
-    """Tell whether `held` has the states of `plant` but for one coordinate, other than q, and its rate."""
+    """Tell whether `held` is the actuator of `plant` with a link fixed.
+
+    It has the states of `plant` but for one coordinate, other than q, and its rate, and with those at zero the same
+    energy.
+    """
     left = [name for name in plant.states if name not in held.states]
-    return plant.energy is not None and "q" in held.states and len(left) == 2 and set(held.states) < set(plant.states)
+    if plant.energy is None or held.energy is None or "q" not in held.states or len(left) != 2:
+        return False
+    if not set(held.states) < set(plant.states) or not set(held.parameters) <= set(plant.parameters):
+        return False
+    numbers = dict(
+        zip((*held.states, *plant.parameters), np.random.default_rng(0).uniform(0.5, 1.5, 999), strict=False)
+    )
+    energies = [
+        float(ca.Function("energy", [item.x, item.p], [item.stored_energy()])(
+            [numbers.get(name, 0.0) for name in item.states], [numbers[name] for name in item.parameters]
+        ))
+        for item in (plant, held)
+    ]  # fmt: skip
+    return bool(np.isclose(*energies, rtol=1e-9))
 
 
 def _check_pair(plant: Plant, held: Plant) -> None:
@@ -197,7 +215,8 @@ def _inertia(plant: Plant, output: str) -> Any:
     return plant.cache[key]
 
 
-def _position(plant: Plant, params: ParameterSet, state: State, output: str) -> float:
+def position(plant: Plant, params: ParameterSet, state: State, output: str) -> float:
+    """Return an output of a state without inputs."""
     if "output" not in plant.cache:
         plant.cache["output"] = ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [plant.output])
     values = plant.cache["output"](0.0, state, np.zeros(len(plant.inputs)), plant.parameter_values(params))
