@@ -35,6 +35,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants.plant import Plant
 
 State = Float[np.ndarray, " n"]
+Held = Float[np.ndarray, " m"]
 
 
 def struck(plant: Plant, params: ParameterSet, state: State, output: str, impulse: float) -> State:
@@ -78,7 +79,7 @@ def struck(plant: Plant, params: ParameterSet, state: State, output: str, impuls
 
 def caught(
     plant: Plant, params: ParameterSet, state: State, held: Plant, output: str = "x_2"
-) -> tuple[State, float, float]:
+) -> tuple[Held, float, float]:
     """Return the state of `held` after a link of `plant` is stopped where it is.
 
     Parameters
@@ -126,7 +127,7 @@ def caught(
 
 
 def released(
-    held: Plant, state: State, plant: Plant, params: ParameterSet, link: Mapping[str, float], output: str = "x_2"
+    held: Plant, state: Held, plant: Plant, params: ParameterSet, link: Mapping[str, float], output: str = "x_2"
 ) -> State:
     """Return the state of `plant` after its link is let go at the position `link`, as the reverse of `caught`.
 
