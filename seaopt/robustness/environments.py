@@ -112,8 +112,8 @@ class StabilityMap:
     def __repr__(self) -> str:
         verdict = "stable" if self.everywhere else "NOT STABLE everywhere"
         lines = [
-            f"Coupled stability at link 2: {verdict}, masses of {self.mass[0]:.3g} to {self.mass[-1]:.3g} kg on springs "
-            f"of {self.stiffness[0]:.3g} to {self.stiffness[-1]:.3g} N/m"
+            f"Coupled stability at link 2: {verdict}, masses of {self.mass[0]:.3g} to {self.mass[-1]:.3g} kg on "
+            f"springs of {self.stiffness[0]:.3g} to {self.stiffness[-1]:.3g} N/m"
         ]
         for damping, stable in zip(self.damping, self.stable, strict=True):
             lines.append(f"  damper {damping:g} N s/m: stable in {np.count_nonzero(stable)} of {stable.size}")
