@@ -21,6 +21,7 @@ CHOICES = (
     ("unlumped", "lumped"),
     ("link1", "link2"),
     ("fixed", "mass", "pendulum"),
+    ("double", "float"),
     ("zero", "first"),
     ("split", "error"),
     ("pd", "pid"),

@@ -121,6 +121,31 @@ for _name, _text in (
     app.command(_name)(_stage(_name, _text))
 
 
+@app.command()
+def export(
+    results: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with controller.json.", show_default=False)],
+    c: Annotated[Path, typer.Option("--c", metavar="OUT", help="Folder for the C code and the gains.")],
+    precision: Annotated[str, typer.Option(metavar="double|float", help="Of the C code.")] = "double",
+    name: Annotated[str, typer.Option(help="Begins every name in C.")] = "force_law",
+    current_limit: Annotated[
+        float | None, typer.Option(metavar="AMPERES", help="In place of the specification's current_limit_A.")
+    ] = None,
+    tracking_time: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Of the anti-windup, in place of the default.")
+    ] = None,
+    allow_infeasible: Annotated[
+        bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
+    from seaopt.cli.exported import exported
+
+    options = {"current_limit_A": current_limit, "tracking_time_s": tracking_time, "allow_infeasible": allow_infeasible}
+    if not exported(results, c, json, precision=precision, name=name, **options):
+        raise typer.Exit(1)
+
+
 def main() -> None:
     """Run the command line; a SeaoptError is one line on stderr and exit code 2."""
     try:

@@ -45,6 +45,11 @@ LABELS = {
 }
 
 
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 class Session:
     """Runs stages for one problem and one folder; later stages read earlier ones' JSON where they did not run."""
 
@@ -155,8 +160,8 @@ class Session:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         return content
 
-    def _made_from(self, stage: str) -> str:
-        """Return a digest of the parts of the problem that a stage reads, and of the result before it."""
+    def _made_from(self, stage: str) -> dict[str, str]:
+        """Return digests of the parts of the problem that a stage reads, and of the result before it, by its file."""
         table = self.problem.table.model_dump(mode="json")
         parts = ["parameters", "plant", "experiment", "fit"]
         earlier = {"fit": None, "frf": None, "tune": "fit.json", "certify": "controller.json"}[stage]
@@ -164,9 +169,11 @@ class Session:
             parts += ["controller", "robustness"]
         if earlier == "fit.json" and not self.problem.table.experiment:
             earlier = None
-        before = (self.folder / earlier).read_bytes() if earlier and (self.folder / earlier).exists() else b""
         text = json.dumps({part: table[part] for part in parts}, sort_keys=True)
-        return hashlib.sha256(text.encode() + before).hexdigest()
+        made_from = {"problem": hashlib.sha256(text.encode()).hexdigest()}
+        if earlier and (self.folder / earlier).exists():
+            made_from[earlier] = digest(self.folder / earlier)
+        return made_from
 
     def _simulate(self, tell: Callable[[str], None]) -> None:
         if not self.problem.table.experiment:

@@ -166,6 +166,7 @@ class RunnableLaw:
         if not (math.isfinite(force) and np.all(np.isfinite(x))):
             return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1)
         current = applied * self.current_per_force_A_per_N
+        current = min(max(current, -self.current_limit_A), self.current_limit_A)  # a limit to the last bit
         return current, LawState(x=x, current_A=current)
 
     def run(

@@ -260,6 +260,11 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
             rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
         return inner_u, dict(out), rates
 
+    def port() -> Plant:
+        inner = plant.port() if plant.port is not None else plant
+        known = inner.inputs if where == "input" else inner.outputs
+        return _filtered(inner, part, [signal for signal in signals if signal in known])
+
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         inner_u, _, rates = split(t, x, u, p)
         return {**plant.f(t, x, SimpleNamespace(**inner_u), p), **rates}
@@ -278,4 +283,5 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         derived=plant.derived,
         optional_inputs=plant.optional_inputs,
         energy=plant.energy,
+        port=None if plant.port is None else port,
     )

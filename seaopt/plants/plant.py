@@ -46,6 +46,9 @@ class Plant:
     energy : callable ``(x, p) -> expression``, optional
         Kinetic and potential energy, J, of a mechanical plant whose states come as pairs of a coordinate and its rate,
         the coordinate first; states of filters around it may follow.
+    port : callable ``() -> Plant``, optional
+        Makes the same actuator with link 1 held and a mass m_2 on link 2 (states x_2 and v_2, input Fe2), for the
+        impedance that it shows at link 2.
 
     Raises
     ------
@@ -81,6 +84,7 @@ class Plant:
     derived: Derived | None = None
     optional_inputs: frozenset[str] = frozenset()
     energy: Energy | None = None
+    port: Callable[[], Any] | None = field(default=None, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
     u: Any = field(init=False, repr=False)

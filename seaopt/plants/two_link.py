@@ -294,6 +294,8 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
     def energy(x: Any, p: Any) -> Any:
         return _motion(x, SimpleNamespace(I=0.0), p, build).energy
 
+    inside = [part for part in build.parts if part in part_laws.INSIDE]
+    held = replace(build, links=("fixed", "mass"), suffixes=("1", "2"), parts=tuple(inside))
     plant = Plant(
         name=name,
         states=states,
@@ -305,6 +307,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         derived=lambda p: derived_figures(p, housing_rides=build.drive == "unlumped" and build.spring == "link2"),
         optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
         energy=energy if part_laws.stores_in_closed_form(build.parts) else None,
+        port=lambda: _actuator(f"port of {name}", held, external=True),
     )
     return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])
 

@@ -1,0 +1,39 @@
+"""The controller of a folder of results, as C and as gains."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from seaopt.cli.session import FILES, SCHEMAS, digest
+from seaopt.control.export import export
+from seaopt.errors import ProblemError
+from seaopt.files import read_json, to_json
+
+
+def exported(results: Path, target: Path, json: bool, **options: Any) -> bool:
+    """Write the controller of `results` to `target`, say what was written, and tell whether it is feasible.
+
+    Raises
+    ------
+    SeaoptError
+        There is no controller, or it was made from another fit than the one beside it, or it cannot be written.
+
+    """
+    path = results / FILES["tune"]
+    if not path.is_file():
+        raise ProblemError(f"{path}: no such file; give the folder of results of seaopt run or seaopt tune")
+    content = read_json(path, SCHEMAS["tune"])
+    fitted, made_from = results / FILES["fit"], content.get("made_from")
+    given = made_from.get(fitted.name) if isinstance(made_from, dict) else None
+    if given is not None and fitted.exists() and digest(fitted) != given:
+        raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
+    written = [str(file) for file in export(content, target, **options)]
+    if json:
+        sys.stdout.write(to_json({"schema": "seaopt/export/1", "feasible": content["feasible"], "files": written}))
+    else:
+        if not content["feasible"]:
+            sys.stdout.write(f"not met: {', '.join(content['active_constraints'])}\n")
+        sys.stdout.write(f"wrote {', '.join(written)}\n")
+    return content["feasible"]

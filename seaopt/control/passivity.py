@@ -1,0 +1,395 @@
+r"""Passivity of the controlled actuator at link 2: what it does to a hand, a leg or a wall that moves it.
+
+Link 1 is held, link 2 is moved with the speed v, and F2 v is the power that goes into the actuator (link 2 feels -F2,
+so that a mass has the impedance +j omega m). The actuator is passive where its impedance Z = F2/v has Re Z >= 0; where
+it is so at every frequency, nothing passive that link 2 is attached to is made unstable by it (Colgate, Hogan, Int. J.
+Control 48(1), 1988).
+
+With :math:`F_1 = G_{11} F_m + G_{12} v` and :math:`F_2 = G_{21} F_m + G_{22} v` of the plant's linearisation, and
+:math:`F_m = -C' F_1`,
+
+.. math:: Z = \frac{G_{22} + \Delta\, C'}{1 + G_{11} C'}, \qquad \Delta = G_{11} G_{22} - G_{12} G_{21} .
+
+Unlumped, spring at link 1: from :math:`M \ddot q = F_m - b_m \dot q - F_2`, :math:`F_1 = k (q + x_2)` and
+:math:`F_2 = F_1 + m_l (\ddot q + \ddot x_2)`,
+
+.. math:: Z = \frac{(m_l s^2 + k)(M s + b_m)}{m_k s^2 + b_m s + k (1 + C')}, \qquad \Delta = 0 .
+
+F1 tells F2, the sprung mass being rigid, which is why :math:`\Delta = 0`, and why Re Z >= 0 is affine in the gains:
+:math:`\mathrm{Re}[G_{22} \overline{(1 + G_{11} C')}] \ge 0` (`passivity_rows`). For an undelayed PID it reads
+
+.. math:: b_m k (1 + k_p) - M k k_i + (M k k_d - b_m m_l)\, \omega^2 \ge 0 \qquad (\omega^2 < k/m_l),
+
+at low frequency :math:`k_i \le b_m (1 + k_p)/M`, where M = J/r^2 is m_k but for m_l. Beyond :math:`\omega^2 = k/m_l`
+(160 Hz for THOR) F2 and F1 have opposite signs and the inequality is reversed: no undelayed PID of positive gains is
+passive just above. `Passivity.limit_hz` is where that begins. A delay that has turned C' by more than a quarter of a
+circle turns both: such a loop can lose passivity below and have it back above.
+
+The sampled controller is taken as linear and time-invariant: :math:`C' = C_y(e^{j\omega T_s})\, e^{-j\omega d T_s}
+(1 - e^{-j\omega T_s})/(j\omega T_s)`, with its delay and its hold. That leaves out the images that sampling folds back
+onto f from f + n/T_s, which the plant has filtered out all but for a part that grows towards the Nyquist frequency.
+Under a sinusoidal motion the mean power into the sampled loop is then abs(v)^2 Re Z/2, up to those images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.controller import Controller
+from seaopt.control.law import TransferFunction
+from seaopt.control.loop import crossings
+from seaopt.control.spec import ControllerSpec
+from seaopt.errors import ControlError, suggestion
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant, state_space
+
+Frequencies = Float[np.ndarray, " m"]
+Response = Complex[np.ndarray, " m"]
+LOWEST_HZ = 0.01
+POINTS = 2000
+ROUNDING = 1e-9  # cosines of the impedance's angle nearer to zero than this are zero
+NOT_AFFINE = 1e-6  # Delta of this share of its terms, and more, makes the condition quadratic in the gains
+TINY = float(np.finfo(float).tiny)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Passivity:
+    """Where the actuator is passive at link 2.
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        What was looked at.
+    bands_hz : tuple of (low, high)
+        Where Re Z >= 0.
+    violated_hz : float or None
+        The lowest frequency at which Re Z < 0 begins; None: nowhere.
+    least_damping_N_s_per_m : float
+        The least Re Z; where it is negative, this much viscous damping at the port would make up for it.
+    least_hz : float
+        Where that is.
+    least_cosine : float
+        Re Z/abs(Z) there, from -1 to 1.
+    limit_hz : float or None
+        From here the fed-back force and the force at the port oppose each other; None where they never do.
+
+    """
+
+    low_hz: float
+    high_hz: float
+    bands_hz: tuple[tuple[float, float], ...]
+    violated_hz: float | None
+    least_damping_N_s_per_m: float
+    least_hz: float
+    least_cosine: float
+    limit_hz: float | None
+
+    def holds(self, band_hz: tuple[float, float]) -> bool:
+        """Tell whether Re Z >= 0 throughout a band.
+
+        Raises
+        ------
+        ControlError
+            The band is not within what was looked at.
+
+        """
+        low, high = band_hz
+        if not self.low_hz <= low < high <= self.high_hz:
+            raise ControlError(
+                f"band_hz = [{low:g}, {high:g}] is not a band within {self.low_hz:g} to {self.high_hz:g} Hz; "
+                "give one, or look further"
+            )
+        return any(start <= low and high <= stop for start, stop in self.bands_hz)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields, for robustness.json."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __repr__(self) -> str:
+        bands = ", ".join(f"{low:.4g} to {high:.4g} Hz" for low, high in self.bands_hz) or "nowhere"
+        lines = [f"Passive at link 2: {bands} (of {self.low_hz:g} to {self.high_hz:g} Hz)"]
+        if self.violated_hz is not None:
+            lines.append(
+                f"  violated from {self.violated_hz:.4g} Hz, most at {self.least_hz:.4g} Hz: Re Z = "
+                f"{self.least_damping_N_s_per_m:.4g} N s/m, {self.least_cosine:.3g} of |Z|"
+            )
+        if self.limit_hz is not None:
+            lines.append(f"  from {self.limit_hz:.4g} Hz the fed-back force opposes the force at the port")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PortResponse:
+    """G_11, G_12, G_21, G_22 of the module's docstring at some frequencies; `feedback` is the fed-back force."""
+
+    motor_to_feedback: Response
+    motion_to_feedback: Response
+    motor_to_port: Response
+    motion_to_port: Response
+
+    @property
+    def determinant(self) -> Response:
+        """Delta."""
+        return self.motor_to_feedback * self.motion_to_port - self.motion_to_feedback * self.motor_to_port
+
+    def impedance(self, law: Response) -> Response:
+        """Return Z under F_m = -law F."""
+        return (self.motion_to_port + self.determinant * law) / (1.0 + self.motor_to_feedback * law)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Port:
+    """A linearised plant whose link 2 is moved and whose link 1 is held.
+
+    Parameters
+    ----------
+    a, motor, force
+        x' = a x + motor F_m + force Fe2, shapes (n, n), (n,), (n,).
+    feedback : array, shape (n + 2,)
+        The fed-back force of x, F_m and Fe2.
+    speed : int
+        Which state is v_2.
+    mass : float
+        m_2, kg, which is taken off again.
+
+    """
+
+    a: Float[np.ndarray, "n n"]
+    motor: Float[np.ndarray, " n"]
+    force: Float[np.ndarray, " n"]
+    feedback: Float[np.ndarray, " n+2"]
+    speed: int
+    mass: float
+
+    def response(self, f: Frequencies) -> PortResponse:
+        """Return the responses to motor force and to motion, Fe2 being what that motion takes."""
+        n, s = self.motor.size, 2j * np.pi * f
+        inner = np.zeros((f.size, n + 1, n + 1), dtype=complex)
+        inner[:, :n, :n] = s[:, None, None] * np.eye(n) - self.a
+        inner[:, :n, n] = -self.force
+        inner[:, n, self.speed] = 1.0
+        causes = np.zeros((n + 1, 2))
+        causes[:n, 0], causes[n, 1] = self.motor, 1.0
+        x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (f.size, n + 1, 2)))
+        taken = x[:, n]
+        read = np.einsum("i,mij->mj", self.feedback[:n], x[:, :n]) + self.feedback[n + 1] * taken
+        read[:, 0] += self.feedback[n]
+        return PortResponse(
+            motor_to_feedback=read[:, 0],
+            motion_to_feedback=read[:, 1],
+            motor_to_port=taken[:, 0],
+            motion_to_port=taken[:, 1] - s * self.mass,
+        )
+
+    def modes_hz(self) -> tuple[Frequencies, Frequencies]:
+        """Return frequency and half width of the poles with link 2 at rest."""
+        moved = self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed]
+        poles = np.linalg.eigvals(moved)
+        return np.abs(poles.imag) / (2 * np.pi), np.abs(poles.real) / (2 * np.pi)
+
+
+def port_of(plant: Plant, params: ParameterSet, measured: str, current_per_force_A_per_N: float) -> Port:
+    """Return a plant's port at link 2, driven by the current for a motor force.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such port or output.
+
+    """
+    if plant.port is None:
+        raise ControlError(f"plant {plant.name} has no port at link 2; use high_impedance, moving_output or two_link")
+    port: Plant = plant.port()
+    if measured not in port.outputs:
+        raise ControlError(
+            f'measured = "{measured}" is not an output of {port.name}; {suggestion(measured, port.outputs)}'
+        )
+    a, b, c, d = state_space(port, params)
+    motor, external = (list(port.inputs).index(name) for name in ("I", "Fe2"))
+    row = list(port.outputs).index(measured)
+    return Port(
+        a=a,
+        motor=current_per_force_A_per_N * b[:, motor],
+        force=b[:, external].copy(),
+        feedback=np.concatenate([c[row], [current_per_force_A_per_N * d[row, motor], d[row, external]]]),
+        speed=list(port.states).index("v_2"),
+        mass=port.complete(params)["m_2"].value,
+    )
+
+
+def held(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:
+    """Return the response of a delay and a zero-order hold."""
+    return np.sinc(f * sample_time_s) * np.exp(-2j * np.pi * f * sample_time_s * (0.5 + delay_samples))
+
+
+def passivity(
+    controller: Controller,
+    plant: Plant,
+    params: ParameterSet,
+    *,
+    low_hz: float = LOWEST_HZ,
+    high_hz: float | None = None,
+) -> Passivity:
+    """Find where a controlled actuator is passive at link 2.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its measurement path closes the loop; the reference stands still.
+    plant, params
+        An actuator with a port at link 2; what its links are does not matter, link 1 is held and link 2 moved.
+    low_hz, high_hz : float
+        Where to look; up to the Nyquist frequency if left out.
+
+    Returns
+    -------
+    Passivity
+        Crossings refined to rounding, and the least of all local minima, refined too.
+
+    Raises
+    ------
+    ControlError
+        The plant has no port at link 2, or the band is not one below the Nyquist frequency.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3)
+    >>> plant, params = so.plants.high_impedance(), so.plants.thor()
+    >>> found = passivity(so.tune(plant, params, spec), plant, params)
+    >>> round(found.limit_hz, 1)
+    160.3
+
+    """
+    ts = controller.sample_time_s
+    high = 0.5 / ts if high_hz is None else high_hz
+    if not 0.0 < low_hz < high <= 0.5 / ts:
+        raise ControlError(
+            f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
+        )
+    port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
+    law = controller.measurement
+
+    def impedance(f: Frequencies) -> Response:
+        return port.response(f).impedance(law.response(f, ts) * held(f, ts, controller.delay_samples))
+
+    def angle(f: Frequencies) -> Frequencies:
+        z = impedance(f)
+        return np.real(z) / np.maximum(np.abs(z), TINY)
+
+    f = _with_minima(angle, _with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
+    bands, violated = _bands(lambda x: angle(x) + ROUNDING, f)
+    z = impedance(f)
+    least = int(np.argmin(np.real(z)))
+    return Passivity(
+        low_hz=low_hz,
+        high_hz=high,
+        bands_hz=bands,
+        violated_hz=violated,
+        least_damping_N_s_per_m=float(np.real(z[least])),
+        least_hz=float(f[least]),
+        least_cosine=float(np.real(z[least]) / max(abs(z[least]), TINY)),
+        limit_hz=_limit(port, f),
+    )
+
+
+def passivity_rows(
+    plant: Plant,
+    params: ParameterSet,
+    spec: ControllerSpec,
+    current_per_force_A_per_N: float,
+    basis: Complex[np.ndarray, "m n"],
+    f: Frequencies,
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
+    """Return A and b with A theta >= b where C_y = sum of theta_i basis_i makes Re Z >= 0 at the frequencies f.
+
+    Parameters
+    ----------
+    plant, params, spec
+        The actuator, and what is measured, how fast, and how late.
+    current_per_force_A_per_N : float
+        Of the controller.
+    basis : array, shape (m, n)
+        Responses of 1, the integrator, the filtered difference, ... at f, as the controller computes them: delay and
+        hold are put in here.
+    f : array, shape (m,)
+        Hz, above zero.
+
+    Returns
+    -------
+    A, b : arrays, shapes (m, n) and (m,)
+        Each row in units of abs(G_22), so that A theta - b is Re Z/abs(Z) times abs(1 + L).
+
+    Raises
+    ------
+    ControlError
+        The measured force does not tell the force at the port (an elastic screw between them), so that the condition
+        is quadratic in the gains.
+
+    """
+    response = port_of(plant, params, spec.measured, current_per_force_A_per_N).response(f)
+    g11, g22 = response.motor_to_feedback, response.motion_to_port
+    size = np.abs(g11 * g22) + np.abs(response.motion_to_feedback * response.motor_to_port)
+    if np.any(np.abs(response.determinant) > NOT_AFFINE * size):
+        raise ControlError(
+            f"the force at the port of {plant.name} does not follow from {spec.measured} alone, so that passivity is "
+            "not affine in the gains; leave the constraint out and read the band that is reported"
+        )
+    through = (g11 * held(f, spec.sample_time_s, spec.delay_samples))[:, None] * basis
+    unit = g22 / np.abs(g22)
+    return np.real(unit[:, None] * np.conj(through)), -np.real(unit)
+
+
+def _grid(port: Port, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
+    """Return frequencies that resolve the modes of plant and law."""
+    roots = np.roots(np.trim_zeros(law.den, "b"))
+    poles = np.log(roots.astype(complex)) / sample_time_s
+    at, width = port.modes_hz()
+    at = np.concatenate([at, np.abs(poles.imag) / (2 * np.pi)])
+    width = np.concatenate([width, np.abs(poles.real) / (2 * np.pi)])
+    fan = np.concatenate([[0.0], *([[-x, x] for x in np.geomspace(0.03, 10.0, 20)])])
+    near = (at[:, None] + np.maximum(width, 1e-6 * high_hz)[:, None] * fan).ravel()
+    inside = near[(near > low_hz) & (near < high_hz)]
+    return np.unique(np.concatenate([np.geomspace(low_hz, high_hz, POINTS), inside]))
+
+
+def _with_minima(curve: Callable[[Frequencies], Frequencies], f: Frequencies) -> Float[np.ndarray, " k"]:
+    """Return f with every local minimum of the curve, by thirds."""
+    values = curve(f)
+    inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
+    low, high = f[inner - 1], f[inner + 1]
+    for _ in range(60 if inner.size else 0):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        lower = curve(left) < curve(right)
+        low, high = np.where(lower, low, left), np.where(lower, right, high)
+    return np.unique(np.concatenate([f, 0.5 * (low + high)]))
+
+
+def _bands(
+    curve: Callable[[Frequencies], Frequencies], f: Frequencies
+) -> tuple[tuple[tuple[float, float], ...], float | None]:
+    """Return where the curve is not negative, and where it first is."""
+    edges = np.concatenate([f[:1], crossings(curve, f), f[-1:]])
+    good = curve(np.sqrt(edges[:-1] * edges[1:])) >= 0.0
+    bands: list[tuple[float, float]] = []
+    for low, high, fine in zip(edges[:-1], edges[1:], good, strict=True):
+        if fine and bands and bands[-1][1] == low:
+            bands[-1] = (bands[-1][0], float(high))
+        elif fine:
+            bands.append((float(low), float(high)))
+    bad = np.flatnonzero(~good)
+    return tuple(bands), float(edges[bad[0]]) if bad.size else None
+
+
+def _limit(port: Port, f: Frequencies) -> float | None:
+    def alike(x: Frequencies) -> Frequencies:
+        response = port.response(x)
+        return np.real(response.motor_to_port * np.conj(response.motor_to_feedback))
+
+    found = crossings(alike, f)
+    return float(found[0]) if found.size else None

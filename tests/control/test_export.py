@@ -1,0 +1,312 @@
+"""The exported C, compiled strictly and run, against the law in Python; the gains read back from header and script."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+import seaopt as so
+from seaopt.control import Gains, TransferFunction
+from seaopt.control.export import export
+from seaopt.control.realisation import runnable
+from seaopt.errors import ControlError, FileError
+from seaopt.files import to_json
+from seaopt.simulation.compiler import find_compiler
+
+STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
+TS = 1e-3
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+    return so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
+
+
+@pytest.fixture(scope="module")
+def compiler():
+    found = find_compiler()
+    if found is None:
+        pytest.skip("no C compiler on this machine")
+    return found
+
+
+def with_law(controller, c_r, c_y):
+    return replace(controller, reference=c_r, measurement=c_y)
+
+
+def high_order(controller):
+    """A notch, a slow lag and a double integrator."""
+    den = np.array([1.0])
+    for factor in ([1, -1], [1, -1], [1, -0.97], [1, -0.5], [1, -1.6, 0.7]):
+        den = np.convolve(den, factor)
+    num = np.array([3.0])
+    for factor in ([1, -0.99], [1, -0.98], [1, -0.9], [1, -0.4], [1, -1.8, 0.9]):
+        num = np.convolve(num, factor)
+    return with_law(controller, *(TransferFunction(num=k * num, den=den) for k in (1.2, 1.0)))
+
+
+def gain_only(controller):
+    one = TransferFunction(num=np.array([40.0]), den=np.array([1.0]))
+    return with_law(controller, one, one)
+
+
+class Compiled:
+    """An exported law through ctypes."""
+
+    def __init__(self, compiler, folder, controller, precision, **options):
+        export(controller, folder, precision=precision, name="law", **options)
+        library = folder / "law.so"
+        command = [*compiler, *STRICT, "-O2", "-shared", "-fPIC", str(folder / "law.c"), "-o", str(library)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        real = ctypes.c_double if precision == "double" else ctypes.c_float
+        order = int(re.search(r"_ORDER (\d+)", (folder / "law.h").read_text())[1])
+
+        class Law(ctypes.Structure):
+            _fields_ = (("x", real * max(order, 1)), ("current_A", real), ("held", ctypes.c_ulong))
+
+        self.law, self.library = Law(), ctypes.CDLL(str(library))
+        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, real]
+        self.library.law_step.restype = real
+        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, real, real]
+        self.library.law_init(ctypes.byref(self.law))
+
+    def step(self, reference, measurement):
+        return self.library.law_step(ctypes.byref(self.law), float(reference), float(measurement))
+
+    def reset(self, *values):
+        self.library.law_reset(ctypes.byref(self.law), *values)
+
+    def run(self, references, measurements):
+        return np.array([self.step(*pair) for pair in zip(references, measurements, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def signals():
+    """Slow and fast parts, so large that the current is at its limit about half of the time."""
+    rng = np.random.default_rng(3)
+    slow = lfilter([0.02], [1, -0.98], rng.normal(size=(2, 4000)))
+    return 800 * slow + 30 * rng.normal(size=(2, 4000))
+
+
+LAWS = {"tuned": lambda c: c, "high_order": high_order, "gain_only": gain_only}
+
+
+@pytest.mark.parametrize("which", list(LAWS))
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_compiled_c_is_the_python_law(which, precision, compiler, tuned, signals, tmp_path):
+    """Double to 1e-12 of the limit; in float to 1e-5 of it (measured: 1.3e-6)."""
+    controller = LAWS[which](tuned)
+    expected, _ = runnable(controller).run(*signals)
+    assert 0.05 < np.mean(np.abs(expected) == 9.0) < 0.95
+    found = Compiled(compiler, tmp_path, controller, precision).run(*signals)
+    tolerance = 9.0 * (1e-12 if precision == "double" else 1e-5)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+    assert np.abs(found).max() <= 9.0
+
+
+@pytest.mark.parametrize("flags", [["-Wconversion", "-Wdouble-promotion", "-Wshadow"], ["-x", "c++", "-std=c++11"]])
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("limit", [9.0, np.inf])
+def test_the_c_compiles_under_stricter_rules_and_its_headers_as_cpp(flags, precision, limit, compiler, tuned, tmp_path):
+    export(tuned, tmp_path, precision=precision, name="law", current_limit_A=limit)
+    source = '#include "law.h"\n#include "law_gains.h"\n' if "c++" in flags else (tmp_path / "law.c").read_text()
+    (tmp_path / "unit.c").write_text(source)
+    strict = STRICT if "c++" not in flags else ["-Wall", "-Wextra", "-Werror", "-pedantic"]
+    command = [*compiler, *strict, *flags, "-c", str(tmp_path / "unit.c"), "-o", str(tmp_path / "unit.o")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "c++" in flags and "cc1plus" in done.stderr:
+        pytest.skip("no C++ compiler on this machine")
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_object_needs_no_library(compiler, tuned, tmp_path):
+    if shutil.which("nm") is None:
+        pytest.skip("no nm on this machine")
+    export(tuned, tmp_path, name="law")
+    made = tmp_path / "law.o"
+    subprocess.run([*compiler, "-std=c99", "-O1", "-c", str(tmp_path / "law.c"), "-o", str(made)], check=True)
+    undefined = subprocess.run(["nm", "-u", str(made)], capture_output=True, text=True, check=True).stdout
+    assert undefined.strip() == ""
+    assert "#include <" not in (tmp_path / "law.c").read_text() + (tmp_path / "law.h").read_text()
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_the_compiled_loop_is_the_simulated_one(precision, compiler, tuned, tmp_path):
+    """A step to 0.9 of what 9 A can hold on the paper's stand, discretised by scipy, the current a sample late."""
+    p = so.plants.thor()
+    r = p["l"].value / (2 * np.pi * p["N_p"].value)
+    m_k, b_m, k = p["m_l"].value + p["J"].value / r**2, p["b_r"].value / r**2, p["k"].value
+    per_ampere = p["K_tau"].value / r
+    continuous = (
+        np.array([[0, 1], [-k / m_k, -b_m / m_k]]), np.array([[0], [per_ampere / m_k]]), np.array([[k, 0]]), [[0.0]],
+    )  # fmt: skip
+    a, b, c, _, _ = cont2discrete(continuous, TS)
+
+    def closed(step):
+        x, late, forces = np.zeros(2), 0.0, []
+        for _ in range(3000):
+            forces.append(float(c[0] @ x))
+            x, late = a @ x + b[:, 0] * late, step(target, forces[-1])
+        return np.array(forces)
+
+    law = runnable(tuned)
+    target = 0.9 * law.force_limit_N
+    state = law.reset()
+
+    def python(reference, measurement):
+        nonlocal state
+        current, state = law.step(state, reference, measurement)
+        return current
+
+    expected = closed(python)
+    found = closed(Compiled(compiler, tmp_path, tuned, precision).step)
+    np.testing.assert_allclose(found, expected, atol=target * (1e-11 if precision == "double" else 1e-5))
+    assert found[-1] == pytest.approx(target, rel=1e-5)
+
+
+def test_reset_continues_from_a_current_in_c(compiler, tuned, tmp_path):
+    compiled = Compiled(compiler, tmp_path, tuned, "double")
+    compiled.reset(700.0, 700.0, 2.5)
+    assert compiled.step(700.0, 700.0) == pytest.approx(2.5, rel=1e-12)
+    compiled.reset(np.nan, np.inf, 100.0)
+    assert compiled.law.current_A == 9.0
+    compiled.reset(0.0, 0.0, np.nan)
+    assert compiled.step(0.0, 0.0) == 0.0
+
+
+def test_readings_that_are_not_finite_hold_the_command_in_c(compiler, tuned, signals, tmp_path):
+    r, y = signals[:, :900] / 10
+    bad = y.copy()
+    bad[400:404] = [np.nan, np.inf, -np.inf, 1e308]
+    law = runnable(tuned)
+    expected, state = law.run(r[:404], bad[:404])
+    compiled = Compiled(compiler, tmp_path, tuned, "double")
+    found = compiled.run(r[:404], bad[:404])
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+    assert (found[400:] == found[399]).all()
+    assert compiled.law.held == state.held == 4
+    np.testing.assert_allclose(compiled.run(r[404:], y[404:]), law.run(r[404:], y[404:], state)[0], atol=1e-11)
+
+
+def test_fast_math_is_refused(compiler, tuned, tmp_path):
+    export(tuned, tmp_path, name="law")
+    command = [*compiler, "-ffast-math", "-c", str(tmp_path / "law.c"), "-o", str(tmp_path / "law.o")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "without -ffast-math" in done.stderr
+
+
+def numbers(text):
+    return [float(word) for word in re.findall(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?", text)]
+
+
+def test_the_matlab_script_has_the_law(tuned, tmp_path):
+    """Every assignment read back; the state space's response is C_r and C_y at 20 frequencies."""
+    export(tuned, tmp_path, precision="float", name="knee joint")
+    text = (tmp_path / "knee_joint_gains.m").read_text(encoding="utf-8")
+    given = dict(re.findall(r"^([\w.]+) = ([^%\n]*);", text, flags=re.MULTILINE))
+    for name, value in tuned.gains.items():
+        assert numbers(given[f"gains.{name}"]) == [value]
+    assert numbers(given["current_per_force"]) == [tuned.current_per_force_A_per_N]
+    for name, tf in (("reference", tuned.reference), ("measurement", tuned.measurement)):
+        assert numbers(given[f"{name}_num"]) == tf.num.tolist()
+        assert numbers(given[f"{name}_den"]) == tf.den.tolist()
+    a = np.array([numbers(row) for row in given["A"].split(";")])
+    b_r, b_y, c = (np.array(numbers(given[name])) for name in ("B_r", "B_y", "C"))
+    z = np.exp(2j * np.pi * np.geomspace(0.1, 400, 20) * TS)
+    for b, d, tf in ((b_r, "D_r", tuned.reference), (b_y, "D_y", tuned.measurement)):
+        found = [c @ np.linalg.solve(v * np.eye(len(c)) - a, b) + numbers(given[d])[0] for v in z]
+        expected = [np.polyval(tf.num[::-1], 1 / v) / np.polyval(tf.den[::-1], 1 / v) for v in z]
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_the_header_of_gains_has_the_law(compiler, tuned, tmp_path):
+    """Compiled into a table and read back, it is the controller to the last bit."""
+    export(tuned, tmp_path, name="law")
+    (tmp_path / "table.c").write_text(
+        '#include "law_gains.h"\nconst double num[] = LAW_MEASUREMENT_NUM;\nconst double k_i = LAW_GAIN_K_I;\n'
+    )
+    library = tmp_path / "table.so"
+    command = [*compiler, *STRICT, "-shared", "-fPIC", str(tmp_path / "table.c"), "-o", str(library)]
+    subprocess.run(command, check=True)
+    table = ctypes.CDLL(str(library))
+    assert ctypes.c_double.in_dll(table, "k_i").value == tuned.gains["k_i"]
+    assert list((ctypes.c_double * 3).in_dll(table, "num")) == tuned.measurement.num.tolist()
+
+
+def test_a_controller_json_gives_the_same_files(tuned, tmp_path):
+    written = export(tuned, tmp_path / "a"), export(json.loads(to_json(tuned.to_dict())), tmp_path / "b")
+    for one, other in zip(*written, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+        assert one.stat().st_size > 300
+
+
+def test_an_infeasible_controller_is_refused_unless_asked(tuned, tmp_path):
+    missed = replace(tuned, feasible=False, active_constraints=("max_noise_gain",))
+    with pytest.raises(ControlError, match="misses max_noise_gain"):
+        export(missed, tmp_path)
+    assert not list(tmp_path.iterdir())
+    for path in export(missed, tmp_path, allow_infeasible=True):
+        assert path.suffix == ".c" or "NOT FEASIBLE: this controller does not meet max_noise_gain" in path.read_text()
+
+
+def test_text_cannot_leave_its_comment(tuned, tmp_path):
+    content = json.loads(to_json(tuned.to_dict()))
+    content["structure"] = "pid */ int main(void)\n{"
+    for path in export(content, tmp_path, name="a/../b"):
+        assert path.parent == tmp_path
+        assert path.name.startswith("a_b")
+        assert path.read_text().count("*/ int") == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"precision": "half"}, 'precision = "half" is not known'),
+        ({"name": "../.."}, "cannot begin a name in C"),
+        ({"name": "a" * 26}, "cannot begin a name in C"),
+        ({"current_limit_A": 0.0}, "current_limit_A = 0 is not positive"),
+        ({"tracking_time_s": float("nan")}, "tracking_time_s = nan is not positive"),
+    ],
+)
+def test_bad_options_are_refused(options, words, tuned, tmp_path):
+    with pytest.raises(ControlError, match=words):
+        export(tuned, tmp_path, **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("gains", None), ("gains", {"k_p": None}), ("reference", {"num": [1.0]}), ("sample_time_s", "x"), ("spec", None)],
+)
+def test_a_malformed_controller_json_is_refused(field, value, tuned, tmp_path):
+    content = json.loads(to_json(tuned.to_dict())) | {field: value}
+    with pytest.raises(FileError, match=r"controller\.json"):
+        export(content, tmp_path)
+
+
+def test_a_pid_whose_integral_is_slow_is_coarse_in_float(compiler, tuned, tmp_path):
+    """At 1 kN an increment under 3e-5 N is lost: an error of 0.02 N stands with k_i = 1.3, and double takes it up."""
+    slow = Gains(k_p=3.2, k_i=1.3, k_d=0.0, T_f=1e-3, k_ff=1.0).transfer_functions("pid", TS)
+    errors = []
+    for precision in ("double", "float"):
+        folder = tmp_path / precision
+        folder.mkdir()
+        compiled = Compiled(compiler, folder, with_law(tuned, *slow), precision, current_limit_A=90.0)
+        compiled.reset(1000.0, 1000.0, 2000.0 * tuned.current_per_force_A_per_N)
+        before = compiled.law.x[0]
+        for _ in range(1000):
+            compiled.step(1000.0, 999.99)
+        errors.append(compiled.law.x[0] - before)
+    assert errors[0] == pytest.approx(1.3 * 0.01, rel=1e-3)
+    assert errors[1] == 0.0
