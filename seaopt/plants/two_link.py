@@ -219,9 +219,10 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     inertia, _ = ca.hessian(kinetic, yd)
     gyroscopic = ca.jtimes(ca.gradient(kinetic, yd), y, yd) - ca.gradient(kinetic, y)
     motor = p.eta * (p.K_tau / r) * u.I - b_m * x.qd - part_laws.dry_friction(build.parts, x.qd, p)
-    external = getattr(u, "Fe1", 0.0) * x_1 + getattr(u, "Fe2", 0.0) * x_2
+    # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
+    external = getattr(u, "Fe1", 0.0) * ca.gradient(x_1, y) + getattr(u, "Fe2", 0.0) * ca.gradient(x_2, y)
     damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping for link in moving))
-    generalised = ca.gradient(external - potential, y) - damping - tension * ca.gradient(compression, y)
+    generalised = external - ca.gradient(potential, y) - damping - tension * ca.gradient(compression, y)
     generalised[0] += motor
     ydd = ca.mtimes(ca.inv_minor(inertia), generalised - gyroscopic)
 

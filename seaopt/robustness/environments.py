@@ -257,11 +257,12 @@ def _radii(
     for name, drawn in (("m_2", m), ("k_e", k), ("d_e", d)):
         values[list(coupled.parameters).index(name)] = drawn
     a, b, c, through = _sampled(controller, coupled, values)
-    law = DigitalPlant(
-        **dict(zip("abcd", controller.measurement.state_space(), strict=True)), sample_time_s=controller.sample_time_s,
-        delay_samples=controller.delay_samples, static_gain=math.inf,
-    ).delayed()  # fmt: skip
-    ak, bk, ck, dk = law
+    la, lb, lc, ld = controller.measurement.state_space()
+    late = DigitalPlant(
+        a=la, b=lb, c=lc, d=ld, sample_time_s=controller.sample_time_s, delay_samples=controller.delay_samples,
+        static_gain=math.inf,
+    )  # fmt: skip
+    ak, bk, ck, dk = late.delayed()
     share = 1.0 / (1.0 + dk * through)
     n, size = b.shape[1], b.shape[1] + bk.size
     closed = np.zeros((m.size, size, size))

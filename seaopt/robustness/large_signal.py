@@ -138,7 +138,7 @@ def large_signal(
     f = PERIODS / (lengths * period)
     onset = _onset(controller, plant, parameters, f)
     static = float(np.abs(controller.close(plant, parameters).tracking(np.array([LOWEST_HZ])))[0])
-    at_band = float(_onset(controller, plant, parameters, np.array([band]))[0])
+    at_band = float(_onset(controller, plant, parameters, np.array([float(band)]))[0])
     amplitude = np.array(amplitudes_N, float) if amplitudes_N is not None else np.array(AMPLITUDES) * at_band
     if not (amplitude.size and np.all(amplitude > 0.0)):
         raise ControlError(f"amplitudes_N = {amplitudes_N} are not positive; give some")

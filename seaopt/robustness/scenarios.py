@@ -258,7 +258,7 @@ def _hold(rest: float, lasting: float, tail: float) -> Scenario:
 
 def _chirp(controller: Controller, small: float, tail: float) -> Scenario:
     band = controller.spec.bandwidth_hz
-    limit = controller.force_limit(band)
+    limit = controller.force_limit(float(band))
     sweep = Chirp(amplitude=0.5 * limit if limit is not None else small, f0_hz=band / 5, f1_hz=1.5 * band)
     return Scenario(name="chirp", phases=(Phase(duration_s=2.0, excitation=(sweep,)), Phase(duration_s=tail)))
 
