@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -67,10 +67,12 @@ def _phases(axes: tuple[Axes, Axes], trace: Trace, until: float, verification: V
                 axis.axvspan(trace.time[start], min(trace.time[stop - 1], until), color=HELD, zorder=0)
 
 
-def large_signal_figure(found: Mapping[str, LargeSignal]) -> Figure:
+def large_signal_figure(found: Sequence[LargeSignal]) -> Figure:
     """Draw the gain against frequency at each amplitude, and the saturation map, a row a plant."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     figure, axes = panels(len(found), 2, 3.0 * len(found), sharex=True)
-    for (left, right), (name, item) in zip(axes, found.items(), strict=True):
+    for (left, right), item in zip(axes, found, strict=True):
         shades = np.linspace(0.85, 0.0, item.amplitude_N.size)
         for amplitude, gain, hit, shade in zip(item.amplitude_N, item.gain, item.saturated, shades, strict=True):
             colour = (shade * 0.75, 0.30 + shade * 0.55, 0.55 + shade * 0.4)
@@ -79,11 +81,13 @@ def large_signal_figure(found: Mapping[str, LargeSignal]) -> Figure:
             left.semilogx(item.frequency_hz[hit], size[hit], ".", color=colour, markersize=5)
         left.axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9)
         left.legend(frameon=False, fontsize="small")
-        left.set_title(
-            f"{name}: first harmonic |F/F_ref| [dB]; dots: the current saturates", fontsize="medium", loc="left"
-        )
+        left.set_title(f"{item.plant}: |F/F_ref| [dB]; dots: saturated", fontsize="medium", loc="left")
         right.loglog(item.frequency_hz, item.onset_N, color=MODEL, linewidth=1.3)
-        right.set_title(f"{name}: amplitude at which the current saturates [N]", fontsize="medium", loc="left")
+        right.set_title("amplitude at which the current saturates [N]", fontsize="medium", loc="left")
+        for axis in (left.xaxis, right.xaxis, right.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
     for axis in axes[-1]:
         axis.set_xlabel("frequency [Hz]")
     return figure
@@ -119,7 +123,7 @@ def stability_figure(found: StabilityMap) -> Figure:
 
 
 def verification_figures(
-    verification: Verification | None, large: Mapping[str, LargeSignal], coupled: StabilityMap | None
+    verification: Verification | None, large: Sequence[LargeSignal], coupled: StabilityMap | None
 ) -> dict[str, Figure]:
     """Return every figure that the results allow, by file name."""
     out: dict[str, Figure] = {}
@@ -135,7 +139,7 @@ def verification_figures(
 
 def verification_section(
     verification: Verification | None,
-    large: Mapping[str, LargeSignal],
+    large: Sequence[LargeSignal],
     coupled: StabilityMap | None,
     svgs: Mapping[str, str],
     number: Any,

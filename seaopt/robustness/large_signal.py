@@ -41,6 +41,8 @@ class LargeSignal:
 
     Parameters
     ----------
+    plant : str
+        Its name.
     frequency_hz : array, shape (f,)
     amplitude_N : array, shape (a,)
         Of F_ref.
@@ -55,6 +57,7 @@ class LargeSignal:
 
     """
 
+    plant: str
     frequency_hz: Float[np.ndarray, " f"]
     amplitude_N: Float[np.ndarray, " a"]
     gain: Complex[np.ndarray, "a f"]
@@ -71,7 +74,7 @@ class LargeSignal:
         }
 
     def __repr__(self) -> str:
-        lines = ["Large-signal bandwidth"]
+        lines = [f"Large-signal bandwidth on {self.plant}"]
         for amplitude, band, hit in zip(self.amplitude_N, self.bandwidth_hz, self.saturated, strict=True):
             shown = "not within the sweep" if band is None else f"{band:.4g} Hz"
             from_hz = f", saturates from {self.frequency_hz[np.argmax(hit)]:.4g} Hz" if np.any(hit) else ""
@@ -152,7 +155,7 @@ def large_signal(
         gain[:, column] = 2j * np.mean(force * np.exp(-1j * phase[-length:]), axis=1) / amplitude
         saturated[:, column] = np.max(np.abs(current), axis=1) >= limit * (1 - 1e-9)
     return LargeSignal(
-        frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
+        plant=plant.name, frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
         bandwidth_hz=tuple(_bandwidth(f, np.abs(row), static) for row in gain),
     )  # fmt: skip
 
