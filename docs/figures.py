@@ -11,6 +11,9 @@ from matplotlib.figure import Figure
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.estimation import Limits, design_experiment
+from seaopt.reporting.verification import large_signal_figure, stability_figure
+from seaopt.robustness.environments import coupled_stability
+from seaopt.robustness.large_signal import large_signal
 
 FOLDER = Path(__file__).resolve().parent / "figures"
 COLOURS = {"unlumped": "#0072b2", "lumped": "#d55e00"}
@@ -136,6 +139,15 @@ def experiment_design() -> None:
     save(figure, "experiment_design")
 
 
+def verification() -> None:
+    stand, swing, params = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+    spec = so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+    controller = so.tune(stand, params, spec, robust_to={"swing": swing})
+    found = [large_signal(controller, plant, params) for plant in (stand, swing)]
+    save(large_signal_figure(found), "large_signal")
+    save(stability_figure(coupled_stability(controller, stand, params)), "environments")
+
+
 if __name__ == "__main__":
     force_responses(so.plants.high_impedance, "high_impedance")
     force_responses(so.plants.moving_output, "moving_output")
@@ -143,3 +155,4 @@ if __name__ == "__main__":
     rotary()
     parts()
     experiment_design()
+    verification()
