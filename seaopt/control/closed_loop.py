@@ -2,8 +2,8 @@ r"""The loop as it will run: a continuous nonlinear plant and a law that acts on
 
 At sample k the load cell reads :math:`m_k = Q(y_k + n_k)`, noise :math:`n_k` and quantisation Q as `Sensors` says; the
 law `RunnableLaw` makes of it and of the reference a motor force, limited, with its anti-windup; the current
-:math:`I = g\,\mathrm{sat}(F)` may be rounded to the amplifier's step, waits `delay_samples` samples and is then
-held for one. In between
+:math:`I = g\,\mathrm{sat}(F)` may be rounded to the amplifier's step, waits `delay_samples` samples (and
+`delay_s` more, where a run's parameters hold that) and is then held for one. In between
 
 .. math:: \dot x = f(t, x, u, p), \qquad u \text{ constant},
 
@@ -25,17 +25,18 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.loop_kernel import Job, Trace, kernel
-from seaopt.control.sampled_loop import ENERGY, LoopState, SampledLoop, at_rest
+from seaopt.control.sampled_loop import DELAY, ENERGY, LoopState, SampledLoop, at_rest, whole_samples
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 
-__all__ = ["ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
+__all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
 MAX_SUBSTEPS = 512
 RTOL = 1e-6
@@ -55,7 +56,7 @@ class LoopRun:
     outputs : mapping of name to array, shape (runs, n)
         The plant's outputs (as they are, not as measured), and "energy" (J) where the plant declares it.
     current : array, shape (runs, n)
-        A, in force from this sample to the next.
+        A, in force at the end of the sample.
     states : array, shape (runs, n, nx)
         The plant's states.
     peaks : mapping of name to array, shape (runs,)
@@ -101,7 +102,7 @@ def run_loop(
     loop : SampledLoop
         Plant, law and devices.
     params : sequence of ParameterSet
-        One a run.
+        One a run; `delay_s` among them is delay besides the controller's, exact between samples too.
     reference : array, shape (n,) or (runs, n)
         F_ref at each sample, N.
     start : LoopState, optional
@@ -149,6 +150,7 @@ def run_loop(
         noise=_noise(loop, runs, n, seed),
         external=_external(loop.plant, external or {}, n),
         p=np.array([loop.plant.parameter_values(item) for item in params]).reshape(runs, -1),
+        **_lags(loop, params),
         start=start if start is not None else at_rest(loop, runs),
         start_s=start_s,
     )
@@ -207,6 +209,23 @@ def _external(plant: Plant, given: Mapping[str, Float[np.ndarray, " n"]], n: int
             raise SimulationError(f"external {name} has the shape {values.shape}; give ({n},), one value a sample")
     columns = [given.get(name, np.zeros(n)) for name in names]
     return np.ascontiguousarray(np.column_stack(columns) if columns else np.zeros((n, 0)), dtype=float)
+
+
+def _lags(loop: SampledLoop, params: Sequence[ParameterSet]) -> dict[str, Any]:
+    """Return which commands are in force in each run, and from when; `lag` and `late_s` of a job."""
+    queue = loop.waiting
+    lag, late = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
+    for run, item in enumerate(params):
+        delay = item[DELAY].value if DELAY in item else 0.0
+        if not 0.0 <= delay <= loop.longest_delay_s:
+            raise SimulationError(
+                f"{DELAY} = {delay:g} is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "
+                "longest of all runs"
+            )
+        whole, late[run] = whole_samples(delay, loop.law.sample_time_s)
+        newer = loop.delay_samples + whole
+        lag[run, 0, newer + (late[run] > 0.0)] = lag[run, 1, newer] = 1.0
+    return {"lag": lag.reshape(len(params), -1), "late_s": late}
 
 
 def _first_guess(loop: SampledLoop, params: Sequence[ParameterSet], rtol: float) -> int:

@@ -31,12 +31,18 @@ Rows = Float[np.ndarray, "runs n"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Job:
-    """The data of runs, checked; `external` has shape (n, nu - 1), p (runs, np)."""
+    """The data of runs, checked.
+
+    `lag` picks, of the newest command and those that wait, the one in force at the start of a sample and the one after
+    `late_s` seconds of it.
+    """
 
     reference: Rows
     noise: Rows
     external: Float[np.ndarray, "n ne"]
     p: Float[np.ndarray, "runs np"]
+    lag: Float[np.ndarray, "runs w"]
+    late_s: Float[np.ndarray, " runs"]
     start: LoopState
     start_s: float
 
@@ -57,12 +63,17 @@ class Trace:
 
 
 def _sample_function(loop: SampledLoop) -> Any:
-    """Return the CasADi function (t, x, z, e, r, w, p, c) -> (z+, u, y) of sensor, law and delay at one sample."""
-    plant, n, delay = loop.plant, loop.law.c.size, loop.delay_samples
-    z, r, w = ca.SX.sym("z", n + delay), ca.SX.sym("r"), ca.SX.sym("w")
+    """Return the CasADi function (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y): sensor, law and delay at a sample.
+
+    `u` holds the current in force at first, `late` is the one after it.
+    """
+    plant, n, queue = loop.plant, loop.law.c.size, loop.waiting
+    z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
     e, c = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("c", _constants(loop).size)
     observe = _observe(loop)
-    waiting = z[n + delay - 1] if delay else ca.SX(0)
+    lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
+    first, second = lag[: queue + 1], lag[queue + 1 :]
+    waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
     reading = observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)[list(plant.outputs).index(loop.measured)] + w
     size = n * n
     a = ca.reshape(c[:size], n, n)
@@ -80,11 +91,11 @@ def _sample_function(loop: SampledLoop) -> Any:
     current = gain * limited
     if loop.current_step_A:
         current = step * ca.floor(current / step + 0.5)
-    applied = waiting if delay else current
-    moved = ca.vertcat(after, *([current, *(z[n + i] for i in range(delay - 1))] if delay else []))
-    u = ca.vertcat(applied, e)
-    arguments = [plant.t, plant.x, z, e, r, w, plant.p, c]
-    return ca.Function("seaopt_sample", arguments, [ca.densify(moved), u, observe(plant.t, plant.x, u, plant.p)])
+    moved = ca.vertcat(after, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
+    known = ca.vertcat(current, behind)
+    u, late = ca.vertcat(ca.dot(first, known), e), ca.dot(second, known)
+    arguments = [plant.t, plant.x, z, e, r, w, plant.p, c, lag]
+    return ca.Function("seaopt_sample", arguments, [ca.densify(moved), u, late, observe(plant.t, plant.x, u, plant.p)])
 
 
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
@@ -122,7 +133,7 @@ def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:
     """Return what runs a job: compiled where there is a compiler, CasADi's virtual machine else; once a structure."""
     sensors = loop.sensors
     key = (
-        f"closed loop {loop.measured} {loop.law.c.size} {loop.delay_samples} {bool(loop.current_step_A)} "
+        f"closed loop {loop.measured} {loop.law.c.size} {loop.waiting} {bool(loop.current_step_A)} "
         f"{sensors.saturation.get(loop.measured) is None} {bool(sensors.quantisation.get(loop.measured))} "
         f"{math.isfinite(loop.law.current_limit_A)}"
     )
@@ -147,7 +158,7 @@ def _source(loop: SampledLoop, sample: Any, advance: Any) -> str:
     both = (sample, advance)
     constants = {
         "NX": len(loop.plant.states), "NU": len(loop.plant.inputs), "NE": len(loop.plant.inputs) - 1,
-        "NY": len(loop.watched), "NZ": loop.law.c.size + loop.delay_samples,
+        "NY": len(loop.watched), "NZ": loop.law.c.size + loop.waiting,
         "SZ_W": max(f.sz_w() for f in both), "SZ_ARG": max(f.sz_arg() for f in both),
         "SZ_RES": max(f.sz_res() for f in both), "SZ_IW": max(f.sz_iw() for f in both),
     }  # fmt: skip
@@ -169,13 +180,14 @@ def _empty(loop: SampledLoop, job: Job) -> Trace:
     )  # fmt: skip
 
 
-_POINTERS = ("p", "c", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
+_POINTERS = ("p", "c", "lag", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
 _ARGUMENTS = np.dtype(
     [
         ("n", np.int64),
         ("substeps", np.int64),
         ("t0", float),
         ("period", float),
+        ("late_s", float),
         *((name, np.uint64) for name in _POINTERS),
     ]
 )
@@ -187,7 +199,8 @@ def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, "
     arguments = np.zeros(runs, dtype=_ARGUMENTS)
     arguments["n"], arguments["substeps"] = n, substeps
     arguments["t0"], arguments["period"] = job.start_s, loop.law.sample_time_s
-    rows = {"p": job.p, "r": job.reference, "w": job.noise} | {
+    arguments["late_s"] = job.late_s
+    rows = {"p": job.p, "lag": job.lag, "r": job.reference, "w": job.noise} | {
         name: getattr(trace, name) for name in ("x", "z", "peak", "error", "size", "y", "applied", "states")
     }
     for name, array in rows.items():
@@ -209,20 +222,23 @@ def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, "
 
 def _interpreted(
     loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], sample: Any, advance: Any,
-    chains: dict[tuple[int, int], Any],
+    chains: dict[tuple[int, int, bool], Any],
 ) -> Trace:  # fmt: skip
     """Run in CasADi's virtual machine: the same two functions, chained in a third."""
     trace = _empty(loop, job)
     runs, n = job.reference.shape
     chunk = min(n, CHUNK)
-    key = (substeps, chunk)
+    split = bool(np.any(job.late_s))
+    key = (substeps, chunk, split)
     if key not in chains:
-        period = _period_function(loop, sample, advance, substeps)
+        period = _period_function(loop, sample, advance, substeps, split)
         chains[key] = (period.expand() if substeps <= EXPANDED else period).mapaccum(chunk)
     times = job.start_s + loop.law.sample_time_s * np.arange(n)
     for run in range(runs):
         state = np.concatenate([getattr(trace, name)[run] for name in ("x", "z", "peak", "error", "size")])
-        shared = [np.repeat(item[:, None], chunk, axis=1) for item in (job.p[run], c)]
+        shared = [
+            np.repeat(item[:, None], chunk, axis=1) for item in (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
+        ]
         signals = np.vstack([times, job.external.T, job.reference[run], job.noise[run]])
         for first in range(0, n, chunk):
             count = min(chunk, n - first)
@@ -240,21 +256,25 @@ def _interpreted(
     return trace
 
 
-def _period_function(loop: SampledLoop, sample: Any, advance: Any, substeps: int) -> Any:
-    """Return ([x, z, peak, error, size], t, e, r, w, p, c) -> (the same a sample later, y, applied, x)."""
-    sizes = [len(loop.plant.states), loop.law.c.size + loop.delay_samples, len(loop.watched)]
+def _period_function(loop: SampledLoop, sample: Any, advance: Any, substeps: int, split: bool) -> Any:
+    """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
+    sizes = [len(loop.plant.states), loop.law.c.size + loop.waiting, len(loop.watched)]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
-    t, r, w = (ca.MX.sym(name) for name in "trw")
-    e, p, c = (ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("p", 6), ("c", 7)))
+    t, r, w, late_s = (ca.MX.sym(name) for name in ("t", "r", "w", "late_s"))
+    e, p, c, lag = (ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("p", 6), ("c", 7), ("lag", 8)))
     x, z, peak, error, size = ca.vertsplit(state, np.cumsum([0, *sizes, sizes[0], sizes[0]]).tolist())
-    after, u, y = sample(t, x, z, e, r, w, p, c)
+    after, u, late, y = sample(t, x, z, e, r, w, p, c, lag)
+    newer, period = ca.vertcat(late, e), loop.law.sample_time_s
+    pieces = [(u, t, late_s), (newer, t + late_s, period - late_s)] if split else [(newer, t, period)]
     top = ca.fmax(peak, ca.fabs(y))
     ends: list[tuple[Any, Any]] = []
     for steps in (substeps, 2 * substeps):
-        h, at, highest = loop.law.sample_time_s / steps, x, top
-        for i in range(steps):
-            at, highest = advance(t + i * h, at, highest, u, p, h)
+        at, highest = x, top
+        for command, begin, lasting in pieces:
+            h = lasting / steps
+            for i in range(steps):
+                at, highest = advance(begin + i * h, at, highest, command, p, h)
         ends.append((at, highest))
     (coarse, _), (fine, top) = ends
     grown = ca.vertcat(fine, after, top, ca.fmax(error, ca.fabs(fine - coarse)), ca.fmax(size, ca.fabs(fine)))
-    return ca.Function("seaopt_period", [state, t, e, r, w, p, c], [grown, y, u[0], x])
+    return ca.Function("seaopt_period", [state, t, e, r, w, p, c, lag, late_s], [grown, y, late, x])

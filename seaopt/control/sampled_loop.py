@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -14,6 +15,7 @@ from seaopt.errors import SimulationError, suggestion
 from seaopt.plants import Plant
 
 ENERGY = "energy"
+DELAY = "delay_s"  # of a run's parameters: seconds of delay besides the controller's whole samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,6 +36,8 @@ class SampledLoop:
         Noise, offset, range and quantisation of the measured output.
     current_step_A : float
         What the current is rounded to; 0 for not at all.
+    longest_delay_s : float
+        The longest `delay_s` that a run's parameters hold: delay besides `delay_samples`, of any length.
 
     Raises
     ------
@@ -48,6 +52,7 @@ class SampledLoop:
     delay_samples: int
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
+    longest_delay_s: float = 0.0
 
     def __post_init__(self) -> None:
         plant = self.plant
@@ -56,8 +61,9 @@ class SampledLoop:
                 f'measured = "{self.measured}" is not an output of {plant.name}; '
                 + suggestion(self.measured, plant.outputs)
             )
-        if not self.current_step_A >= 0.0:
-            raise SimulationError(f"current_step_A = {self.current_step_A:g} is negative; give zero or more")
+        for what in ("current_step_A", "longest_delay_s"):
+            if not getattr(self, what) >= 0.0:
+                raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")
         for what in ("noise_std", "quantisation", "saturation"):
             if not getattr(self.sensors, what).get(self.measured, 0.0) >= 0.0:
                 raise SimulationError(f"{what} of {self.measured} is negative; give zero or more")
@@ -67,6 +73,13 @@ class SampledLoop:
                 f"{self.measured} of {plant.name} contains the present current, which a law without delay sets from "
                 "it; give delay_samples = 1 or more, or measure another output"
             )
+
+    @property
+    def waiting(self) -> int:
+        """How many commands wait, or act, behind the newest."""
+        if not self.longest_delay_s:
+            return self.delay_samples
+        return self.delay_samples + whole_samples(self.longest_delay_s, self.law.sample_time_s)[0] + 1
 
     @property
     def watched(self) -> tuple[str, ...]:
@@ -81,7 +94,7 @@ class LoopState:
     Parameters
     ----------
     x : array, shape (runs, nx)
-    z : array, shape (runs, n + delay_samples)
+    z : array, shape (runs, n + waiting)
 
     """
 
@@ -92,4 +105,11 @@ class LoopState:
 def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None = None) -> LoopState:
     """Return `runs` loops whose law is at zero and whose plant is in state x, zero if left out."""
     start = np.zeros(len(loop.plant.states)) if x is None else x
-    return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law.c.size + loop.delay_samples)))
+    return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law.c.size + loop.waiting)))
+
+
+def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
+    """Return a delay as whole samples and the rest in seconds."""
+    whole = math.floor(delay_s / sample_time_s + 1e-9)
+    rest = delay_s - whole * sample_time_s
+    return whole, rest if rest > 1e-9 * sample_time_s else 0.0

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
-from seaopt.control.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, run_loop
+from seaopt.control.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
@@ -45,7 +45,7 @@ class Stage:
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
 
-    def loop(self, held: bool) -> SampledLoop:
+    def loop(self, held: bool, longest_delay_s: float = 0.0) -> SampledLoop:
         """Return the loop with the link held or not."""
         plant = self.partner if held else self.plant
         if plant is None:
@@ -59,6 +59,7 @@ class Stage:
             delay_samples=self.controller.delay_samples,
             sensors=self.sensors,
             current_step_A=self.current_step_A,
+            longest_delay_s=longest_delay_s,
         )
 
 
@@ -124,7 +125,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     scenario : Scenario
         What happens.
     params : sequence of ParameterSet
-        One a run.
+        One a run; `delay_s` among them is delay besides the controller's.
     seed : int
         Of the sensor noise and of random excitations.
 
@@ -139,8 +140,10 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
-    values = [stage.plant.complete(item) for item in params]
-    now, grip = _start(stage, scenario, values), None
+    delays = [[item[DELAY]] if DELAY in item else [] for item in params]
+    longest = max((delay.value for found in delays for delay in found), default=0.0)
+    values = [stage.plant.complete(item).with_parameters(*d) for item, d in zip(params, delays, strict=True)]
+    now, grip = _start(stage, scenario, values, longest), None
     runs: list[LoopRun] = []
     contacts: list[Contact] = []
     begin_s = 0.0
@@ -154,7 +157,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         if phase.impulse_Ns:
             blows = [struck(stage.plant, p, x, LINK, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
-        loop = stage.loop(phase.held)
+        loop = stage.loop(phase.held, longest)
         reference = _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
         run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
         now, begin_s = run.end, begin_s + reference.size * loop.law.sample_time_s
@@ -162,9 +165,9 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     return _joined(stage, runs, tuple(contacts))
 
 
-def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet]) -> LoopState:
+def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
     """Return the first states of the plant with its link free: the given ones, the spring relaxed."""
-    plant, loop = stage.plant, stage.loop(held=False)
+    plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
     start = at_rest(loop, len(values), point("state", plant.states, scenario.initial_state))
     if scenario.initial_state and "q" in plant.states and LINK in plant.outputs:
         place = list(plant.states).index("q")

@@ -125,6 +125,29 @@ def test_without_limits_it_is_the_linear_loop(stand, thor, delay):
     np.testing.assert_allclose(run.outputs["F1"][0], forces, rtol=1e-6, atol=1e-6)
 
 
+def delayed(params, delay_s):
+    return params.with_parameters(so.Parameter(name="delay_s", value=delay_s, unit="s"))
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.4e-3, 1e-3, 2.7e-3])
+def test_a_delay_of_any_length_is_two_pieces_of_a_sample(stand, thor, delay_s):
+    """The older command for what is left of the delay, the newer one for the rest: two exact holds."""
+    loop = SampledLoop(plant=stand, law=law(None), measured="F1", delay_samples=1, longest_delay_s=2.7e-3)
+    run = run_loop(loop, [delayed(thor, delay_s), delayed(thor, 1.1e-3)], np.full(200, 50.0), rtol=1e-9)
+    model = stand.linearize(thor)
+    whole, rest = int(delay_s / TS + 1e-9), delay_s - TS * int(delay_s / TS + 1e-9)
+    held = lambda t: cont2discrete((model.A, model.B * GAIN, model.C[:1], np.zeros((1, 1))), t, "zoh")[:3]  # noqa: E731
+    (a1, b1, c), (a2, b2, _) = held(max(rest, 1e-15)), held(TS - rest)
+    x, memory, commands, forces = np.zeros(2), loop.law.reset(), [0.0] * (whole + 2), []
+    for _ in range(200):
+        forces.append((c @ x)[0])
+        current, memory = loop.law.step(memory, 50.0, forces[-1])
+        commands.append(current / GAIN)
+        older, newer = commands[-3 - whole], commands[-2 - whole]
+        x = a2 @ (a1 @ x + b1[:, 0] * older) + b2[:, 0] * newer
+    np.testing.assert_allclose(run.outputs["F1"][0], forces, rtol=1e-6, atol=1e-6)
+
+
 def test_the_interpreter_gives_the_compiled_numbers(thor, no_compiler):
     runs = []
     for compiled in (False, True):
@@ -145,9 +168,10 @@ def test_the_interpreter_gives_the_compiled_numbers(thor, no_compiler):
 
 def _noisy(plant, thor):
     loop = SampledLoop(
-        plant=plant, law=law(), measured="F1", delay_samples=1, sensors=so.Sensors(noise_std={"F1": 1.0})
-    )
-    return run_loop(loop, [thor, thor.update(f_c=20.0)], np.full(300, 80.0), seed=3)
+        plant=plant, law=law(), measured="F1", delay_samples=1, sensors=so.Sensors(noise_std={"F1": 1.0}),
+        longest_delay_s=1.3e-3,
+    )  # fmt: skip
+    return run_loop(loop, [delayed(thor, 1.3e-3), thor.update(f_c=20.0)], np.full(300, 80.0), seed=3)
 
 
 def test_a_batch_is_its_runs_one_by_one(swing, thor):
@@ -197,6 +221,7 @@ def test_stiff_friction_takes_smaller_steps_or_is_refused(stand, thor):
         ({"measured": "F9"}, "F9"),
         ({"measured": "F2", "delay_samples": 0}, "without delay"),
         ({"current_step_A": -1.0}, "current_step_A"),
+        ({"longest_delay_s": -1.0}, "longest_delay_s"),
         ({"sensors": so.Sensors(noise_std={"F1": -1.0})}, "negative"),
     ],
 )
@@ -211,6 +236,7 @@ def test_bad_runs(stand, thor):
         ({"params": []}, "no parameters"),
         ({"reference": np.ones((3, 5))}, "shape"),
         ({"external": {"Fe3": np.ones(5)}}, "Fe3"),
+        ({"params": [delayed(thor, 1e-3)]}, "longest of all runs"),
         ({"start": LoopState(x=np.zeros((2, 2)), z=np.zeros((2, 3)))}, "2 runs"),
     ):
         with pytest.raises(SimulationError, match=words):
