@@ -20,6 +20,7 @@ from seaopt.plants.impacts import struck
 LINK = "x_2"
 PAYLOADS = (("I_p", "m"), ("I_p2", "m2"), ("m_2",), ("J_l",))
 FALL_DEG = 120.0
+LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # blows that are tried
 NOMINAL_FORCE_N = 100.0
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
@@ -163,7 +164,7 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
         found += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
     found.append(_chirp(controller, small, tail))
     if LINK in plant.outputs and plant.energy is not None:
-        found.append(_impact(2.0 * small / _force_per_blow(controller, plant), tail))
+        found.append(_impact(_blow(controller, plant, 2.0 * small), tail))
     payload = next((names for names in PAYLOADS if all(name in plant.parameters for name in names)), ())
     if payload and moves(plant):
         found.append(_payload(payload, small, lasting, tail))
@@ -207,16 +208,25 @@ def _samples(controller: Controller, duration_s: float) -> int:
     return max(2, round(duration_s / controller.sample_time_s))
 
 
-def _force_per_blow(controller: Controller, plant: Plant) -> float:
-    """Return the peak of the measured force after a light blow, per N s."""
+def _blow(controller: Controller, plant: Plant, force: float) -> float:
+    """Return the blow (N s) on link 2 whose peak of the measured force is about `force`; play makes that nonlinear."""
     params = plant.complete(_design(controller)[1])
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )
-    light = 1e-3
-    state = struck(plant, params, np.zeros(len(plant.states)), LINK, light)
-    run = run_loop(loop, [params], np.zeros(_samples(controller, 0.1)), start=at_rest(loop, 1, state))
-    return float(run.peaks[controller.spec.measured][0]) / light
+
+    def peak(blow: float) -> float:
+        state = struck(plant, params, np.zeros(len(plant.states)), LINK, blow)
+        run = run_loop(loop, [params], np.zeros(_samples(controller, 0.1)), start=at_rest(loop, 1, state))
+        return float(run.peaks[controller.spec.measured][0])
+
+    blow, found = LIGHTEST_NS, peak(LIGHTEST_NS)
+    while found < force and blow < HEAVIEST_NS:
+        blow, before = 2.0 * blow, found
+        found = peak(blow)
+        if found >= force:
+            return blow * 2.0 ** (-math.log(found / force) / math.log(found / before))
+    return blow
 
 
 def _tail(controller: Controller, plant: Plant) -> float:
