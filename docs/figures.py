@@ -10,6 +10,9 @@ from matplotlib.figure import Figure
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
+from seaopt.control import Gains, current_per_force, sample
+from seaopt.control.passivity import held, port_of
+from seaopt.control.realisation import realise
 from seaopt.estimation import Limits, design_experiment
 from seaopt.reporting.verification import large_signal_figure, stability_figure
 from seaopt.robustness.environments import coupled_stability
@@ -148,11 +151,65 @@ def verification() -> None:
     save(stability_figure(coupled_stability(controller, stand, params)), "environments")
 
 
+GAINS = Gains(k_p=3.18, k_i=1.31, k_d=0.0328, T_f=1.01e-3, k_ff=1.0)  # 30 Hz on the stand
+
+
+def anti_windup() -> None:
+    """Step to half again what 9 A can hold, and at 1.5 s to half of it."""
+    plant, params = so.plants.high_impedance(), so.plants.thor()
+    gain = current_per_force(plant, params)
+    a, b, c, _ = sample(plant, params, "F1", gain, 1e-3, 1).delayed()
+    pair = GAINS.transfer_functions("pid", 1e-3)
+    time = np.arange(4000) * 1e-3
+    figure, axes = new(["force", "current"], "F1 over what 9 A hold", "time [s]")
+    axes[1].set_ylabel("current [A]")
+    roots = {"(k_ff + k_p)/k_i = 3.2 s": None, "sqrt(T_i T_d) = 0.16 s": 0.158, "none": 1e9}
+    for (label, tracking), colour in zip(roots.items(), ("#0072b2", "#d55e00", "#777777"), strict=True):
+        law = realise(
+            *pair, sample_time_s=1e-3, current_per_force_A_per_N=gain, current_limit_A=9.0, tracking_time_s=tracking
+        )
+        x, state, forces, currents = np.zeros(b.size), law.reset(), [], []
+        for t in time:
+            force = float(c @ x)
+            current, state = law.step(state, (1.5 if t < 1.5 else 0.5) * law.force_limit_N, force)
+            x = a @ x + b * current / gain
+            forces.append(force / law.force_limit_N)
+            currents.append(current)
+        axes[0].plot(time, forces, color=colour, linewidth=1.3, label=label)
+        axes[1].plot(time, currents, color=colour, linewidth=1.0)
+    axes[0].legend(frameon=False, fontsize="x-small", title="tracking time", title_fontsize="x-small")
+    save(figure, "anti_windup")
+
+
+def passivity() -> None:
+    plant, params = so.plants.high_impedance(), so.plants.thor()
+    port = port_of(plant, params, "F1", current_per_force(plant, params))
+    f = np.geomspace(0.1, 499, 2000)
+    _, c_y = GAINS.transfer_functions("pid", 1e-3)
+    figure, axes = new(["port impedance", "cosine of its angle"], "|Z| [N s/m]")
+    axes[1].set_ylabel("Re Z / |Z|")
+    without = np.zeros(f.size, dtype=complex)
+    laws = {
+        "no control": without,
+        "pid, held, one sample late": c_y.response(f, 1e-3) * held(f, 1e-3, 1),
+        "the same, two samples late": c_y.response(f, 1e-3) * held(f, 1e-3, 2),
+    }
+    for (label, law), colour in zip(laws.items(), ("#777777", "#0072b2", "#d55e00"), strict=True):
+        z = port.response(f).impedance(law)
+        axes[0].loglog(f, np.abs(z), color=colour, linewidth=1.3, label=label)
+        axes[1].semilogx(f, z.real / np.abs(z), color=colour, linewidth=1.3)
+    axes[1].axhline(0.0, color="k", linewidth=0.6)
+    axes[0].legend(frameon=False, fontsize="x-small")
+    save(figure, "passivity")
+
+
 if __name__ == "__main__":
     force_responses(so.plants.high_impedance, "high_impedance")
     force_responses(so.plants.moving_output, "moving_output")
     impulse()
     rotary()
     parts()
+    anti_windup()
+    passivity()
     experiment_design()
     verification()

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import seaopt as so
+from seaopt.control import Gains
+from seaopt.control.export import export
+from seaopt.simulation.compiler import find_compiler
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
@@ -37,6 +42,41 @@ def test_the_plant_of_the_how_to_works():
     space: dict = {}
     exec(code, space)
     assert list(space["pendulum"].states) == ["theta", "omega"]
+
+
+def test_the_export_of_the_docs_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    space: dict = {}
+    exec(blocks("export.md", "python")[0], space)
+    assert {path.name for path in (tmp_path / "firmware").iterdir()} >= {"knee.h", "knee.c"}
+    assert 0.8 < space["current_A"] <= 9.0
+    assert space["currents_A"].shape == (100,)
+
+
+def test_the_c_of_the_docs_compiles(tmp_path):
+    compiler = find_compiler()
+    if compiler is None:
+        pytest.skip("no C compiler on this machine")
+    pair = Gains(k_p=3.0, k_i=1.0, k_d=0.03, T_f=1e-3, k_ff=1.0).transfer_functions("pid", 1e-3)
+    reference, measurement = ({"num": tf.num, "den": tf.den} for tf in pair)
+    content = {
+        "structure": "pid", "gains": {}, "sample_time_s": 1e-3, "delay_samples": 1, "reference": reference,
+        "measurement": measurement, "current_per_force_A_per_N": 0.004, "spec": {"measured": "F1"}, "achieved": {},
+        "feasible": True, "active_constraints": [],
+    }  # fmt: skip
+    export(content, tmp_path, name="knee")
+    (tmp_path / "main.c").write_text(blocks("export.md", "c")[0], encoding="utf-8")
+    subprocess.run(
+        [*compiler, "-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic", "-c", "main.c"], cwd=tmp_path, check=True
+    )
+
+
+def test_the_passivity_of_the_docs_works():
+    space: dict = {}
+    for block in blocks("passivity.md", "python"):
+        exec(re.sub(r"print\(.*", "", block), space)
+    assert space["found"].holds((0.1, 60.0))
+    assert space["passive"]
 
 
 def test_the_design_of_the_how_to_works():

@@ -24,12 +24,13 @@ Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Fol
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON and nothing else.")]
 
 
-def _version(wanted: bool) -> None:
+def _version(wanted: bool) -> bool:
     if wanted:
         from seaopt import __version__
 
         typer.echo(f"seaopt {__version__}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()

@@ -1,21 +1,5 @@
 r"""The law as it runs: one step a sample, with the motor's current limit and anti-windup.
 
-State space
------------
-C_r and C_y become one system with two inputs, of least order, in coordinates that single precision can hold. With
-:math:`\delta = 1 - q`, every denominator is :math:`\delta^m R(q)`, R without a root at 1, and the m integrators split
-off exactly: with X the first m terms of the Taylor series of N/R at :math:`\delta = 0`,
-
-.. math:: \frac{N}{\delta^m R} = \frac{X(\delta)}{\delta^m} + \frac{Y(q)}{R(q)}, \qquad Y = \frac{N - X R}{\delta^m}
-
-and in :math:`w = 1/(z - 1)`, where :math:`1/\delta = 1 + w`, the first part is :math:`g_0 + g_1 w + \dots + g_m w^m`:
-a chain of m accumulators whose poles are 1 to the last bit. The rest is balanced (Moore, IEEE Trans. Automatic
-Control 26(1), 1981): controllability and observability Gramians are equal and diagonal, which keeps rounding noise
-low (Mullis, Roberts, IEEE Trans. Circuits and Systems 23(9), 1976), and states that C_r and C_y share, or that
-nothing drives, show as Hankel singular values of zero and are left out.
-
-Anti-windup
------------
 .. math::
     u &= C x + D_r r - D_y y, \qquad x^+ = A x + B_r r - B_y y + K (\mathrm{sat}(u) - u)
 
@@ -48,17 +32,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from scipy.linalg import block_diag
 
 from seaopt.control.controller import Controller
 from seaopt.control.law import TransferFunction
+from seaopt.control.minimal import Part, balanced, common, split
 from seaopt.errors import ControlError
 
 Vector = Float[np.ndarray, " n"]
-AT_ONE = 1e-12  # a denominator this small at q = 1, against its coefficients, has a root there
-NEGLIGIBLE = 1e-13  # Hankel singular values below this share of the law's gain are rounding
-VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
+EPS = float(np.finfo(float).eps)
+SAME = 1e-6  # how well the state space must have the response of its transfer functions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,6 +106,14 @@ class RunnableLaw:
         """The motor force at the current limit."""
         return self.current_limit_A / self.current_per_force_A_per_N
 
+    def __repr__(self) -> str:
+        tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
+        limit = "no current limit" if math.isinf(self.current_limit_A) else f"limited to {self.current_limit_A:g} A"
+        return (
+            f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
+            f"{1 / self.sample_time_s:.6g} Hz, {limit}"
+        )
+
     def rest(self) -> tuple[Vector, Vector]:
         """Return x per reference and per measurement (counted negative) at rest, integrators zero."""
         m, n = self.integrators, self.c.size
@@ -129,6 +121,14 @@ class RunnableLaw:
         inner = np.eye(n - m) - self.a[m:, m:]
         out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
         return out[0], out[1]
+
+    def response(self, f: Float[np.ndarray, " k"]) -> tuple[Complex[np.ndarray, " k"], Complex[np.ndarray, " k"]]:
+        """Return C_r and C_y at frequencies in Hz, above zero."""
+        z = np.exp(2j * np.pi * f * self.sample_time_s)
+        inner = z[:, None, None] * np.eye(self.c.size) - self.a
+        causes = np.column_stack([self.b_reference, self.b_measurement]).astype(complex)
+        out = self.c @ np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape)))
+        return out[:, 0] + self.d_reference, out[:, 1] + self.d_measurement
 
     def reset(self, reference: float = 0.0, measurement: float = 0.0, current_A: float = 0.0) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
@@ -250,7 +250,8 @@ def realise(
     Raises
     ------
     ControlError
-        A number is out of range, or the law by itself is unstable other than by integrators.
+        A number is out of range, the law by itself is unstable other than by integrators, or its poles lie so close
+        together that double precision does not hold it.
 
     """
     for name, value in (
@@ -261,17 +262,17 @@ def realise(
     ):
         if value is not None and not value > 0.0:
             raise ControlError(f"{name} = {value:g} is not positive; give a positive number")
-    parts = [_split(name, tf) for name, tf in (("reference", reference), ("measurement", measurement))]
+    parts = [split(name, tf) for name, tf in (("reference", reference), ("measurement", measurement))]
     m = max(part.chain.size for part in parts)
     gains = np.zeros((m, 2))
     for column, part in enumerate(parts):
         gains[: part.chain.size, column] = part.chain
     through = (float(reference.num[0]), float(measurement.num[0]))
-    a, b, c = _balanced(*_common(parts), max(map(abs, through)))
+    a, b, c = balanced(*common(parts), max(map(abs, through)))
     tracking = _tracking(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
     share = sample_time_s / (tracking + sample_time_s) if tracking is not None else 0.0
     b = np.vstack([gains, b])
-    return RunnableLaw(
+    law = RunnableLaw(
         a=np.asarray(block_diag(np.eye(m) + np.eye(m, k=1), a)),
         b_reference=b[:, 0].copy(),
         b_measurement=b[:, 1].copy(),
@@ -285,109 +286,28 @@ def realise(
         current_per_force_A_per_N=current_per_force_A_per_N,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
     )
+    _check(law, reference, measurement)
+    return law
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Part:
-    """A transfer function taken apart: g_1 ... g_m, Y, R, and the first m + 2 terms of the series of N/R."""
-
-    chain: Float[np.ndarray, " m"]
-    rest: Float[np.ndarray, " _"]
-    den: Float[np.ndarray, " _"]
-    series: Float[np.ndarray, " _"]
-
-
-def _split(name: str, tf: TransferFunction) -> _Part:
-    """Take a transfer function apart as the module's docstring does, m as small as the numerator lets it be."""
-    num, den, m = tf.num.astype(float), np.trim_zeros(tf.den.astype(float), "b"), 0
-    if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
-        raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
-    while den.size > 1 and _at_one(den):
-        den, m = np.cumsum(den)[:-1], m + 1
-        if num.size > 1 and _at_one(num):
-            num, m = np.cumsum(num)[:-1], m - 1
-    series = _taylor(num, den, m + 2)
-    chain = np.zeros(m + 1)  # the coefficients of w^0 ... w^m in X / delta^m, with 1/delta = 1 + w
-    for power, value in zip(range(m, 0, -1), series, strict=False):
-        chain[: power + 1] += value * np.array([math.comb(power, i) for i in range(power + 1)])
-    removed = np.convolve(_flipped(series[:m]), den) if m else np.zeros(1)
-    rest = np.zeros(max(num.size, removed.size, m + 1))
-    rest[: num.size] = num
-    rest[: removed.size] -= removed
-    for _ in range(m):
-        rest = np.cumsum(rest)[:-1]
-    return _Part(chain=chain[1:], rest=rest, den=den, series=series)
+def _check(law: RunnableLaw, reference: TransferFunction, measurement: TransferFunction) -> None:
+    """Refuse a law whose response is not that of its transfer functions, but for their coefficients' rounding."""
+    f = np.geomspace(1e-4, 0.49, 25) / law.sample_time_s
+    q = np.exp(-2j * np.pi * f * law.sample_time_s)
+    for found, tf in zip(law.response(f), (reference, measurement), strict=True):
+        bottom = np.polynomial.polynomial.polyval(q, tf.den)
+        wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
+        rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
+        allowed = SAME * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
+        if not np.all(np.abs(found - wanted) <= allowed):
+            raise ControlError(
+                "the law's slow poles are too close together to tell from integrators in double precision; "
+                "sample more slowly, or make them faster"
+            )
 
 
-def _common(parts: list[_Part]) -> tuple[list[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]]:
-    """Return both Y over one R."""
-    one, other = parts
-    if np.array_equal(one.den, other.den):
-        return [one.rest, other.rest], one.den
-    return [np.convolve(one.rest, other.den), np.convolve(other.rest, one.den)], np.convolve(one.den, other.den)
-
-
-def _at_one(polynomial: Float[np.ndarray, " n"]) -> bool:
-    return bool(abs(np.sum(polynomial)) <= AT_ONE * np.sum(np.abs(polynomial)))
-
-
-def _flipped(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the coefficients in 1 - q of a polynomial in q, or the other way."""
-    out = np.zeros(polynomial.size)
-    for value in polynomial[::-1]:  # Horner's rule; the last coefficient shifted out is zero
-        out = out - np.concatenate([[0.0], out[:-1]])
-        out[0] += value
-    return out
-
-
-def _taylor(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: int) -> Float[np.ndarray, " terms"]:
-    """Return the first terms of num/den in powers of 1 - q."""
-    top, bottom = (np.concatenate([_flipped(p), np.zeros(terms)]) for p in (num, den))
-    out = np.zeros(terms)
-    for j in range(terms):
-        out[j] = (top[j] - np.dot(out[:j], bottom[j:0:-1])) / bottom[0]
-    return out
-
-
-def _tracking(parts: list[_Part], sample_time_s: float) -> float:
+def _tracking(parts: list[Part], sample_time_s: float) -> float:
     """Return T_s abs(a_1/a_0) of C_r, of C_y where the reference is not integrated; a sample at least."""
     most = max(part.chain.size for part in parts)
     a_0, a_1 = next(part.series for part in parts if part.chain.size == most)[:2]
     return sample_time_s * max(abs(float(a_1 / a_0)), 1.0)
-
-
-def _balanced(
-    numerators: list[Float[np.ndarray, " _"]], den: Float[np.ndarray, " k"], gain: float
-) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Return a balanced realisation of least order of two transfer functions over one denominator, each of its input.
-
-    What is below `NEGLIGIBLE` of `gain`, or of the largest Hankel singular value, is rounding.
-    """
-    n = max(p.size for p in (*numerators, den)) - 1
-    column = np.pad(den, (0, n + 1 - den.size))[1:]
-    a, c = np.eye(n, k=1), np.eye(1, n)[0]
-    a[:, :1] -= column[:, None]
-    b = np.column_stack([np.pad(p, (0, n + 1 - p.size))[1:] - p[0] * column for p in numerators])
-    if not c.size:
-        return a, b, c
-    radius = float(np.max(np.abs(np.linalg.eigvals(a))))
-    if radius >= 1.0:
-        raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; tune a stable one")
-    reach, show = _factor(a, b), _factor(a.T, c[:, None])
-    left, hankel, right = np.linalg.svd(show.T @ reach)
-    kept = hankel > NEGLIGIBLE * max(float(hankel[0]), gain)
-    root = np.sqrt(hankel[kept])
-    into, back = reach @ right[kept].T / root, (show @ left[:, kept] / root).T
-    return back @ a @ into, back @ b, c @ into
-
-
-def _factor(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n n"]:
-    """Return G with G G' = the sum of a^k b b' a^k' over k >= 0, never squared: small directions keep their digits."""
-
-    def triangle(wide: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n n"]:
-        return np.asarray(np.linalg.qr(wide.T, mode="r")).T
-
-    g = triangle(np.hstack([b, np.zeros(a.shape)]))
-    while np.linalg.norm(a) > VANISHED:
-        g, a = triangle(np.hstack([g, a @ g])), a @ a
-    return g

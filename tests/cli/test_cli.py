@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -91,6 +92,17 @@ def test_results_of_another_problem_are_refused(folder, done, old, new, stage, w
     out = seaopt(stage, "edited.toml", "-o", "all", cwd=folder)
     assert out.returncode == 2
     assert words in out.stderr
+
+
+def test_a_controller_of_another_fit_is_not_exported(folder, done):
+    shutil.copytree(folder / "all", folder / "refitted")
+    assert seaopt("export", "refitted", "--c", "firmware", cwd=folder).returncode == 0
+    with (folder / "refitted" / "fit.json").open("a", encoding="utf-8") as fit:
+        fit.write("\n")
+    out = seaopt("export", "refitted", "--c", "other", cwd=folder)
+    assert out.returncode == 2
+    assert "was tuned with another fit" in out.stderr
+    assert not (folder / "other").exists()
 
 
 def test_an_unidentifiable_fit_exits_1_with_a_report(folder):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import bilinear, cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.control import Gains, TransferFunction
@@ -97,11 +97,44 @@ def rounded(value):
     return Fraction(round(value * 10**40), 10**40)
 
 
+@pytest.mark.parametrize("ts", [1e-3, 2.5e-4])
+@pytest.mark.parametrize("q_hz", [1.0, 10.0, 60.0])
+def test_a_pid_with_observer_and_notch_keeps_its_weak_integral(ts, q_hz):
+    """C_y = (C N + Q/P)/(1 - Q) of order seven against its factors; k_i is 1e-14 of the numerator's coefficients."""
+    w, w0 = 2 * np.pi * q_hz, 2 * np.pi * 80
+    q = bilinear([w**2], [1, 1.4 * w, w**2], 1 / ts)
+    inverse = bilinear(w**2 * np.array([294.65 / 655e3, 11636 / 655e3, 1]), [1, 1.4 * w, w**2], 1 / ts)[0]
+    notch = bilinear([1, 0.2 * w0, w0**2], [1, 1.2 * w0, w0**2], 1 / ts)
+    c = Gains(**GAINS).transfer_functions("pid", ts)[1]
+    den = product(c.den, notch[1], q[1] - q[0])
+    num = product(c.num, notch[0], q[1]) + product(inverse, c.den, notch[1])
+    c_y = tf(num / den[0], den / den[0])
+    law = realise(c_y, c_y, sample_time_s=ts)
+    assert (law.c.size, law.integrators) == (6, 2)
+    f = np.geomspace(1e-3, 0.45, 40) / ts
+    z = np.exp(-2j * np.pi * f * ts)
+    value = lambda p: np.polynomial.polynomial.polyval(z, p)  # noqa: E731
+    whole = value(q[0]) / value(q[1])
+    expected = (value(c.num) / value(c.den) * value(notch[0]) / value(notch[1]) + value(inverse) / value(q[1])) / (
+        1 - whole
+    )
+    np.testing.assert_allclose(law.response(f)[1], expected, rtol=1e-3)  # a lost integral shows as 0.05 and more
+
+
 def test_what_nothing_drives_is_left_out():
     assert law_of(k_i=0.0).c.size == 1
     assert law_of(k_d=0.0).c.size == 1
     assert law_of(k_i=0.0, k_d=0.0).c.size == 0
     assert law_of("pd", k_d=0.0).run(np.ones(3), np.ones(3))[0] == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_a_law_may_leave_the_reference_out(signals):
+    c_y = Gains(**GAINS).transfer_functions("pid", TS)[1]
+    law = realise(tf([0.0], c_y.den), c_y, sample_time_s=TS)
+    r, y = signals[:, :200]
+    expected = -lfilter(c_y.num, c_y.den, y)
+    np.testing.assert_allclose(law.run(r, y)[0], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert law.tracking_time_s == pytest.approx(3.2 / 1.3, rel=1e-3)
 
 
 def test_a_state_takes_single_precision():
@@ -158,6 +191,9 @@ def test_back_calculation_is_the_written_one(signals):
 def test_the_default_tracking_time_is_that_of_the_docs():
     assert law_of().tracking_time_s == pytest.approx((1.0 + 3.2) / 1.3 - TS / 2, rel=1e-9)
     assert law_of("pd").tracking_time_s is None
+    assert repr(law_of(limit=9.0)) == (
+        "RunnableLaw of order 2 (1 of it integrators, tracking time 3.23 s) at 1000 Hz, limited to 9 A"
+    )
 
 
 def test_a_disturbance_observer_sees_the_saturated_command(signals):
@@ -259,6 +295,7 @@ def test_numbers_that_are_not_finite_hold_the_command(tuned, signals):
         ([1.0, 0.0], [1.0, -1.02], {}, r"pole at \|z\| = 1.02"),
         ([1.0, 0.0], [1.0, 1.0], {}, r"pole at \|z\| = 1 "),
         ([np.nan], [1.0], {}, "not finite"),
+        ([1.0, 0.5], np.poly([0.99999, 0.99999, 0.99999]), {}, "too close together"),
         ([1.0], [2.0], {}, r"den\[0\] is not 1"),
         ([1.0], [1.0], {"current_limit_A": 0.0}, "current_limit_A = 0 is not positive"),
         ([1.0], [1.0], {"tracking_time_s": -1.0}, "tracking_time_s = -1 is not positive"),
