@@ -22,7 +22,6 @@ from jaxtyping import Bool, Complex, Float
 
 from seaopt.control import Controller
 from seaopt.control.closed_loop import SampledLoop, run_loop
-from seaopt.control.loop import LOWEST_HZ
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
@@ -32,6 +31,7 @@ PERIODS, SETTLING = 6, 12
 LEAST_S = 0.6  # that a loop is given to settle
 AMPLITUDES = (0.1, 0.5, 1.0, 2.0, 4.0)  # of the force that the limit allows at the bandwidth
 POINTS = 14
+STATIC_HZ = 1e-3  # stands for 0 Hz
 HALF_POWER = 1.0 / math.sqrt(2.0)
 
 
@@ -140,7 +140,7 @@ def large_signal(
     lengths = np.round(PERIODS / (wanted * period)).astype(int)
     f = PERIODS / (lengths * period)
     onset = _onset(controller, plant, parameters, f)
-    static = float(np.abs(controller.close(plant, parameters).tracking(np.array([LOWEST_HZ])))[0])
+    static = float(np.abs(controller.close(plant, parameters).tracking(np.array([STATIC_HZ])))[0])
     at_band = float(_onset(controller, plant, parameters, np.array([float(band)]))[0])
     amplitude = np.array(amplitudes_N, float) if amplitudes_N is not None else np.array(AMPLITUDES) * at_band
     if not (amplitude.size and np.all(amplitude > 0.0)):
