@@ -110,7 +110,7 @@ def run_loop(
     external : mapping of input name to array, shape (n,), optional
         The plant's other inputs, such as Fe2, held between samples; zero where left out.
     seed : int
-        Of the sensor noise; run i has the i-th stream of it, whatever the other runs.
+        Of the sensor noise, the same in every run: what differs between runs is the parameters.
     start_s : float
         Time of the first sample.
     rtol : float
@@ -197,7 +197,7 @@ def _noise(loop: SampledLoop, runs: int, n: int, seed: int) -> Rows:
     std = loop.sensors.noise_std.get(loop.measured, 0.0)
     if not std:
         return np.zeros((runs, n))
-    return std * np.stack([stream.normal(size=n) for stream in np.random.default_rng(seed).spawn(runs)])
+    return np.tile(std * np.random.default_rng(seed).normal(size=n), (runs, 1))
 
 
 def _external(plant: Plant, given: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:

@@ -91,7 +91,7 @@ def test_noise_and_rounding_are_numpys(swing, thor):
     """Each sample from the run's own states: a quantiser makes a step of any difference, and whole runs part."""
     sensors = so.Sensors(noise_std={"F1": 0.7}, quantisation={"F1": 0.25}, offset={"F1": 1.5}, saturation={"F1": 150.0})
     loop, reference, _, run, (rate, force) = hard_case(swing, thor, 30.0, sensors, 0.01)
-    noise = 0.7 * np.random.default_rng(5).spawn(1)[0].normal(size=400)
+    noise = 0.7 * np.random.default_rng(5).normal(size=400)
     memory, waiting, currents = loop.law.reset(), [0.0, 0.0], []
     for k in range(400):
         reading = np.clip(force(run.states[0, k]) + noise[k] + 1.5, -150.0, 150.0)

@@ -81,7 +81,7 @@ def test_scenarios_do_what_they_say(verification):
 def test_a_row_is_its_own_witness(verification):
     row = next(item for item in verification.rows if item.draw == "2" and item.scenario == "saturating doublet")
     again = verification.replay(row)
-    assert again.peaks["F1"][0] == pytest.approx(row.peak_force_N, rel=0.02)  # the noise is of another stream
+    assert again.peaks["F1"][0] == pytest.approx(row.peak_force_N, rel=1e-3)
     assert row.parameters == {"I_p": 0.6}
 
 
