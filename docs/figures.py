@@ -14,6 +14,9 @@ from seaopt.control import Gains, MPCSpec, NoiseModel, close_loop, current_per_f
 from seaopt.control.passivity import held, port_of
 from seaopt.control.realisation import realise, runnable
 from seaopt.estimation import Limits, design_experiment
+from seaopt.reporting.verification import large_signal_figure, stability_figure
+from seaopt.robustness.environments import coupled_stability
+from seaopt.robustness.large_signal import large_signal
 
 FOLDER = Path(__file__).resolve().parent / "figures"
 COLOURS = {"unlumped": "#0072b2", "lumped": "#d55e00"}
@@ -139,6 +142,15 @@ def experiment_design() -> None:
     save(figure, "experiment_design")
 
 
+def verification() -> None:
+    stand, swing, params = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+    spec = so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+    controller = so.tune(stand, params, spec, robust_to={"swing": swing})
+    found = [large_signal(controller, plant, params) for plant in (stand, swing)]
+    save(large_signal_figure(found), "large_signal")
+    save(stability_figure(coupled_stability(controller, stand, params)), "environments")
+
+
 GAINS = Gains(k_p=3.18, k_i=1.31, k_d=0.0328, T_f=1.01e-3, k_ff=1.0)  # 30 Hz on the stand
 
 
@@ -262,3 +274,4 @@ if __name__ == "__main__":
     experiment_design()
     state_estimator()
     predictive_control()
+    verification()

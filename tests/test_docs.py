@@ -137,3 +137,16 @@ def test_every_figure_of_the_docs_is_there():
     for page in DOCS.glob("*.md"):
         for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):
             assert (DOCS / name).exists(), name
+
+
+def test_the_verification_of_the_docs_works():
+    page = (DOCS / "verification.md").read_text(encoding="utf-8")
+    space: dict = {}
+    for code in blocks("verification.md", "python"):
+        exec(re.sub(r"(?m)^print\(", "found = (", code), space)
+        if "verify(" in code:
+            assert space["verification"].passed
+            for row in space["verification"].rows:
+                assert row.scenario in page
+        elif "coupled" in code:
+            assert not space["found"].everywhere and space["found"].fixed_stable

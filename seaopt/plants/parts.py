@@ -124,6 +124,25 @@ def spring_force(parts: Sequence[str], compression: Any, rate: Any, p: Any) -> A
     return force + p.c_k * rate if "spring_damping" in parts else force
 
 
+def stores_in_closed_form(parts: Sequence[str]) -> bool:
+    """Tell whether `spring_energy` knows the spring's energy: of play and hardening together it does not."""
+    return not ("backlash" in parts and "hardening" in parts)
+
+
+def spring_energy(parts: Sequence[str], compression: Any, p: Any) -> Any:
+    """Return the energy that spring and play store at a compression (m), J: the integral of the force without c_k."""
+    if "backlash" in parts:
+
+        def primitive(a: Any) -> Any:
+            root = ca.sqrt(a**2 + p.eps_b**2)
+            return 0.5 * (a * root + p.eps_b**2 * ca.asinh(a / p.eps_b))
+
+        before = primitive(compression - p.g_b) + primitive(p.g_b)
+        return p.k * 0.5 * (compression**2 + before - primitive(compression + p.g_b) + primitive(p.g_b))
+    energy = 0.5 * p.k * compression**2
+    return energy + 0.25 * p.k_3 * compression**4 if "hardening" in parts else energy
+
+
 def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
     """Return Coulomb's and, with the part, Stribeck's friction at the screw, N."""
     level = p.f_c
@@ -263,5 +282,6 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         h=h,
         derived=plant.derived,
         optional_inputs=plant.optional_inputs,
+        energy=plant.energy,
         port=None if plant.port is None else port,
     )

@@ -22,6 +22,7 @@ from seaopt.units import DIMENSIONLESS, factor, si_unit
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
+Energy = Callable[[Any, Any], Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,6 +43,9 @@ class Plant:
         Figures of interest that follow from the parameters; a fit reports them with their uncertainty.
     optional_inputs : collection of names
         Inputs that a log may leave out; they are then zero (external forces).
+    energy : callable ``(x, p) -> expression``, optional
+        Kinetic and potential energy, J, of a mechanical plant whose states come as pairs of a coordinate and its rate,
+        the coordinate first; states of filters around it may follow.
     port : callable ``() -> Plant``, optional
         Makes the same actuator with link 1 held and a mass m_2 on link 2 (states x_2 and v_2, input Fe2), for the
         impedance that it shows at link 2.
@@ -79,6 +83,7 @@ class Plant:
     h: Equations
     derived: Derived | None = None
     optional_inputs: frozenset[str] = frozenset()
+    energy: Energy | None = None
     port: Callable[[], Any] | None = field(default=None, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
@@ -146,6 +151,23 @@ class Plant:
         if self.derived is None:
             return {}
         return dict(self.derived(SimpleNamespace(**dict(zip(self.parameters, ca.vertsplit(self.p), strict=True)))))
+
+    def stored_energy(self) -> Any:
+        """Return the energy (J) as an expression of x and p.
+
+        Raises
+        ------
+        PlantError
+            The plant declares none.
+
+        """
+        if self.energy is None:
+            raise PlantError(f"plant {self.name} declares no energy; give energy=lambda x, p: ... when it is made")
+        spaces = [
+            SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
+            for names, symbols in ((self.states, self.x), (self.parameters, self.p))
+        ]
+        return ca.SX(self.energy(*spaces))
 
     def linearize(
         self,

@@ -88,6 +88,10 @@ def rotary(parts: Sequence[Part] = ()) -> Plant:
             "resonance_hz": (ca.sqrt(p.k_s * (1 / p.J_l + 1 / (p.N**2 * p.J_m))) / (2 * math.pi), "Hz"),
         }
 
+    def energy(x: Any, p: Any) -> Any:
+        kinetic = 0.5 * (p.J_m * x.thetad_m**2 + p.J_l * x.thetad_l**2)
+        return kinetic + 0.5 * p.k_s * (x.theta_m / p.N - x.theta_l) ** 2
+
     plant = Plant(
         name="rotary",
         states={"theta_m": "rad", "thetad_m": "rad/s", "theta_l": "rad", "thetad_l": "rad/s"},
@@ -97,5 +101,6 @@ def rotary(parts: Sequence[Part] = ()) -> Plant:
         f=f,
         h=h,
         derived=derived,
+        energy=energy,
     )
     return wrapped(plant, parts, outputs=("tau_s",))

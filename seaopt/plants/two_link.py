@@ -40,6 +40,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import casadi as ca
@@ -167,6 +168,7 @@ class _Motion:
     rates: list[tuple[Any, Any]]
     forces: tuple[Any, Any]
     links: tuple[_LinkModel, _LinkModel]
+    energy: Any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,9 +219,10 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     inertia, _ = ca.hessian(kinetic, yd)
     gyroscopic = ca.jtimes(ca.gradient(kinetic, yd), y, yd) - ca.gradient(kinetic, y)
     motor = p.eta * (p.K_tau / r) * u.I - b_m * x.qd - part_laws.dry_friction(build.parts, x.qd, p)
-    external = getattr(u, "Fe1", 0.0) * x_1 + getattr(u, "Fe2", 0.0) * x_2
+    # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
+    external = getattr(u, "Fe1", 0.0) * ca.gradient(x_1, y) + getattr(u, "Fe2", 0.0) * ca.gradient(x_2, y)
     damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping for link in moving))
-    generalised = ca.gradient(external - potential, y) - damping - tension * ca.gradient(compression, y)
+    generalised = external - ca.gradient(potential, y) - damping - tension * ca.gradient(compression, y)
     generalised[0] += motor
     ydd = ca.mtimes(ca.inv_minor(inertia), generalised - gyroscopic)
 
@@ -230,7 +233,11 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
         forces = (tension, -bolt if screw else tension + thrust(sprung, x_s))
     else:
         forces = (tension - thrust(sprung, x_s) - (thrust(nut, x_n) if screw else 0.0), tension)
-    return _Motion(rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]))
+    stored = kinetic + potential + part_laws.spring_energy(build.parts, compression, p)
+    return _Motion(
+        rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]),
+        energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
+    )  # fmt: skip
 
 
 def _pendulum_parameters(suffix: str) -> list[Parameter]:
@@ -285,6 +292,9 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
             values |= {f"x_{number}": link.position, f"phi{build.suffixes[number - 1]}": link.coordinate}
         return {name: values[name] for name in outputs}
 
+    def energy(x: Any, p: Any) -> Any:
+        return _motion(x, SimpleNamespace(I=0.0), p, build).energy
+
     inside = [part for part in build.parts if part in part_laws.INSIDE]
     held = replace(build, links=("fixed", "mass"), suffixes=("1", "2"), parts=tuple(inside))
     plant = Plant(
@@ -297,6 +307,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         h=h,
         derived=lambda p: derived_figures(p, housing_rides=build.drive == "unlumped" and build.spring == "link2"),
         optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
+        energy=energy if part_laws.stores_in_closed_form(build.parts) else None,
         port=lambda: _actuator(f"port of {name}", held, external=True),
     )
     return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])

@@ -22,15 +22,22 @@ from seaopt.plants import Plant
 from seaopt.reporting.comparison import fit_surveys, sentence, survey_figure
 from seaopt.reporting.figures import all_figures
 from seaopt.reporting.residuals import ranking_figure, residual_figure
+from seaopt.reporting.verification import verification_figures, verification_section
 from seaopt.robustness import Certificate
+from seaopt.robustness.environments import StabilityMap
+from seaopt.robustness.large_signal import LargeSignal
+from seaopt.robustness.verification import Verification
 
-Result = Fit | Ranking | Controller | Certificate
+Result = Fit | Ranking | Controller | Certificate | Verification | StabilityMap | LargeSignal
 _CAPTIONS = {
     "time": "Measured and model outputs in the time domain",
     "response": "Frequency response: H1 estimate of the log, the fitted model and the second-order fit (16)",
     "residual": "Residuals and their correlations; shaded: what one lag of a hundred exceeds by chance",
     "ranking": "Residuals of the fits that are compared, octave by octave",
     "loop": "The closed loop on every plant",
+    "simulation": "Force and current of each scenario; shaded: link 2 is held",
+    "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
+    "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
 }
 
 
@@ -39,9 +46,9 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
 
     Parameters
     ----------
-    results : sequence of Fit, Ranking, Controller, Certificate
-        At most one of each; sections of what is not there are left out. A fit that was not read from a file has a
-        section of diagnostics.
+    results : sequence of Fit, Ranking, Controller, Certificate, Verification, StabilityMap, LargeSignal
+        At most one of each, of the last any number; sections of what is not there are left out. A fit that was not
+        read from a file has a section of diagnostics.
     path : path
         The page; figures go to the folder ``figures`` beside it.
     title : str
@@ -67,16 +74,21 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     'report.html'
 
     """
-    kinds = (Fit, Ranking, Controller, Certificate)
-    fit, ranking, controller, certificate = (_only(results, kind) for kind in kinds)
-    if all(item is None for item in (fit, ranking, controller, certificate)):
-        raise SeaoptError("write_report got no result; give a Fit, a Ranking, a Controller or a Certificate")
+    kinds = (Fit, Ranking, Controller, Certificate, Verification, StabilityMap)
+    fit, ranking, controller, certificate, verification, coupled = (_only(results, kind) for kind in kinds)
+    large = [item for item in results if isinstance(item, LargeSignal)]
+    if not any(isinstance(item, (*kinds, LargeSignal)) for item in results):
+        raise SeaoptError(
+            "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
+        )
     if controller is None and certificate is not None:
         controller = certificate.controller
     surveys = fit_surveys(fit) if fit is not None else {}
     diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None else None
     figures = all_figures(fit, surveys, controller, _plants(controller, certificate))
     figures |= _leftover_figures(fit, diagnostics, ranking)
+    simulated = verification_figures(verification, large, coupled)
+    figures |= simulated
     target = Path(path)
     drawn: list[dict[str, str]] = []
     for name, figure in figures.items():
@@ -92,7 +104,11 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
                 "note": _note(name, surveys, fit),
             }
         )
-    return write_text(target, _page(title, fit, diagnostics, ranking, controller, certificate, drawn))
+    shown = {item["name"]: item["svg"] for item in drawn if item["name"] in simulated}
+    section = verification_section(verification, large, coupled, shown, number)
+    return write_text(
+        target, _page(title, fit, diagnostics, ranking, controller, certificate, drawn, verification, section)
+    )
 
 
 def _leftover_figures(fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None) -> dict[str, Any]:
@@ -237,7 +253,8 @@ def _band(value: tuple[float, float] | None) -> str:
 
 def _page(
     title: str, fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None,
-    controller: Controller | None, certificate: Certificate | None, figures: Any,
+    controller: Controller | None, certificate: Certificate | None, figures: Any, verification: Verification | None,
+    simulated: str,
 ) -> str:  # fmt: skip
     from jinja2 import Environment
 
@@ -251,12 +268,15 @@ def _page(
     )
     return template.render(
         title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller, certificate=certificate,
-        figures=figures, verdict=verdict(fit, controller, certificate), swinging=_swinging(certificate),
-        forces=_forces(controller),
+        figures=figures, verdict=verdict(fit, controller, certificate, verification), swinging=_swinging(certificate),
+        forces=_forces(controller), simulated=simulated,
     )  # fmt: skip
 
 
-def verdict(fit: Fit | None, controller: Controller | None, certificate: Certificate | None) -> list[tuple[bool, str]]:
+def verdict(
+    fit: Fit | None, controller: Controller | None, certificate: Certificate | None,
+    verification: Verification | None = None,
+) -> list[tuple[bool, str]]:  # fmt: skip
     """Return one line a stage: whether it is met, and what to say."""
     lines: list[tuple[bool, str]] = []
     if fit is not None:
@@ -274,4 +294,8 @@ def verdict(fit: Fit | None, controller: Controller | None, certificate: Certifi
             else "failed – " + "; ".join(broken)
         )
         lines.append((certificate.passed, f"Certificate: {what}"))
+    if verification is not None:
+        failed = dict.fromkeys(f"{row.scenario} on {row.plant}" for row in verification.failures)
+        what = "failed – " + ", ".join(failed) if failed else f"{len(verification.rows)} runs passed"
+        lines.append((verification.passed, f"Simulation: {what}"))
     return lines

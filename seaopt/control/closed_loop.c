@@ -1,0 +1,80 @@
+/* Sampled closed loops, sample by sample, one run after the other.
+
+   Built with constants and CasADi's functions in front (see seaopt/control/closed_loop.py):
+   seaopt_sample: (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y), sensor, law and delay at one sample;
+   seaopt_advance: (t, x, peak, u, p, h) -> (x+, peak+), one Runge-Kutta step. */
+#include <math.h>
+#include <string.h>
+
+typedef struct {
+    long n, substeps;          /* samples; steps of the coarse solution in a sample, the fine one takes twice as many */
+    double t0, period, late_s; /* after late_s of a sample the current `late` follows that of u */
+    const double *p, *c, *lag; /* parameters, the law's numbers, which of the commands are in force */
+    const double *r, *w, *e;   /* n, n, n x NE */
+    double *x, *z;             /* in and out */
+    double *peak, *error, *size; /* NY, NX, NX: largest |y| over all fine steps, |fine - coarse| and |x| */
+    double *y, *applied, *states; /* n x NY, n, n x NX */
+} seaopt_loop_args;
+
+static void piece(const seaopt_loop_args *a, double t, double lasting, const double *u, long steps, double *x, double *peak) {
+    double h = lasting / steps, next[NX], top[NY], work[SZ_W + 1];
+    const double *arg[SZ_ARG + 6];
+    double *res[SZ_RES + 2];
+    casadi_int iw[SZ_IW + 1];
+    for (long i = 0; i < steps; i++) {
+        double at = t + i * h;
+        arg[0] = &at; arg[1] = x; arg[2] = peak; arg[3] = u; arg[4] = a->p; arg[5] = &h;
+        res[0] = next; res[1] = top;
+        seaopt_advance(arg, res, iw, work, 0);
+        memcpy(x, next, sizeof next);
+        memcpy(peak, top, sizeof top);
+    }
+}
+
+static void integrate(const seaopt_loop_args *a, double t, const double *u, const double *newer, long steps, double *x, double *peak) {
+    if (a->late_s > 0.0) piece(a, t, a->late_s, u, steps, x, peak);
+    piece(a, t + a->late_s, a->period - a->late_s, newer, steps, x, peak);
+}
+
+static inline double larger(double old, double value) { return value > old || value != value ? value : old; }
+
+static void run(const seaopt_loop_args *a) {
+    double x[NX], z[NZ + 1], after[NZ + 1], u[NU], newer[NU], coarse[NX], unused[NY], work[SZ_W + 1];
+    const double *arg[SZ_ARG + 9];
+    double *res[SZ_RES + 4];
+    casadi_int iw[SZ_IW + 1];
+    memcpy(x, a->x, sizeof x);
+    memcpy(z, a->z, NZ * sizeof *z);
+    for (long k = 0; k < a->n; k++) {
+        double t = a->t0 + k * a->period;
+        arg[0] = &t; arg[1] = x; arg[2] = z; arg[3] = a->e + k * NE; arg[4] = a->r + k; arg[5] = a->w + k;
+        arg[6] = a->p; arg[7] = a->c; arg[8] = a->lag;
+        res[0] = after; res[1] = u; res[2] = newer; res[3] = a->y + k * NY;
+        seaopt_sample(arg, res, iw, work, 0);
+        memcpy(z, after, NZ * sizeof *z);
+        for (int i = 1; i < NU; i++) newer[i] = u[i];
+        memcpy(a->states + k * NX, x, sizeof x);
+        a->applied[k] = newer[0];
+        for (int i = 0; i < NY; i++) a->peak[i] = larger(a->peak[i], fabs(a->y[k * NY + i]));
+        memcpy(coarse, x, sizeof x);
+        memcpy(unused, a->peak, sizeof unused);
+        integrate(a, t, u, newer, a->substeps, coarse, unused);
+        integrate(a, t, u, newer, 2 * a->substeps, x, a->peak);
+        for (int i = 0; i < NX; i++) {
+            a->error[i] = larger(a->error[i], fabs(x[i] - coarse[i]));
+            a->size[i] = larger(a->size[i], fabs(x[i]));
+        }
+    }
+    memcpy(a->x, x, sizeof x);
+    memcpy(a->z, z, NZ * sizeof *z);
+}
+
+#if defined(_WIN32)
+__declspec(dllexport)
+#else
+__attribute__((visibility("default")))
+#endif
+int seaopt_loops(const seaopt_loop_args *runs, long count) {
+    for (long i = 0; i < count; i++) run(runs + i);
+    return 0;
+}

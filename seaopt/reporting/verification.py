@@ -1,0 +1,156 @@
+"""Figures of simulations and of coupled stability, and their section of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from seaopt.reporting.figures import MEASURED, MODEL, PLANT_COLOURS, panels
+from seaopt.robustness.environments import StabilityMap
+from seaopt.robustness.judgement import NOMINAL, Outcome
+from seaopt.robustness.large_signal import LargeSignal
+from seaopt.robustness.playback import Trace
+from seaopt.robustness.verification import Verification
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN_S = 0.6  # of the last phase, where the others are shorter: what happens there is over soon
+HELD = "#f1f1f1"
+
+
+def verification_figure(verification: Verification, plant: str) -> Figure:
+    """Draw force and current of each scenario on one plant: the run that failed, or has the largest force."""
+    rows = [row for row in verification.worst() if row.plant == plant]
+    controller = verification.stages[plant].controller
+    name, limit = controller.spec.measured, controller.spec.current_limit_A
+    figure, axes = panels(len(rows), 2, 0.5 + 1.5 * len(rows))
+    for (left, right), row in zip(axes, rows, strict=True):
+        trace = verification.replay(row)
+        shown = trace.time <= _until(trace)
+        time = trace.time[shown]
+        left.plot(time, trace.reference[0][shown], color=MEASURED, linewidth=1.6, label="reference")
+        left.plot(time, trace.outputs[name][0][shown], color=MODEL, linewidth=0.9, label=name)
+        right.step(time, trace.current[0][shown], where="post", color=PLANT_COLOURS[1], linewidth=0.9, label="current")
+        if limit is not None and row.saturated > 0.0:
+            for side in (-limit, limit):
+                right.axhline(side, color="#444444", linestyle=":", linewidth=0.9)
+        _phases((left, right), trace, float(time[-1]), verification, row)
+        drawn = "" if row.draw == NOMINAL else f", draw {row.draw}"
+        verdict = "" if row.passed else ": FAILED"
+        left.set_title(f"{row.scenario}{drawn}{verdict}", fontsize="medium", loc="left")
+        left.set_ylabel(f"{name} [N]")
+        right.set_ylabel("current [A]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    return figure
+
+
+def _until(trace: Trace) -> float:
+    """Return how much of a trace is drawn: all of one phase, else the last one's beginning."""
+    if len(trace.edges) == 2:
+        return float(trace.time[-1])
+    return float(trace.time[trace.edges[-2]]) + max(SHOWN_S, float(trace.time[trace.edges[-2]]))
+
+
+def _phases(axes: tuple[Axes, Axes], trace: Trace, until: float, verification: Verification, row: Outcome) -> None:
+    (scenario,) = (item for item in verification.scenarios[row.plant] if item.name == row.scenario)
+    for phase, start, stop in zip(scenario.phases, trace.edges[:-1], trace.edges[1:], strict=True):
+        if phase.held:
+            for axis in axes:
+                axis.axvspan(trace.time[start], min(trace.time[stop - 1], until), color=HELD, zorder=0)
+
+
+def large_signal_figure(found: Sequence[LargeSignal]) -> Figure:
+    """Draw the gain against frequency at each amplitude, and the saturation map, a row a plant."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    figure, axes = panels(len(found), 2, 3.0 * len(found), sharex=True)
+    for (left, right), item in zip(axes, found, strict=True):
+        shades = np.linspace(0.85, 0.0, item.amplitude_N.size)
+        for amplitude, gain, hit, shade in zip(item.amplitude_N, item.gain, item.saturated, shades, strict=True):
+            colour = (shade * 0.75, 0.30 + shade * 0.55, 0.55 + shade * 0.4)
+            size = 20 * np.log10(np.maximum(np.abs(gain), 1e-6))
+            left.semilogx(item.frequency_hz, size, color=colour, linewidth=1.3, label=f"{amplitude:.3g} N")
+            left.semilogx(item.frequency_hz[hit], size[hit], ".", color=colour, markersize=5)
+        left.axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9)
+        left.legend(frameon=False, fontsize="small")
+        left.set_title(f"{item.plant}: |F/F_ref| [dB]; dots: saturated", fontsize="medium", loc="left")
+        right.loglog(item.frequency_hz, item.onset_N, color=MODEL, linewidth=1.3)
+        right.set_title("amplitude at which the current saturates [N]", fontsize="medium", loc="left")
+        for axis in (left.xaxis, right.xaxis, right.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
+    for axis in axes[-1]:
+        axis.set_xlabel("frequency [Hz]")
+    return figure
+
+
+def stability_figure(found: StabilityMap) -> Figure:
+    """Draw where the loop is stable against a mass on a spring, a panel a damper."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    columns = min(2, found.damping.size)
+    rows = -(-found.damping.size // columns)
+    figure, axes = panels(rows, columns, 3.1 * rows, sharex=True, sharey=True)
+    colours = ListedColormap(["#cfe3f1", "#f6d9c6"])
+    for index, (damping, stable, edge) in enumerate(zip(found.damping, found.stable, found.boundary, strict=True)):
+        axis = axes.ravel()[index]
+        axis.pcolormesh(
+            found.mass, found.stiffness, (~stable).T.astype(float), cmap=colours, norm=BoundaryNorm([0, 0.5, 1], 2),
+            shading="nearest", rasterized=True,
+        )  # fmt: skip
+        if len(edge):
+            axis.plot(edge[:, 0], edge[:, 1], ".", color=PLANT_COLOURS[1], markersize=3)
+        share = 100.0 * float(np.mean(stable))
+        axis.set_title(f"damper {damping:g} N s/m: stable in {share:.3g} %", fontsize="medium", loc="left")
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+    for axis in axes.ravel()[found.damping.size :]:
+        axis.set_visible(False)
+    for axis in axes[-1]:
+        axis.set_xlabel("mass on link 2 [kg]")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("spring to ground [N/m]")
+    return figure
+
+
+def verification_figures(
+    verification: Verification | None, large: Sequence[LargeSignal], coupled: StabilityMap | None
+) -> dict[str, Figure]:
+    """Return every figure that the results allow, by file name."""
+    out: dict[str, Figure] = {}
+    if verification is not None:
+        played = dict.fromkeys(row.plant for row in verification.rows)
+        out |= {f"simulation_{name}": verification_figure(verification, name) for name in played}
+    if large:
+        out["amplitude"] = large_signal_figure(large)
+    if coupled is not None:
+        out["environments"] = stability_figure(coupled)
+    return out
+
+
+def verification_section(
+    verification: Verification | None,
+    large: Sequence[LargeSignal],
+    coupled: StabilityMap | None,
+    svgs: Mapping[str, str],
+    number: Any,
+) -> str:
+    """Return the section's HTML: tables, and the figures' <svg> elements by file name.
+
+    `number` shows a number to people (`seaopt.reporting.report.number`).
+    """
+    from jinja2 import Environment
+
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["number"] = number
+    source = files("seaopt.reporting").joinpath("verification.html.jinja").read_text(encoding="utf-8")
+    return environment.from_string(source).render(verification=verification, large=large, coupled=coupled, svgs=svgs)

@@ -1,0 +1,202 @@
+"""Whether what a run showed is allowed.
+
+What every run is judged by:
+
+- it stays finite, and the current within the limit;
+- nothing grows: in the last phase, where the reference is constant, the largest energy of the second half (after a
+  fifth of settling) is no more than that of the first, with 5 % and a thousandth of the whole run's to spare. With the
+  force held, the loop works on the link like a constant force, which is conservative: over a swing the energy of link
+  and actuator comes back to where it was, unless the loop feeds it. Where a plant declares no energy, the square of the
+  force's error stands for it. This sees growth within seconds; a mode that takes minutes is seen by the eigenvalues;
+- no oscillation sustains itself in the last phase (`oscillation`), above what noise and quantisation make, faster than
+  a tenth of the bandwidth: an undamped link that swings is the link's own business;
+- the limits of the scenario.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.closed_loop import ENERGY
+from seaopt.parameters import ParameterSet
+from seaopt.robustness.oscillation import oscillation
+from seaopt.robustness.playback import Stage, Trace
+from seaopt.robustness.scenarios import Scenario
+
+SETTLE = 0.2  # of the last phase, before it is judged
+GROWTH, GROWTH_FLOOR = 1.05, 1e-3
+WINDOW_S = 3.0
+NOMINAL = "nominal"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """One scenario on one plant at one set of parameters.
+
+    Parameters
+    ----------
+    scenario, plant, draw : str
+        `draw` is "nominal" or the number of a draw, from 1.
+    passed : bool
+    reason : str
+        What failed; empty if nothing did.
+    parameters : mapping of name to float
+        Where the draw differs from nominal: with scenario, plant and seed, the witness.
+    peak_force_N, peak_current_A : float
+        Of the measured output (in its unit), between samples too, and of the command.
+    saturated : float
+        Share of the samples at the current limit.
+    peak_angle_rad : float or None
+        Of the plant's angles.
+    peak_energy_J, energy_growth : float or None
+        Largest energy; largest of the last phase's second half over that of its first.
+    final_error_N : float or None
+        Mean of reference minus force over the last fifth of the last phase.
+    limit_cycle_N, limit_cycle_hz : float or None
+        Amplitude and frequency of an oscillation that does not die out.
+    contact_impulse, contact_loss_J : float or None
+        Of the hardest contact: what stops the link along its coordinate, and the energy lost.
+
+    """
+
+    scenario: str
+    plant: str
+    draw: str
+    passed: bool
+    reason: str
+    parameters: Mapping[str, float]
+    peak_force_N: float
+    peak_current_A: float
+    saturated: float
+    peak_angle_rad: float | None = None
+    peak_energy_J: float | None = None
+    energy_growth: float | None = None
+    final_error_N: float | None = None
+    limit_cycle_N: float | None = None
+    limit_cycle_hz: float | None = None
+    contact_impulse: float | None = None
+    contact_loss_J: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Findings:
+    """What one run showed, as figures of an `Outcome`, and sentences on what is not allowed."""
+
+    figures: dict[str, Any] = field(default_factory=dict[str, Any])
+    faults: list[str] = field(default_factory=list[str])
+
+
+def judged(
+    stage: Stage, name: str, scenario: Scenario, trace: Trace, run: int, sets: Sequence[ParameterSet]
+) -> Outcome:
+    """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first."""
+    found = _Findings()
+    measured = stage.controller.spec.measured
+    force, current = trace.outputs[measured][run], trace.current[run]
+    _extremes(stage, scenario, trace, run, found)
+    if np.all(np.isfinite(force)) and np.all(np.isfinite(current)):
+        _growth(stage, trace, run, found)
+        _ringing(stage, scenario, trace, run, found)
+        _ending(scenario, trace, run, force, found)
+    else:
+        found.faults.insert(0, "it leaves what numbers can hold")
+    return Outcome(
+        scenario=scenario.name, plant=name, draw=NOMINAL if run == 0 else str(run), passed=not found.faults,
+        reason="; ".join(found.faults), parameters=_difference(sets[0], sets[run]),
+        **found.figures,
+    )  # fmt: skip
+
+
+def _extremes(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Findings) -> None:
+    controller, plant = stage.controller, stage.plant
+    force = float(trace.peaks[controller.spec.measured][run])
+    angles = [float(trace.peaks[name][run]) for name, unit in plant.outputs.items() if unit == "rad"]
+    current, limit = np.abs(trace.current[run]), controller.spec.current_limit_A
+    hits = trace.contacts
+    hardest = max(hits, key=lambda item: abs(item.impulse[run]), default=None)
+    found.figures.update(
+        peak_force_N=force,
+        peak_current_A=float(np.max(current)),
+        peak_angle_rad=max(angles) if angles else None,
+        saturated=float(np.mean(current >= limit * (1 - 1e-9))) if limit is not None else 0.0,
+        peak_energy_J=float(trace.peaks[ENERGY][run]) if ENERGY in trace.peaks else None,
+        contact_impulse=None if hardest is None else float(hardest.impulse[run]),
+        contact_loss_J=None if hardest is None else float(hardest.loss_J[run]),
+    )
+    if limit is not None and np.max(current) > limit * (1 + 1e-9) + 0.5 * stage.current_step_A:
+        found.faults.append(f"the current reaches {np.max(current):.4g} A, above its limit of {limit:g} A")
+    for what, value, allowed, unit in (
+        (controller.spec.measured, force, scenario.max_force_N, "N"),
+        ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
+    ):
+        if allowed is not None and not value <= allowed:
+            found.faults.append(f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
+    for name, value in scenario.passes.items():
+        reached = trace.outputs[name][run]
+        if not np.nanmin(reached) <= value <= np.nanmax(reached):
+            found.faults.append(f"{name} never passes {value:g}, so that the scenario shows nothing")
+
+
+def _growth(stage: Stage, trace: Trace, run: int, found: _Findings) -> None:
+    if ENERGY in trace.outputs:
+        level, what = trace.outputs[ENERGY][run], "the energy"
+    else:
+        name = stage.controller.spec.measured
+        level, what = (trace.outputs[name][run] - trace.reference[run]) ** 2, f"the square of the error of {name}"
+    level = np.abs(level[np.isfinite(level)])
+    last = level[-(trace.edges[-1] - trace.edges[-2]) :]
+    last = last[int(SETTLE * last.size) :]
+    first, second = (float(np.max(half)) for half in np.array_split(last, 2))
+    found.figures["energy_growth"] = second / max(first, 1e-300)
+    if second > GROWTH * first + GROWTH_FLOOR * float(np.max(level)):
+        found.faults.append(f"{what} grows {second / max(first, 1e-300):.3g} times while the reference is constant")
+
+
+def _ringing(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Findings) -> None:
+    spec, period = stage.controller.spec, stage.controller.sample_time_s
+    if not scenario.quiet:
+        return
+    window = _window(trace, period)
+    seen = oscillation(
+        trace.outputs[spec.measured][run][window], period, floor=_floor(stage, trace, run),
+        lowest_hz=max(spec.bandwidth_hz / 10.0, 8.0 / (period * (window.stop - window.start))),
+    )  # fmt: skip
+    if seen is None or not (seen.sustained or seen.growing):
+        return
+    found.figures.update(limit_cycle_N=seen.amplitude, limit_cycle_hz=seen.frequency_hz)
+    what = "sustains itself" if seen.sustained else f"grows {seen.growth:.3g} times"
+    found.faults.append(f"an oscillation of {seen.amplitude:.3g} N at {seen.frequency_hz:.4g} Hz {what}")
+
+
+def _window(trace: Trace, period: float) -> slice:
+    last = trace.last
+    start = last.start + int(SETTLE * (last.stop - last.start))
+    return slice(max(start, last.stop - int(WINDOW_S / period)), last.stop)
+
+
+def _floor(stage: Stage, trace: Trace, run: int) -> float:
+    """Return the amplitude (N) that noise, quantisation and rounding make by themselves."""
+    name, sensors = stage.controller.spec.measured, stage.sensors
+    rounding = 0.5 * stage.current_step_A / stage.controller.current_per_force_A_per_N
+    noise = 2.0 * sensors.noise_std.get(name, 0.0) + 1.5 * sensors.quantisation.get(name, 0.0)
+    return max(noise + rounding, 1e-3 * float(trace.peaks[name][run]))
+
+
+def _ending(scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray, " n"], found: _Findings) -> None:
+    last = trace.last
+    end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
+    error = float(np.mean(trace.reference[run][end] - force[end]))
+    found.figures["final_error_N"] = error
+    if scenario.final_error is not None and not abs(error) <= scenario.final_error:
+        found.faults.append(f"the force ends {error:.4g} N off, {scenario.final_error:.4g} N are allowed")
+
+
+def _difference(nominal: ParameterSet, drawn: ParameterSet) -> dict[str, float]:
+    return {
+        name: item.value for name, item in drawn.items() if name not in nominal or item.value != nominal[name].value
+    }

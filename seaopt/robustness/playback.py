@@ -1,0 +1,235 @@
+"""Play a scenario: phase after phase on the sampled loop, several parameter sets at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.bench import Sensors, excite
+from seaopt.control import Controller
+from seaopt.control.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop
+from seaopt.control.realisation import runnable
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.impacts import caught, position, released, struck
+from seaopt.plants.linear import point
+from seaopt.robustness.scenarios import LINK, Phase, Scenario
+
+Rows = Float[np.ndarray, "runs n"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stage:
+    """What scenarios are played on.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its law runs as exported.
+    plant : Plant
+        With link 2 as it is.
+    partner : Plant or None
+        The same actuator with that link fixed, for phases in which it is held.
+    sensors, current_step_A
+        As in `SampledLoop`.
+
+    """
+
+    controller: Controller
+    plant: Plant
+    partner: Plant | None = None
+    sensors: Sensors = field(default_factory=Sensors)
+    current_step_A: float = 0.0
+
+    def loop(self, held: bool, longest_delay_s: float = 0.0) -> SampledLoop:
+        """Return the loop with the link held or not."""
+        plant = self.partner if held else self.plant
+        if plant is None:
+            raise ControlError(
+                f"a phase holds the link of {self.plant.name}; give partner, the plant with that link fixed"
+            )
+        return SampledLoop(
+            plant=plant,
+            law=runnable(self.controller),
+            measured=self.controller.spec.measured,
+            delay_samples=self.controller.delay_samples,
+            sensors=self.sensors,
+            current_step_A=self.current_step_A,
+            longest_delay_s=longest_delay_s,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contact:
+    """A link that is caught: when (s), the impulse that stops it and the energy (J) it loses, one a run."""
+
+    time_s: float
+    impulse: Float[np.ndarray, " runs"]
+    loss_J: Float[np.ndarray, " runs"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trace:
+    """A scenario as it was played.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds from the start.
+    reference, current : array, shape (runs, n)
+        N and A.
+    outputs : mapping of name to array, shape (runs, n)
+        Of `plant`, and "energy" where it declares it; NaN while the link is held and there is no such output.
+    peaks : mapping of name to array, shape (runs,)
+        Largest magnitudes, between samples too.
+    edges : tuple of int
+        First samples of the phases, and one past the last.
+    contacts : tuple of Contact
+    error : float
+        Estimated integration error of the worst sample, relative.
+    substeps : int
+        Integration steps a sample, the most of all phases.
+    wall_s : float
+        Time that the simulation took.
+
+    """
+
+    time: Float[np.ndarray, " n"]
+    reference: Rows
+    current: Rows
+    outputs: Mapping[str, Rows]
+    peaks: Mapping[str, Float[np.ndarray, " runs"]]
+    edges: tuple[int, ...]
+    contacts: tuple[Contact, ...]
+    error: float
+    substeps: int
+    wall_s: float
+
+    @property
+    def last(self) -> slice:
+        """The samples of the last phase."""
+        return slice(self.edges[-2], self.edges[-1])
+
+
+def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Trace:
+    """Play a scenario, once for each set of parameters.
+
+    Parameters
+    ----------
+    stage : Stage
+        Controller, plant and devices.
+    scenario : Scenario
+        What happens.
+    params : sequence of ParameterSet
+        One a run; `delay_s` among them is delay besides the controller's.
+    seed : int
+        Of the sensor noise and of random excitations.
+
+    Raises
+    ------
+    ControlError
+        The scenario cannot be played on this plant.
+    SimulationError
+        The plant cannot be simulated well enough.
+
+    """
+    obstacle = scenario.obstacle(stage.plant, stage.partner)
+    if obstacle is not None:
+        raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
+    delays = [[item[DELAY]] if DELAY in item else [] for item in params]
+    longest = max((delay.value for found in delays for delay in found), default=0.0)
+    values = [stage.plant.complete(item).with_parameters(*d) for item, d in zip(params, delays, strict=True)]
+    now, grip = _start(stage, scenario, values, longest), None
+    runs: list[LoopRun] = []
+    contacts: list[Contact] = []
+    begin_s = 0.0
+    for number, phase in enumerate(scenario.phases):
+        values = [_scaled(item, phase.scale) for item in values]
+        if phase.held and grip is None:
+            now, grip, contact = _catch(stage, values, now, begin_s)
+            contacts.append(contact)
+        elif grip is not None and not phase.held:
+            now, grip = _let_go(stage, values, grip, now), None
+        if phase.impulse_Ns:
+            blows = [struck(stage.plant, p, x, LINK, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
+            now = LoopState(x=np.stack(blows), z=now.z)
+        loop = stage.loop(phase.held, longest)
+        reference = _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
+        run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
+        now, begin_s = run.end, begin_s + reference.size * loop.law.sample_time_s
+        runs.append(run)
+    return _joined(stage, runs, tuple(contacts))
+
+
+def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
+    """Return the first states of the plant with its link free: the given ones, the spring relaxed."""
+    plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
+    start = at_rest(loop, len(values), point("state", plant.states, scenario.initial_state))
+    if scenario.initial_state and "q" in plant.states and LINK in plant.outputs:
+        place = list(plant.states).index("q")
+        for row, p in zip(start.x, values, strict=True):
+            row[place] -= position(plant, p, row, LINK)
+    return start
+
+
+def _scaled(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
+    return params.update(**{name: factor * params[name].value for name, factor in scale.items()})
+
+
+def _reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    n = max(1, round(phase.duration_s / sample_time_s))
+    if not phase.excitation:
+        return np.full(n, phase.force_N)
+    return phase.force_N + excite(phase.excitation, duration_s=n * sample_time_s, rate_hz=1 / sample_time_s, rng=rng)[1]
+
+
+def _catch(
+    stage: Stage, values: Sequence[ParameterSet], now: LoopState, time_s: float
+) -> tuple[LoopState, list[dict[str, float]], Contact]:
+    """Return the states after the link is caught, where its coordinate stands in each run, and the contact."""
+    plant, held = stage.plant, stage.partner
+    assert held is not None
+    found = [caught(plant, p, row, held) for p, row in zip(values, now.x, strict=True)]
+    (name,) = [n for n, unit in plant.states.items() if n not in held.states and not unit.endswith("/s")]
+    place = list(plant.states).index(name)
+    after = LoopState(x=np.stack([state for state, _, _ in found]), z=now.z)
+    impulse, loss = (np.array([item[k] for item in found]) for k in (1, 2))
+    contact = Contact(time_s=time_s, impulse=impulse, loss_J=loss)
+    return after, [{name: float(row[place])} for row in now.x], contact
+
+
+def _let_go(
+    stage: Stage, values: Sequence[ParameterSet], grip: Sequence[Mapping[str, float]], now: LoopState
+) -> LoopState:
+    held = stage.partner
+    assert held is not None
+    rows = [released(held, row, stage.plant, p, link) for row, p, link in zip(now.x, values, grip, strict=True)]
+    return LoopState(x=np.stack(rows), z=now.z)
+
+
+def _joined(stage: Stage, runs: Sequence[LoopRun], contacts: tuple[Contact, ...]) -> Trace:
+    names = stage.loop(held=False).watched
+    count = runs[0].current.shape[0]
+
+    def column(run: LoopRun, name: str) -> Rows:
+        return run.outputs[name] if name in run.outputs else np.full((count, run.time.size), np.nan)
+
+    return Trace(
+        time=np.concatenate([run.time for run in runs]),
+        reference=np.hstack([run.reference for run in runs]),
+        current=np.hstack([run.current for run in runs]),
+        outputs={name: np.hstack([column(run, name) for run in runs]) for name in names},
+        peaks={
+            name: np.max([run.peaks[name] for run in runs if name in run.peaks], axis=0)
+            for name in names
+        },
+        edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
+        contacts=contacts,
+        error=max(run.error for run in runs),
+        substeps=max(run.substeps for run in runs),
+        wall_s=sum(run.wall_s for run in runs),
+    )  # fmt: skip

@@ -1,0 +1,234 @@
+"""The controller as exported on nonlinear plants: scenarios, what they showed, and whether that is allowed."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from seaopt.bench import Sensors
+from seaopt.control import Controller
+from seaopt.errors import ControlError, suggestion
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.impacts import is_pair
+from seaopt.robustness.judgement import NOMINAL, Outcome, judged
+from seaopt.robustness.playback import Stage, Trace, play
+from seaopt.robustness.scenarios import Scenario, default_scenarios
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Verification:
+    """What `verify` returns.
+
+    Parameters
+    ----------
+    passed : bool
+        Every row passed, and there is one.
+    rows : tuple of Outcome
+    skipped : tuple of (scenario, plant, reason)
+        What was asked for and cannot be played.
+    real_time_factor : mapping of plant name to float
+        Seconds simulated in a second, over all runs.
+    error : float
+        Largest estimated integration error of a sample, relative to the state's largest value.
+    seed : int
+        Of noise and random excitations.
+    stages : mapping of plant name to Stage
+    scenarios : mapping of plant name to tuple of Scenario
+    draws : mapping of plant name to tuple of ParameterSet
+        Nominal first: what `replay` plays again.
+
+    """
+
+    passed: bool
+    rows: tuple[Outcome, ...]
+    skipped: tuple[tuple[str, str, str], ...]
+    real_time_factor: Mapping[str, float]
+    error: float
+    seed: int
+    stages: Mapping[str, Stage]
+    scenarios: Mapping[str, tuple[Scenario, ...]]
+    draws: Mapping[str, tuple[ParameterSet, ...]]
+
+    def replay(self, row: Outcome) -> Trace:
+        """Return the trace of a row, played again."""
+        (scenario,) = (item for item in self.scenarios[row.plant] if item.name == row.scenario)
+        drawn = self.draws[row.plant][0 if row.draw == NOMINAL else int(row.draw)]
+        return play(self.stages[row.plant], scenario, [drawn], seed=self.seed)
+
+    @property
+    def failures(self) -> tuple[Outcome, ...]:
+        """The rows that did not pass."""
+        return tuple(row for row in self.rows if not row.passed)
+
+    def worst(self) -> tuple[Outcome, ...]:
+        """Return one row a scenario and plant: one that failed, else the one with the largest force."""
+        best: dict[tuple[str, str], Outcome] = {}
+        for row in self.rows:
+            key = (row.plant, row.scenario)
+            if key not in best or (not row.passed, row.peak_force_N) > (not best[key].passed, best[key].peak_force_N):
+                best[key] = row
+        return tuple(best.values())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what goes into robustness.json under "simulation"."""
+        return {
+            "passed": self.passed,
+            "seed": self.seed,
+            "real_time_factor": dict(self.real_time_factor),
+            "integration_error": self.error,
+            "rows": [{f.name: _plain(getattr(row, f.name)) for f in fields(Outcome)} for row in self.rows],
+            "skipped": [dict(zip(("scenario", "plant", "reason"), item, strict=True)) for item in self.skipped],
+        }
+
+    def __repr__(self) -> str:
+        failed = len(self.failures)
+        verdict = "passed" if self.passed else (f"FAILED in {failed} of {len(self.rows)} runs" if failed else "EMPTY")
+        lines = [f"Verification by simulation: {verdict}"]
+        lines += [f"  {line}" for line in _table(self.worst())]
+        lines += [
+            f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{_witness(row)}"
+            for row in self.failures
+        ]
+        lines += [f"  not played: {scenario} on {plant}, {reason}" for scenario, plant, reason in self.skipped]
+        speed = ", ".join(f"{name} {value:.0f}" for name, value in self.real_time_factor.items())
+        return "\n".join([*lines, f"  seconds simulated in a second: {speed}; seed {self.seed}"])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def verify(
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    parameters: ParameterSet,
+    *,
+    scenarios: Sequence[Scenario] | None = None,
+    draws: Mapping[str, Sequence[ParameterSet]] | None = None,
+    sensors: Sensors | None = None,
+    current_step_A: float = 0.0,
+    partners: Mapping[str, Plant] | None = None,
+    seed: int = 1,
+) -> Verification:
+    """Simulate a controller, as exported, on nonlinear plants.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its law runs with its own rate, delay, current limit and anti-windup.
+    plants : mapping of name to Plant
+        What it must survive.
+    parameters : ParameterSet
+        Nominal values; the plants' defaults where left out.
+    scenarios : sequence of Scenario, optional
+        The same for every plant; `default_scenarios` of each if left out.
+    draws : mapping of plant name to sequence of ParameterSet, optional
+        Played besides the nominal values, such as a certificate's worst draws.
+    sensors : Sensors, optional
+        Noise, offset, range and quantisation of the measured output; ideal if left out.
+    current_step_A : float
+        What the current is rounded to; 0 for not at all.
+    partners : mapping of plant name to Plant, optional
+        The same actuator with link 2 fixed, for scenarios of contact; found among `plants` and the controller's design
+        plant where left out.
+    seed : int
+        Of noise and random excitations.
+
+    Returns
+    -------
+    Verification
+
+    Raises
+    ------
+    ControlError
+        There is no plant, or an argument names one that is not there.
+    SimulationError
+        A plant cannot be simulated to the accuracy asked for.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, swing, thor = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+    >>> controller = so.tune(stand, thor, spec, robust_to={"swing": swing})
+    >>> cell = so.Sensors(noise_std={"F1": 1.0})
+    >>> verification = verify(controller, {"stand": stand, "swing": swing}, thor, sensors=cell)
+    >>> verification.passed, len(verification.rows)
+    (True, 11)
+
+    """
+    _check(plants, draws or {}, partners or {})
+    stages = {
+        name: Stage(
+            controller=controller, plant=plant, partner=_partner(name, plant, plants, controller, partners or {}),
+            sensors=sensors or Sensors(), current_step_A=current_step_A,
+        )
+        for name, plant in plants.items()
+    }  # fmt: skip
+    played: dict[str, tuple[Scenario, ...]] = {}
+    skipped: list[tuple[str, str, str]] = []
+    sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
+    rows: list[Outcome] = []
+    speeds: dict[str, float] = {}
+    error = 0.0
+    for name, stage in stages.items():
+        chosen = default_scenarios(controller, stage.plant) if scenarios is None else tuple(scenarios)
+        found = [(item, item.obstacle(stage.plant, stage.partner)) for item in chosen]
+        played[name] = tuple(item for item, obstacle in found if obstacle is None)
+        skipped += [(item.name, name, obstacle) for item, obstacle in found if obstacle is not None]
+        simulated = wall = 0.0
+        for item in played[name]:
+            trace = play(stage, item, sets[name], seed=seed)
+            rows += [judged(stage, name, item, trace, k, sets[name]) for k in range(len(sets[name]))]
+            simulated += len(sets[name]) * trace.time.size * controller.sample_time_s
+            wall, error = wall + trace.wall_s, max(error, trace.error)
+        speeds[name] = simulated / wall if wall else math.nan
+    return Verification(
+        passed=bool(rows) and all(row.passed for row in rows), rows=tuple(rows), skipped=tuple(skipped),
+        real_time_factor=speeds, error=error, seed=seed, stages=stages, scenarios=played, draws=sets,
+    )  # fmt: skip
+
+
+def _check(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
+    if not isinstance(plants, Mapping) or not plants:
+        raise ControlError("verify needs a mapping of name to plant with at least one; give {name: plant}")
+    for what, given in (("draws", draws), ("partners", partners)):
+        for name in given:
+            if name not in plants:
+                raise ControlError(f'{what} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
+
+
+def _partner(
+    name: str, plant: Plant, plants: Mapping[str, Plant], controller: Controller, given: Mapping[str, Plant]
+) -> Plant | None:
+    if name in given:
+        return given[name]
+    known = [*([controller.design[0]] if controller.design is not None else []), *plants.values()]
+    return next((item for item in known if is_pair(plant, item)), None)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _witness(row: Outcome) -> str:
+    return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
+
+
+def _table(rows: Sequence[Outcome]) -> list[str]:
+    head = ("plant", "scenario", "", "force N", "current A", "angle deg", "energy J", "at limit", "draw")
+    cells: list[tuple[str, ...]] = [head]
+    for row in rows:
+        angle = "" if row.peak_angle_rad is None else f"{math.degrees(row.peak_angle_rad):.3g}"
+        energy = "" if row.peak_energy_J is None else f"{row.peak_energy_J:.3g}"
+        cells.append((
+            row.plant, row.scenario, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
+            f"{row.peak_current_A:.3g}", angle, energy, f"{100 * row.saturated:.3g} %", row.draw,
+        ))  # fmt: skip
+    widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]

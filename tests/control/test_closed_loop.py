@@ -1,0 +1,243 @@
+"""The sampled loop against scipy's DOP853 and plain NumPy, sample by sample."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete
+
+import seaopt as so
+from seaopt.control import TransferFunction
+from seaopt.control.closed_loop import LoopState, SampledLoop, run_loop
+from seaopt.control.realisation import realise
+from seaopt.errors import SimulationError
+from seaopt.simulation import compiler
+
+TS = 1e-3
+LAW = {  # k_p = 3, k_i = 2, k_d = 0.03, T_f = 1 ms and unit feedforward, written out: (1 - q)(1 - q/2)
+    "reference": TransferFunction(num=np.array([19.001, -35.9995, 16.9995]), den=np.array([1.0, -1.5, 0.5])),
+    "measurement": TransferFunction(num=np.array([18.001, -34.4995, 16.4995]), den=np.array([1.0, -1.5, 0.5])),
+}
+GAIN = 1 / 240.3318
+
+
+def law(limit=9.0, **changes):
+    options = {"sample_time_s": TS, "current_per_force_A_per_N": GAIN, "current_limit_A": limit, **changes}
+    return realise(LAW["reference"], LAW["measurement"], **options)
+
+
+@pytest.fixture
+def no_compiler(monkeypatch):
+    monkeypatch.setenv("SEAOPT_COMPILER", "none")
+    compiler.load_library.cache_clear()
+    yield
+    compiler.load_library.cache_clear()
+
+
+def swing_by_hand(params):
+    """Return the unlumped swing's right-hand side and F1, written from the paper: M qdd = F_m - ... - F2."""
+    p = {name: item.value for name, item in params.items()}
+    r = p["l"] / (2 * np.pi * p["N_p"])
+    m, b = p["J"] / r**2, p["b_r"] / r**2
+
+    def rate(t, x, current):
+        q, qd, phi, phid = x
+        arm, slope = p["L_a"] * np.cos(phi), -p["L_a"] * np.sin(phi)
+        f1 = p["k"] * (q + p["L_a"] * np.sin(phi))
+        push = p["K_tau"] / r * current - b * qd - p["f_c"] * np.tanh(qd / p["v_s"])
+        # In qdd, phidd and F2: m_l xdd_l = F2 - F1, M qdd = push - F2, I_p phidd = -F2 arm - m g L sin - d phid.
+        rows = [[p["m_l"], p["m_l"] * arm, -1], [m, 0, 1], [0, p["I_p"], arm]]
+        right = [-f1 - p["m_l"] * slope * phid**2, push, -p["m"] * p["g"] * p["L"] * np.sin(phi) - p["d"] * phid]
+        qdd, phidd, _ = np.linalg.solve(rows, right)
+        return [qd, qdd, phid, phidd]
+
+    return rate, lambda x: p["k"] * (x[0] + p["L_a"] * np.sin(x[2]))
+
+
+def hard_case(swing, thor, friction, sensors, step):
+    """0.4 s with friction, the pendulum's sine, two samples of delay and saturation with anti-windup."""
+    loop = SampledLoop(plant=swing, law=law(3.0), measured="F1", delay_samples=2, sensors=sensors, current_step_A=step)
+    reference = np.where(np.arange(400) < 200, 120.0, -60.0)
+    start = np.array([1e-4, 0.0, 0.8, -1.0])
+    start[0] -= 0.0725 * np.sin(0.8)
+    state = LoopState(x=start[None], z=np.zeros((1, loop.law.c.size + 2)))
+    params = thor.update(f_c=friction, d=0.05)
+    run = run_loop(loop, [params], reference, start=state, seed=5)
+    assert np.max(np.abs(run.current)) == pytest.approx(3.0)
+    return loop, reference, start, run, swing_by_hand(params)
+
+
+def held(rate, x, current):
+    return solve_ivp(rate, (0, TS), x, args=(current,), method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
+
+
+@pytest.mark.parametrize("friction", [0.0, 30.0])
+def test_the_nonlinear_swing_is_dop853s(swing, thor, friction):
+    loop, reference, x, run, (rate, force) = hard_case(swing, thor, friction, so.Sensors(), 0.0)
+    memory, waiting, forces, currents = loop.law.reset(), [0.0, 0.0], [], []
+    for k in range(400):
+        forces.append(force(x))
+        current, memory = loop.law.step(memory, reference[k], forces[-1])
+        waiting.append(current)
+        currents.append(waiting.pop(0))
+        x = held(rate, x, currents[-1])
+    np.testing.assert_allclose(run.current[0], currents, atol=1e-4)
+    np.testing.assert_allclose(run.outputs["F1"][0], forces, atol=1e-5 * np.max(np.abs(forces)))
+    np.testing.assert_allclose(run.end.x[0], x, rtol=1e-5, atol=1e-8)
+
+
+def test_noise_and_rounding_are_numpys(swing, thor):
+    """Each sample from the run's own states: a quantiser makes a step of any difference, and whole runs part."""
+    sensors = so.Sensors(noise_std={"F1": 0.7}, quantisation={"F1": 0.25}, offset={"F1": 1.5}, saturation={"F1": 150.0})
+    loop, reference, _, run, (rate, force) = hard_case(swing, thor, 30.0, sensors, 0.01)
+    noise = 0.7 * np.random.default_rng(5).normal(size=400)
+    memory, waiting, currents = loop.law.reset(), [0.0, 0.0], []
+    for k in range(400):
+        reading = np.clip(force(run.states[0, k]) + noise[k] + 1.5, -150.0, 150.0)
+        current, memory = loop.law.step(memory, reference[k], 0.25 * np.round(reading / 0.25))
+        waiting.append(0.01 * np.round(current / 0.01))
+        currents.append(waiting.pop(0))
+    np.testing.assert_allclose(run.current[0], currents, atol=1e-9)
+    ends = np.array([held(rate, run.states[0, k], currents[k]) for k in range(0, 399, 7)])
+    scale = np.max(np.abs(run.states[0]), axis=0)
+    assert np.max(np.abs(ends - run.states[0, 1:400:7]) / scale) < 2e-7
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_without_limits_it_is_the_linear_loop(stand, thor, delay):
+    """scipy's zero-order hold, the difference equation of the law and a queue."""
+    loop = SampledLoop(plant=stand, law=law(None), measured="F1", delay_samples=delay)
+    n = 300
+    run = run_loop(loop, [thor], np.full(n, 50.0), rtol=1e-9)
+    model = stand.linearize(thor)
+    a, b, c, _, _ = cont2discrete((model.A, model.B * GAIN, model.C[:1], np.zeros((1, 1))), TS, "zoh")
+    x, queue, forces = np.zeros(2), [0.0] * delay, []
+    e, u = [0.0, 0.0], [0.0, 0.0]
+    num_r, num_y = LAW["reference"].num, LAW["measurement"].num
+    y = [0.0, 0.0]
+    for _ in range(n):
+        forces.append((c @ x)[0])
+        e, y = [50.0, *e], [forces[-1], *y]
+        u = [1.5 * u[0] - 0.5 * u[1] + num_r @ e[:3] - num_y @ y[:3], *u]
+        queue.append(u[0])
+        x = a @ x + b[:, 0] * queue.pop(0)
+    np.testing.assert_allclose(run.outputs["F1"][0], forces, rtol=1e-6, atol=1e-6)
+
+
+def delayed(params, delay_s):
+    return params.with_parameters(so.Parameter(name="delay_s", value=delay_s, unit="s"))
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.4e-3, 1e-3, 2.7e-3])
+def test_a_delay_of_any_length_is_two_pieces_of_a_sample(stand, thor, delay_s):
+    """The older command for what is left of the delay, the newer one for the rest: two exact holds."""
+    loop = SampledLoop(plant=stand, law=law(None), measured="F1", delay_samples=1, longest_delay_s=2.7e-3)
+    run = run_loop(loop, [delayed(thor, delay_s), delayed(thor, 1.1e-3)], np.full(200, 50.0), rtol=1e-9)
+    model = stand.linearize(thor)
+    whole, rest = int(delay_s / TS + 1e-9), delay_s - TS * int(delay_s / TS + 1e-9)
+    held = lambda t: cont2discrete((model.A, model.B * GAIN, model.C[:1], np.zeros((1, 1))), t, "zoh")[:3]  # noqa: E731
+    (a1, b1, c), (a2, b2, _) = held(max(rest, 1e-15)), held(TS - rest)
+    x, memory, commands, forces = np.zeros(2), loop.law.reset(), [0.0] * (whole + 2), []
+    for _ in range(200):
+        forces.append((c @ x)[0])
+        current, memory = loop.law.step(memory, 50.0, forces[-1])
+        commands.append(current / GAIN)
+        older, newer = commands[-3 - whole], commands[-2 - whole]
+        x = a2 @ (a1 @ x + b1[:, 0] * older) + b2[:, 0] * newer
+    np.testing.assert_allclose(run.outputs["F1"][0], forces, rtol=1e-6, atol=1e-6)
+
+
+def test_the_interpreter_gives_the_compiled_numbers(thor, no_compiler):
+    runs = []
+    for compiled in (False, True):
+        if compiled:
+            compiler.load_library.cache_clear()
+            with pytest.MonkeyPatch.context() as patch:
+                patch.delenv("SEAOPT_COMPILER")
+                if compiler.find_compiler() is None:
+                    pytest.skip("no compiler here")
+                runs.append(_noisy(so.plants.moving_output(), thor))
+        else:
+            runs.append(_noisy(so.plants.moving_output(), thor))
+    np.testing.assert_allclose(runs[0].outputs["F1"], runs[1].outputs["F1"], atol=1e-7)
+    np.testing.assert_allclose(runs[0].end.z, runs[1].end.z, atol=1e-7)
+    np.testing.assert_allclose(runs[0].peaks["F2"], runs[1].peaks["F2"], atol=1e-7)
+    assert runs[0].error == pytest.approx(runs[1].error, rel=1e-3)
+
+
+def _noisy(plant, thor):
+    loop = SampledLoop(
+        plant=plant, law=law(), measured="F1", delay_samples=1, sensors=so.Sensors(noise_std={"F1": 1.0}),
+        longest_delay_s=1.3e-3,
+    )  # fmt: skip
+    return run_loop(loop, [delayed(thor, 1.3e-3), thor.update(f_c=20.0)], np.full(300, 80.0), seed=3)
+
+
+def test_a_batch_is_its_runs_one_by_one(swing, thor):
+    loop = SampledLoop(plant=swing, law=law(), measured="F1", delay_samples=1)
+    sets = [thor.update(I_p=value) for value in (0.2, 0.36, 0.6)]
+    together = run_loop(loop, sets, np.full(200, 60.0))
+    for k, params in enumerate(sets):
+        alone = run_loop(loop, [params], np.full(200, 60.0))
+        np.testing.assert_allclose(together.outputs["F1"][k], alone.outputs["F1"][0], rtol=1e-9)
+
+
+def test_a_run_goes_on_where_another_ended(swing, thor):
+    loop = SampledLoop(plant=swing, law=law(), measured="F1", delay_samples=2)
+    whole = run_loop(loop, [thor], np.full(200, 60.0))
+    first = run_loop(loop, [thor], np.full(120, 60.0))
+    second = run_loop(loop, [thor], np.full(80, 60.0), start=first.end, start_s=0.12)
+    np.testing.assert_allclose(second.outputs["F1"][0], whole.outputs["F1"][0, 120:], rtol=1e-9)
+    assert second.time[-1] == pytest.approx(whole.time[-1])
+
+
+def test_peaks_between_samples_are_seen(thor):
+    """A free ringing at 160 Hz, six samples a period: the largest of the samples is not the top."""
+    plant = so.plants.two_link("fixed", "mass")
+    silent = realise(
+        *(TransferFunction(num=np.zeros(1), den=np.ones(1)) for _ in range(2)), sample_time_s=3.1e-3,
+        current_per_force_A_per_N=GAIN,
+    )  # fmt: skip
+    params = plant.defaults.update(m_2=1e6, b_r=0.0, J=1e-3)
+    loop = SampledLoop(plant=plant, law=silent, measured="F1", delay_samples=1)
+    state = LoopState(x=np.array([[0.0, 0.0, 1e-4, 0.0]]), z=np.zeros((1, 1)))
+    run = run_loop(loop, [params], np.zeros(30), start=state)
+    assert run.peaks["F1"][0] == pytest.approx(65.5, rel=1e-2)
+
+
+def test_stiff_friction_takes_smaller_steps_or_is_refused(stand, thor):
+    loop = SampledLoop(plant=stand, law=law(), measured="F1", delay_samples=1)
+    smooth = run_loop(loop, [thor.update(f_c=50.0)], np.full(100, 80.0))
+    sharp = run_loop(loop, [thor.update(f_c=50.0, v_s=3e-6)], np.full(100, 80.0))
+    assert sharp.substeps > smooth.substeps
+    with pytest.raises(SimulationError, match="smooth the friction"):
+        run_loop(loop, [thor.update(f_c=500.0, v_s=1e-9)], np.full(100, 80.0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"measured": "F9"}, "F9"),
+        ({"measured": "F2", "delay_samples": 0}, "without delay"),
+        ({"current_step_A": -1.0}, "current_step_A"),
+        ({"longest_delay_s": -1.0}, "longest_delay_s"),
+        ({"sensors": so.Sensors(noise_std={"F1": -1.0})}, "negative"),
+    ],
+)
+def test_bad_loops(stand, changes, words):
+    with pytest.raises(SimulationError, match=words):
+        SampledLoop(**{"plant": stand, "law": law(), "measured": "F1", "delay_samples": 1, **changes})
+
+
+def test_bad_runs(stand, thor):
+    loop = SampledLoop(plant=stand, law=law(), measured="F1", delay_samples=1)
+    for options, words in (
+        ({"params": []}, "no parameters"),
+        ({"reference": np.ones((3, 5))}, "shape"),
+        ({"external": {"Fe3": np.ones(5)}}, "Fe3"),
+        ({"params": [delayed(thor, 1e-3)]}, "longest of all runs"),
+        ({"start": LoopState(x=np.zeros((2, 2)), z=np.zeros((2, 3)))}, "2 runs"),
+    ):
+        with pytest.raises(SimulationError, match=words):
+            run_loop(loop, **{"params": [thor], "reference": np.ones(5), **options})
