@@ -23,7 +23,7 @@ CHOICES = (
     ("fixed", "mass", "pendulum"),
     ("zero", "first"),
     ("split", "error"),
-    ("pd", "pid"),
+    ("pd", "pid", "pid_dob"),
     ("error", "measurement"),
     ("disturbance", "noise"),
 )
