@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.task import INTEGRAL_RAD_S, Grid, Point, Task, prominent
+from seaopt.control.task import Grid, Point, Task, prominent
 
 STEPS = 8
 ROWS = 10  # per kind of limit
@@ -87,7 +87,8 @@ def improved(task: Task, grid: Grid, start: Point, steps: int = STEPS) -> tuple[
         if step is None:
             break
         trial = x.copy()
-        trial[:3] = np.clip(x[:3] + step, *(ends[:3] for ends in task.bounds()))
+        trial[:3] += step
+        trial = task.tidy(trial)
         found = _merit(task, grid, trial)
         if found < merit and task.stable(trial):
             small = merit - found < 1e-3
@@ -113,18 +114,12 @@ def _merit(task: Task, grid: Grid, x: Point) -> float:
     """Return the logarithm of the objective and the price of the worst usage."""
     usage = task.usage(grid, x)
     worst = max(float(np.max(curve)) for curve in usage.values())
-    worst = max(worst, 1.0 + abs(_bandwidth_miss(task, grid, x)), _integral(task, x) + 1.0)
+    worst = max(worst, 1.0 + abs(task.miss(grid, x)), _integral(task, x) + 1.0)
     return float(np.log(task.objective(grid, x))) + PRICE * max(0.0, worst - 1.0)
 
 
 def _integral(task: Task, x: Point) -> float:
-    return INTEGRAL_RAD_S * (1 + x[0]) - x[1] if task.integrates else 0.0
-
-
-def _bandwidth_miss(task: Task, grid: Grid, x: Point) -> float:
-    at = grid.at(np.array([int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))]))
-    c_r, c_y = task.law(at, x)
-    return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * c_r / (1 + at.p[0] * c_y)))[0])
+    return task.least_rate * (1 + x[0]) - x[1]
 
 
 def _affine(task: Task, grid: Grid, x: Point) -> _Affine:
@@ -176,8 +171,7 @@ def _rows(task: Task, grid: Grid, x: Point, law: _Affine) -> _Rows:
     near = _along(one, p * law.by_y[:, column]) / np.abs(one)[:, None]
     rows.add(used, used[:, None] * (near - _along(through, by) / np.abs(through)[:, None]))
     _bandwidth_rows(task, grid, x, law, rows)
-    if task.integrates:
-        rows.add(np.array([1.0 + _integral(task, x)]), np.array([[INTEGRAL_RAD_S, -1.0, 0.0]]))
+    rows.add(np.array([1.0 + _integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
     return rows
 
 
@@ -186,7 +180,7 @@ def _bandwidth_rows(task: Task, grid: Grid, x: Point, law: _Affine, rows: _Rows)
     p, one = grid.p[0, at], np.array([1.0 + grid.p[0, at] * law.c_y[at]])
     through = np.array([p * law.c_r[at]])
     slope = _along(through, p * law.by_r[:, [at]]) / np.abs(through) - _along(one, p * law.by_y[:, [at]]) / np.abs(one)
-    miss = _bandwidth_miss(task, grid, x)
+    miss = task.miss(grid, x)
     rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
 
 

@@ -23,7 +23,7 @@ inverse rings. Delay and :math:`B_u` stay in Q, so that the inverse is exact, st
     Q = Q_0 \, q^{1+d} \frac{B_u(q)}{B_u(1)}, \qquad \frac{Q}{P_n} = Q_0 \frac{A(q)}{B_s(q) B_u(1)}, \qquad
     Q_0 = \Big(\frac{T_s}{T_q + T_s - q T_q}\Big)^2 .
 
-:math:`Q(1) = 1`: the observer integrates.
+:math:`Q(1) = 1`: the observer integrates, and k_i may be 0 beside it.
 
 **Notch**, in series with all of it: a biquad :math:`(s^2 + 2 g \zeta \omega s + \omega^2)/(s^2 + 2 \zeta \omega s +
 \omega^2)` by Tustin's rule, prewarped to be exact at :math:`\omega`; :math:`\zeta` is its width, g its depth.
@@ -45,6 +45,7 @@ from seaopt.control.digital import DigitalPlant
 Structure = Literal["pd", "pid", "pid_dob"]
 Derivative = Literal["error", "measurement"]
 STRUCTURES: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
+ROUNDING = 1e-17
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
 HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal lags are 3 dB down
 
@@ -57,9 +58,11 @@ class TransferFunction:
     den: Float[np.ndarray, " m"]
 
     def response(self, f: Float[np.ndarray, " k"], sample_time_s: float) -> Complex[np.ndarray, " k"]:
-        """Return the values at frequencies in Hz."""
+        """Return the values at frequencies in Hz; next to a pole on the circle, no more than rounding allows."""
         q = np.exp(-2j * np.pi * f * sample_time_s)
-        return np.polynomial.polynomial.polyval(q, self.num) / np.polynomial.polynomial.polyval(q, self.den)
+        below = np.polynomial.polynomial.polyval(q, self.den)
+        least = ROUNDING * np.sum(np.abs(self.den))
+        return np.polynomial.polynomial.polyval(q, self.num) / np.where(np.abs(below) < least, least, below)
 
     def state_space(
         self,
@@ -214,10 +217,13 @@ class Gains:
     def transfer_functions(
         self, structure: Structure, sample_time_s: float
     ) -> tuple[TransferFunction, TransferFunction]:
-        """Return C_r and C_y over their common denominator; of a pd or pid, (1 - q) (1 - alpha q) or (1 - alpha q)."""
+        """Return C_r and C_y over their common denominator.
+
+        It is (1 - alpha q) of a pd and (1 - q) (1 - alpha q) of a pid; observer and notch multiply it.
+        """
         alpha = self.T_f / (self.T_f + sample_time_s)
         lag = np.array([1.0, -alpha])
-        integrates = structure != "pd"
+        integrates = structure == "pid" or (structure == "pid_dob" and self.k_i != 0.0)
         difference = np.array([1.0, -1.0])
         den = np.convolve(difference, lag) if integrates else lag
         unit = den

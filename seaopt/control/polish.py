@@ -22,9 +22,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.law import terms
-from seaopt.control.task import EVERYWHERE, INTEGRAL_RAD_S, NAMES, ON_DESIGN, Grid, Point, Task, prominent
+from seaopt.control.task import EVERYWHERE, NAMES, ON_DESIGN, Grid, Point, Task, prominent
 
-POINTS = 16  # of each kind of limit
+POINTS = 24  # of each kind of limit
+SPREAD = 10  # of them, at even distances
+REACH = 3.0  # factor by which a number may change in one solution
 WORST = 2  # plants whose objective is followed
 CHUNK = 64  # quadrature points come in multiples of this
 PRICE = 1e3
@@ -75,8 +77,8 @@ class _Complex:
         return self.re * self.re + self.im * self.im
 
 
-def polished(task: Task, grid: Grid, start: Point, rounds: int = 3) -> Point:
-    """Return the numbers at a local optimum, or the start if no stable one is found.
+def polished(task: Task, grid: Grid, start: Point, rounds: int = 5) -> Point:
+    """Return the numbers at a local optimum, or the start if no better ones are found.
 
     Parameters
     ----------
@@ -91,27 +93,41 @@ def polished(task: Task, grid: Grid, start: Point, rounds: int = 3) -> Point:
 
     """
     x, chosen = start, _choose(task, grid, start)
+    rank = task.rank(grid, start)
     for _ in range(rounds):
         trial = _solve(task, grid, x, chosen)
-        if trial is None or not task.stable(trial):
-            return x
-        x, missed = trial, False
-        for name, curve in task.usage(grid, x).items():
-            allowed = max(1.0, float(np.max(curve.ravel()[chosen[name]]))) + 1e-4
-            if np.max(curve) > allowed:
-                missed = True
-                more = prominent(curve, POINTS // 2)
-                chosen[name] = np.concatenate([more, chosen[name]])[:POINTS]
-        if not missed:
+        if trial is None:
+            break
+        again = _add_missed(task, grid, trial, chosen)
+        found = task.rank(grid, trial)
+        if found < rank and task.stable(trial):
+            again = again or bool(np.any(trial > 0.99 * REACH * x)) or bool(np.any(trial < 1.01 / REACH * x))
+            x, rank = trial, found
+        if not again:
             break
     return x
 
 
+def _add_missed(task: Task, grid: Grid, x: Point, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
+    """Add the points where more of a limit is used than at any chosen one, in place of the last; tell if there are."""
+    missed = False
+    for name, curve in task.usage(grid, x).items():
+        if np.max(curve) > max(1.0, float(np.max(curve.ravel()[chosen[name]]))) + 1e-4:
+            missed = True
+            keep = POINTS - SPREAD
+            worst = np.concatenate([prominent(curve, keep // 2), chosen[name][:keep]])[:keep]
+            chosen[name] = np.concatenate([worst, chosen[name][keep:]])
+    return missed
+
+
 def _choose(task: Task, grid: Grid, x: Point) -> dict[str, Int[np.ndarray, " n"]]:
-    """Return, for each limit, flat indices of POINTS points that matter; the noise objective needs its peak too."""
+    """Return, for each limit, flat indices of POINTS points: those that matter most, and some at even distances."""
     chosen: dict[str, Int[np.ndarray, " n"]] = {}
     for name, curve in task.usage(grid, x).items():
-        index = prominent(curve, POINTS)
+        worst = np.argmax(curve, axis=0)
+        used = np.flatnonzero(np.max(curve, axis=0) > 0.0)
+        even = used[np.linspace(0, used.size - 1, SPREAD).astype(int)] if used.size else np.zeros(1, dtype=int)
+        index = np.concatenate([prominent(curve, POINTS - SPREAD), worst[even] * grid.f.size + even])
         chosen[name] = np.resize(index, POINTS)
     return chosen
 
@@ -149,7 +165,7 @@ def _program(quadrature: int, observer: bool, notch: bool, feedback_only: bool, 
     slices = {kind: slice(POINTS * i, POINTS * (i + 1)) for i, kind in enumerate(kinds)}
     above: dict[str, Any] = {
         "ms": 1.0, "mt": open_loop.square(), "disk": (1.0 - open_loop).square(), "peak": through.square(),
-        "noise": c_y.square(), "slow": 2.0, "low": 1.0,
+        "noise": c_y.square(), "slow": 1.0, "low": 1.0,
     }  # fmt: skip
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
@@ -186,7 +202,8 @@ def _program(quadrature: int, observer: bool, notch: bool, feedback_only: bool, 
 def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarray, " n"]]) -> Point | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    limits = task.limits()._asdict() | {"slow": 1.0, "low": 1.0}
+    limits = task.limits()._asdict() | {"low": 1.0}
+    limits["slow"] = 1.0 / limits["slow"]
     m, kinds = grid.f.size, (*EVERYWHERE, *ON_DESIGN)
     flat = np.concatenate([chosen[kind] for kind in kinds])
     columns, p = flat % m, grid.p.ravel()[flat]
@@ -207,7 +224,7 @@ def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarra
     data = [
         *parts, weights, np.repeat(np.log([limits[kind] for kind in kinds]), POINTS),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
-        [INTEGRAL_RAD_S],
+        [task.least_rate],
     ]  # fmt: skip
     solver, _ = _program(
         weights.size, task.nominal is not None, spec.notch is not None, spec.derivative == "measurement", noise
@@ -218,14 +235,13 @@ def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarra
     count = int(solver.size_out("g")[0])
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0
-    if not task.integrates:
-        upper[1] = np.inf
     found = solver(
         x0=x0, p=np.concatenate([np.asarray(item, dtype=float) for item in data]), lbg=lower, ubg=upper,
-        lbx=[*(low / scale), -np.inf, 0.0], ubx=[*(high / scale), np.inf, np.inf],
+        lbx=[*(np.maximum(low, start / REACH) / scale), -np.inf, 0.0],
+        ubx=[*(np.minimum(high, REACH * np.maximum(start, 0.3 * scale)) / scale), np.inf, np.inf],
     )  # fmt: skip
-    x = np.clip(np.array(found["x"]).ravel()[: len(NAMES)] * scale, low, high)
-    return x if np.all(np.isfinite(x)) else None
+    x = np.array(found["x"]).ravel()[: len(NAMES)] * scale
+    return task.tidy(x) if np.all(np.isfinite(x)) else None
 
 
 def _integrals(task: Task, grid: Grid, x: Point) -> Float[np.ndarray, " n"]:

@@ -24,7 +24,7 @@ from seaopt.control.task import HIGHEST_NOTCH, INTEGRAL_RAD_S, Grid, Point, Task
 RATES = 24  # values of k_d
 COARSE = 90  # frequencies
 SCANNED_PLANTS = 4
-TURN = 1.2 * np.pi  # of 1 + L over all frequencies: more is an encirclement
+TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: less is an encirclement
 
 
 def starts(task: Task, grid: Grid, count: int) -> list[Point]:
@@ -44,14 +44,13 @@ def starts(task: Task, grid: Grid, count: int) -> list[Point]:
     found = [_ranked(task, coarse, shape) for shape in _shapes(task)]
     merit = np.concatenate([item[0] for item in found])
     points = np.concatenate([item[1] for item in found])
-    low, high = task.bounds()
     distinct: list[Point] = []
     tried = 0
     for k in np.argsort(merit):
         if len(distinct) == count or tried == 40 * count or not np.isfinite(merit[k]):
             break
-        x = np.clip(points[k], low, high)
-        if any(_alike(x, other) for other in distinct):
+        x = task.tidy(points[k])
+        if any(_alike(task, x, other) for other in distinct):
             continue
         tried += 1
         if task.stable(x):
@@ -61,14 +60,20 @@ def starts(task: Task, grid: Grid, count: int) -> list[Point]:
 
 def at_rest(task: Task) -> Point:
     """Return the law with next to no feedback, stable because the plants are."""
-    low, high = task.bounds()
     ts = task.spec.sample_time_s
-    x = np.array([0.0, INTEGRAL_RAD_S, 0.0, ts, 10.0, 0.3, 0.5, 1.0])
-    return np.clip(x, low, high)
+    return task.tidy(np.array([0.0, task.least_rate, 0.0, ts, 10.0, 0.3, 0.5, 1.0]))
 
 
-def _alike(x: Point, other: Point) -> bool:
-    return bool(np.max(np.abs(np.log((x + 1e-4) / (other + 1e-4)))) < 0.4)
+def _alike(task: Task, x: Point, other: Point) -> bool:
+    """Tell whether two starts lead to the same place: valleys differ by notch, observer or integral, if there is one."""
+    apart = np.abs(np.log((x + 1e-4) / (other + 1e-4)))
+    if task.spec.notch is not None:
+        apart = apart[5:]
+    elif task.nominal is not None:
+        apart = apart[4]
+    elif task.spec.structure == "pid":
+        apart = apart[1]
+    return bool(np.max(apart) < 0.4)
 
 
 def _coarse(task: Task, grid: Grid) -> Grid:
@@ -88,7 +93,7 @@ def _shapes(task: Task) -> Iterator[tuple[float, float, float, float, float]]:
     unit = 1 / (2 * np.pi * spec.bandwidth_hz)
     filters = np.geomspace(0.15 * ts, min(0.7 * unit, high[3]), 5 if spec.notch is None else 3)
     # An output that swings at a few tenths of a hertz bears only a slow observer.
-    lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.4, 3.0] if task.nominal is not None else [1.0]
+    lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.5, 3.0] if task.nominal is not None else [1.0]
     notches = _notches(task) if spec.notch is not None else [(low[5], low[6], low[7])]
     for t_f in filters:
         for t_q in lags:
@@ -122,8 +127,7 @@ def _ranked(
     which = np.flatnonzero(keep) % k_d.size
     k_p, k_d, k_i, slope, back = k_p[keep], k_d[which], k_i[which], slope[which], back[which]
     merit = _merit(task, grid, series * (k_p[:, None] + back), series * (k_p[:, None] + slope))
-    if task.integrates:
-        merit += np.maximum(0.0, np.log(INTEGRAL_RAD_S * (1 + k_p) / np.maximum(k_i, 1e-12)))
+    merit += np.maximum(0.0, np.log(np.maximum(task.least_rate * (1 + k_p), 1e-12) / np.maximum(k_i, 1e-12)))
     points = np.column_stack([k_p, k_i, k_d, np.tile(shape, (k_p.size, 1))])
     return merit, points
 
@@ -132,10 +136,11 @@ def _gains(task: Task, grid: Grid, at: int, rate: float) -> tuple[Float[np.ndarr
     """Return values of k_d and k_i, in units of the inverse of the plant at the bandwidth."""
     inverse = 1.0 / max(abs(grid.p[0, at]), 1e-6)
     k_d = np.concatenate([[0.0], np.geomspace(0.02, 20.0, RATES)]) * inverse / rate
-    if not task.integrates:
+    if task.spec.structure == "pd":
         return k_d, np.zeros(1)
     slowest = 1.3 * INTEGRAL_RAD_S * (1 + np.array([0.1, 1.0]) * inverse)
-    return k_d, np.append(slowest, max(0.05 * 2 * np.pi * task.spec.bandwidth_hz * inverse, 2.0 * slowest[1]))
+    k_i = np.append(slowest, max(0.05 * 2 * np.pi * task.spec.bandwidth_hz * inverse, 2.0 * slowest[1]))
+    return k_d, k_i if task.nominal is None else np.array([0.0, k_i[1]])
 
 
 def _proportional(
@@ -161,11 +166,11 @@ def _merit(task: Task, grid: Grid, c_y: Complex[np.ndarray, "n m"], c_r: Complex
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = 1.0 + p * c_y
         turn = np.unwrap(np.angle(distance), axis=1)
-        turned = np.maximum(turned, np.abs(turn[:, -1] - turn[:, 0]))
+        turned = np.minimum(turned, turn[:, -1] - turn[:, 0])
         if task.spec.objective == "disturbance":
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
         elif row == 0:
             value = np.max(np.abs(c_y / distance), axis=1)
     broken = np.log(np.maximum(worst, 1.0))
     size = np.min(value) if value.size else 1.0
-    return np.log(value / size) + 20.0 * broken + np.where(turned > TURN, 50.0, 0.0)
+    return np.log(value / size) + 20.0 * broken + np.where(turned < TURN, 50.0, 0.0)

@@ -31,7 +31,11 @@ INTEGRAL_RAD_S = 2 * np.pi * 0.05  # k_i / (1 + k_p) at least, so that the integ
 FREQUENCIES = 300
 MORE_FREQUENCIES = 300  # about lightly damped modes
 LIGHT = 0.2  # damping ratio below which a mode is resolved
+NO_RATE = 1e-3  # rad/s
 NO_LIMIT = 1e9
+NEARLY_KEPT = 1.001
+SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
+LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
 HIGHEST_NOTCH = 0.45  # of the sample rate
 NAMES = ("k_p", "k_i", "k_d", "T_f", "T_q", "notch_w", "notch_width", "notch_depth")
 EVERYWHERE = ("ms", "mt", "disk")  # limits of every plant
@@ -48,6 +52,7 @@ class Limits(NamedTuple):
     disk: float  # 2 over the disk margin
     peak: float
     noise: float
+    slow: float  # abs(1 + L) at least
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,9 +94,16 @@ class Task:
     nominal: Nominal | None
 
     @property
-    def integrates(self) -> bool:
-        """Whether the law has k_i."""
-        return self.spec.structure != "pd"
+    def least_rate(self) -> float:
+        """The least k_i/(1 + k_p), rad/s: an integral does something, and a disturbance observer integrates itself."""
+        return INTEGRAL_RAD_S if self.spec.structure == "pid" else 0.0
+
+    def tidy(self, x: Point) -> Point:
+        """Return numbers within their bounds; beside an observer an integral that does nothing becomes none."""
+        x = np.clip(x, *self.bounds())
+        if self.nominal is not None and x[1] < NO_RATE * (1 + x[0]):
+            x[1] = 0.0
+        return x
 
     def limits(self) -> Limits:
         """Return the limits to keep while tuning."""
@@ -100,23 +112,24 @@ class Task:
             s.max_sensitivity, s.max_complementary, None if s.min_disk_margin is None else 2.0 / s.min_disk_margin,
             s.max_reference_peak, s.max_noise_gain,
         )  # fmt: skip
-        return Limits(*(NO_LIMIT if value is None else max(value * keep, 1e-6) for value in given))
+        peaks = (NO_LIMIT if value is None else max(value * keep, 1e-6) for value in given)
+        return Limits(*peaks, slow=np.sqrt(2.0) / keep)
 
     def bounds(self) -> tuple[Point, Point]:
         """Return the least and largest values of the eight numbers; equal where a number is fixed or absent."""
         spec, ts = self.spec, self.spec.sample_time_s
         notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
         if spec.notch is not None:
-            centre = _range(spec.notch.frequency_hz, 0.5 * spec.bandwidth_hz, HIGHEST_NOTCH / ts)
+            centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_NOTCH / ts)
             notch = (
                 (float(np.tan(np.pi * centre[0] * ts)), float(np.tan(np.pi * centre[1] * ts))),
-                _range(spec.notch.width, 0.02, 1.5),
+                _range(spec.notch.width, 0.02, 1.0),
                 _range(spec.notch.depth, 0.01, 1.0),
             )
         ranges = [
-            (0.0, np.inf), (0.0, np.inf) if self.integrates else (0.0, 0.0), (0.0, np.inf),
+            (0.0, np.inf), (0.0, 0.0) if self.spec.structure == "pd" else (0.0, np.inf), (0.0, np.inf),
             (0.0, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
-            (0.2 * ts, 10.0) if self.nominal is not None else (1.0, 1.0), *notch,
+            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0), *notch,
         ]  # fmt: skip
         low, high = (np.array(ends, dtype=float) for ends in zip(*ranges, strict=True))
         return low, high
@@ -194,7 +207,7 @@ class Task:
         limits, distance, through = self.limits(), np.abs(1.0 + p * c_y), np.abs(p * c_r)
         return {
             "peak": through / (limits.peak * distance), "noise": np.abs(c_y) / (limits.noise * distance),
-            "slow": np.where(self.slow(f), np.sqrt(2.0) / distance, 0.0),
+            "slow": np.where(self.slow(f), limits.slow / distance, 0.0),
             "low": np.where(self.low(f), distance / np.maximum(np.sqrt(2.0) * through, 1e-12), 0.0),
         }  # fmt: skip
 
@@ -213,6 +226,21 @@ class Task:
         out[: inside - 1] += step
         out[1:inside] += step
         return out
+
+    def miss(self, grid: Grid, x: Point) -> float:
+        """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
+        at = grid.at(np.array([int(np.argmin(np.abs(grid.f - self.spec.bandwidth_hz)))]))
+        c_r, c_y = self.law(at, x)
+        return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * c_r / (1 + at.p[0] * c_y)))[0])
+
+    def rank(self, grid: Grid, x: Point) -> tuple[float, float]:
+        """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
+
+        A bandwidth that is missed counts ten times a limit that is.
+        """
+        worst = max(float(np.max(curve)) for curve in self.usage(grid, x).values())
+        worst = max(worst, 1.0 + 10.0 * abs(self.miss(grid, x)))
+        return (worst if worst > NEARLY_KEPT else 0.0), self.objective(grid, x)
 
     def objective(self, grid: Grid, x: Point) -> float:
         """Return the objective on a grid."""

@@ -18,7 +18,7 @@ found, and the largest bandwidth at which they can be kept is found by bisection
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex
@@ -38,25 +38,12 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
-STARTS = 3
-POLISHED = 2
+STARTS = 3  # one more where an observer or a notch makes more valleys
+POLISHED = 2  # of them; one more there too
 RECHECKS = 3
 FINEST = 0.01  # of the largest bandwidth
+OUT_OF_REACH = 1.03  # usage
 PROBES = 5  # bandwidths tried when the lowest cannot be met
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tuned:
-    """Numbers, and by how much the worst limit is used on the frequencies that were looked at."""
-
-    x: Point
-    usage: float
-    objective: float
-
-    @property
-    def rank(self) -> tuple[float, float]:
-        """What to sort by: limits broken first, then the objective."""
-        return (self.usage if self.usage > 1.002 else 0.0), self.objective
 
 
 def current_per_force(plant: Plant, params: ParameterSet) -> float:
@@ -123,9 +110,14 @@ def tune(
 
     """
     task = make_task(plant, params, spec, robust_to or {}, draws)
-    found, figures = solved(task)
-    largest = None if not broken(spec, task.names, figures) else largest_bandwidth(task, found.x)
-    return controller_of(task, found.x, figures, (plant, params), largest)
+    x, figures = solved(task)
+    largest = None
+    if broken(spec, task.names, figures):
+        largest, near = largest_bandwidth(task, x)
+        # From there another answer may be in reach: a better compromise, or none needed.
+        if near is not None:
+            x, figures = solved(task, (x, near))
+    return controller_of(task, x, figures, (plant, params), largest)
 
 
 def make_task(
@@ -187,7 +179,7 @@ def _drawn(
     return out
 
 
-def solved(task: Task, warm: Sequence[Point] = ()) -> tuple[Tuned, list[LoopFigures]]:
+def solved(task: Task, warm: Sequence[Point] = ()) -> tuple[Point, list[LoopFigures]]:
     """Return the best numbers found, and the figures of every plant with them.
 
     Parameters
@@ -199,32 +191,27 @@ def solved(task: Task, warm: Sequence[Point] = ()) -> tuple[Tuned, list[LoopFigu
 
     """
     grid = task.grid(frequencies(task))
-    found = best(task, grid, warm)
+    x = best(task, grid, warm)
     for _ in range(RECHECKS):
-        missed = _missed(task, found.x, grid)
+        missed = _missed(task, x, grid)
         if not missed.size:
             break
         grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
-        found = _rated(task, grid, polished(task, grid, found.x))
-    return found, [task.loop(found.x, i).figures() for i in range(len(task.plants))]
+        x = polished(task, grid, x)
+    return x, [task.loop(x, i).figures() for i in range(len(task.plants))]
 
 
-def best(task: Task, grid: Grid, warm: Sequence[Point] = ()) -> Tuned:
+def best(task: Task, grid: Grid, warm: Sequence[Point] = ()) -> Point:
     """Return the best numbers on a grid."""
-    low, high = task.bounds()
-    given = [np.clip(x, low, high) for x in warm]
-    first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS - bool(given))
+    more = task.nominal is not None or task.spec.notch is not None
+    given = [task.tidy(x) for x in warm]
+    first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + more - bool(given))
     ranked = sorted((improved(task, grid, x) for x in first), key=lambda item: item[0])
     chosen: list[Point] = []
     for _, x in ranked:
-        if len(chosen) < POLISHED and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
+        if len(chosen) < POLISHED + more and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
-    return min((_rated(task, grid, polished(task, grid, x)) for x in chosen), key=lambda item: item.rank)
-
-
-def _rated(task: Task, grid: Grid, x: Point) -> Tuned:
-    usage = max(float(np.max(curve)) for curve in task.usage(grid, x).values())
-    return Tuned(x=x, usage=usage, objective=task.objective(grid, x))
+    return min((polished(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
 
 
 def _missed(task: Task, x: Point, grid: Grid) -> np.ndarray:
@@ -241,38 +228,49 @@ def _missed(task: Task, x: Point, grid: Grid) -> np.ndarray:
     return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
 
 
-def largest_bandwidth(task: Task, x: Point) -> float | None:
-    """Return the largest bandwidth in the specification's range that keeps the limits; None if none was found.
+def largest_bandwidth(task: Task, x: Point) -> tuple[float | None, Point | None]:
+    """Return the largest bandwidth in the specification's range that keeps the limits, if any, and its numbers.
 
     Found by bisection from the bandwidth asked, which does not keep them, towards the lowest; if that does not either,
     a few others are tried first. It is right to a hundredth, if limits that can be kept at one bandwidth can be kept
     at a lower one.
     """
-    spec = task.spec
+    spec, asked = task.spec, task.spec.bandwidth_hz
     low = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
-    warm = [x]
+    near: list[Point] = []
 
     def possible(bandwidth_hz: float) -> bool:
-        other = replace(task, spec=replace(spec, bandwidth_hz=bandwidth_hz))
-        found = best(other, other.grid(frequencies(other)), warm[-1:])
-        if found.usage > 1.0 + spec.reserve:
-            return False
-        warm.append(found.x)
-        return True
+        found = _possible(
+            replace(task, spec=replace(spec, bandwidth_hz=bandwidth_hz)), near[-1] if near else x, near=bool(near)
+        )
+        near.extend([] if found is None else [found])
+        return found is not None
 
-    if low >= spec.bandwidth_hz:
-        return None
-    tried = [low, *np.geomspace(low, spec.bandwidth_hz, PROBES + 2)[1:-1][::-1]]
-    lower = next((f for f in tried if possible(float(f))), None)
-    if lower is None:
-        return None
-    upper = (
-        spec.bandwidth_hz if lower == low else float(min([f for f in tried if f > lower], default=spec.bandwidth_hz))
-    )
+    tried = [low, *np.geomspace(low, asked, PROBES + 2)[-2:0:-1]] if low < asked else []
+    first = next((k for k, f in enumerate(tried) if possible(float(f))), None)
+    if first is None:
+        return None, None
+    lower, upper = tried[first], tried[first - 1] if first > 1 else asked
     while upper / lower > 1.0 + FINEST:
         middle = float(np.sqrt(lower * upper))
         lower, upper = (middle, upper) if possible(middle) else (lower, middle)
-    return float(lower)
+    return float(lower), near[-1]
+
+
+def _possible(task: Task, x: Point, *, near: bool) -> Point | None:
+    """Return numbers that keep all limits on the frequencies looked at, if found: from x first, then from anywhere.
+
+    Near a bandwidth that is possible what x misses clearly is not looked for anywhere else.
+    """
+    grid = task.grid(frequencies(task))
+    x = task.tidy(x)
+    if task.stable(x):
+        x = polished(task, grid, x)
+        usage, _ = task.rank(grid, x)
+        if usage == 0.0 or (near and usage > OUT_OF_REACH):
+            return x if usage == 0.0 else None
+    found = best(task, grid, [x])
+    return found if task.rank(grid, found)[0] == 0.0 else None
 
 
 def controller_of(
