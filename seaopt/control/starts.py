@@ -65,7 +65,7 @@ def at_rest(task: Task) -> Point:
 
 
 def _alike(task: Task, x: Point, other: Point) -> bool:
-    """Tell whether two starts lead to the same place: valleys differ by notch, observer or integral, if there is one."""
+    """Tell whether two starts lead to the same place: valleys differ by notch, observer or integral."""
     apart = np.abs(np.log((x + 1e-4) / (other + 1e-4)))
     if task.spec.notch is not None:
         apart = apart[5:]
