@@ -3,24 +3,23 @@ r"""The closed loop of a digital controller and a sampled plant, and the figures
 With :math:`L = C_y P z^{-d}`: :math:`S = 1/(1+L)`, :math:`T_r = P z^{-d} C_r / (1 + L)` from reference to force,
 :math:`C_y S` from sensor noise to motor force. Stability is decided by the eigenvalues of plant, hold, delay and
 controller together, never by a frequency grid; an unstable loop has no margins (zero) and infinite peaks. Peaks and
-crossings are bracketed on a grid that resolves every pole of plant and loop, then refined to rounding.
+crossings come from the eigenvalues of level sets (`response`, `peaks`), so that none is missed, however narrow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.digital import DigitalPlant
 from seaopt.control.law import TransferFunction
+from seaopt.control.peaks import HALF_POWER, TRACKING, Measured, measured
+from seaopt.control.response import ClosedLoop, close
 
-HALF_POWER = 1.0 / np.sqrt(2.0)
 LOWEST_HZ = 1e-3
-Curve = Callable[[Float[np.ndarray, " m"]], Float[np.ndarray, " m"]]
+STABLE = 1.0 - 1e-11  # a spectral radius nearer to 1 is 1 to rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,18 +99,13 @@ class Loop:
         """Return -F_m/noise = C_y S."""
         return self.measurement.response(f, self.plant.sample_time_s) * self.sensitivity(f)
 
+    def system(self) -> ClosedLoop:
+        """Return plant, hold, delay and controller as one system."""
+        return close(self.plant.delayed(), self.reference, self.measurement)
+
     def eigenvalues(self) -> Complex[np.ndarray, " n"]:
         """Return the closed loop's eigenvalues."""
-        a, b, c, d = self.plant.delayed()
-        ac, bc, cc, dc = self.measurement.state_space()
-        loop = 1.0 / (1.0 + d * dc)
-        n, m = b.size, bc.size
-        closed = np.zeros((n + m, n + m))
-        closed[:n, :n] = a - np.outer(b, c) * dc * loop
-        closed[:n, n:] = -np.outer(b, cc) * loop
-        closed[n:, :n] = np.outer(bc, c) * loop
-        closed[n:, n:] = ac - np.outer(bc, cc) * d * loop
-        return np.linalg.eigvals(closed).astype(complex)
+        return self.system().poles
 
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
@@ -127,102 +121,58 @@ class Loop:
 
     def figures(self) -> LoopFigures:
         """Return the loop's figures."""
-        radius = float(np.max(np.abs(self.eigenvalues())))
-        if radius >= 1.0:
+        system = self.system()
+        radius = float(np.max(np.abs(system.poles), initial=0.0))
+        if not radius < STABLE:
             return LoopFigures(
                 stable=False, spectral_radius=radius, bandwidth_hz=None, tracking_band_hz=None, crossover_hz=None,
                 sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
                 gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0, disk_margin=0.0, noise_gain=np.inf,
             )  # fmt: skip
-        f = self.grid()
-
-        def tracking(x: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-            return np.abs(self.tracking(x))
-
-        static = float(tracking(f[:1])[0])
-        ms_hz, ms = peak(lambda x: np.abs(self.sensitivity(x)), f)
-        _, mt = peak(lambda x: np.abs(self.open_loop(x) * self.sensitivity(x)), f)
-        _, skew = peak(lambda x: np.abs(2.0 * self.sensitivity(x) - 1.0), f)
-        crossovers = crossings(lambda x: np.abs(self.open_loop(x)) - 1.0, f)
-        phase, delay = self._phase_margins(crossovers)
-        below = crossings(lambda x: tracking(x) - HALF_POWER * static, f)
-        slow = crossings(lambda x: np.abs(self.sensitivity(x)) - HALF_POWER, f)
-        quiet = float(np.abs(self.sensitivity(f[:1]))[0]) < HALF_POWER
+        found = measured(system)
+        per_hz = 2 * np.pi * self.plant.sample_time_s
+        (ms, mt, skew, noise, reference), ms_at = found.peaks, found.at[0]
+        phase, delay = _phase_margins(found)
+        crossovers, slow, below = found.crossovers, found.sensitivity_edges, found.bandwidth_edges
+        quiet = abs(found.ends[0, 0]) < HALF_POWER
+        band = _tracking_band(system, found.band_edges)
         return LoopFigures(
             stable=True,
             spectral_radius=radius,
-            bandwidth_hz=float(below[0]) if below.size else None,
-            tracking_band_hz=self._tracking_band(f),
-            crossover_hz=float(crossovers[-1]) if crossovers.size else None,
-            sensitivity_bandwidth_hz=(float(slow[0]) if slow.size else self.plant.nyquist_hz) if quiet else 0.0,
-            ms=ms,
-            mt=mt,
-            ms_hz=ms_hz,
-            reference_peak=peak(tracking, f)[1] / static,
-            gain_margin_db=self._gain_margin(f),
+            bandwidth_hz=float(below[0]) / per_hz if below.size else None,
+            tracking_band_hz=None if band is None else (band[0] / per_hz, band[1] / per_hz),
+            crossover_hz=float(crossovers[-1]) / per_hz if crossovers.size else None,
+            sensitivity_bandwidth_hz=float(slow[0] if slow.size else np.pi) / per_hz if quiet else 0.0,
+            ms=float(ms),
+            mt=float(mt),
+            ms_hz=float(ms_at) / per_hz,
+            reference_peak=float(reference) / found.static if found.static else np.inf,
+            gain_margin_db=_gain_margin(found),
             phase_margin_deg=phase,
-            delay_margin_s=delay,
-            disk_margin=2.0 / skew,
-            noise_gain=peak(lambda x: np.abs(self.noise(x)), f)[1],
+            delay_margin_s=None if delay is None else delay * self.plant.sample_time_s,
+            disk_margin=2.0 / float(skew),
+            noise_gain=float(noise),
         )
 
-    def _gain_margin(self, f: Float[np.ndarray, " m"]) -> float | None:
-        at = crossings(lambda x: np.imag(self.open_loop(x)), f)
-        ends = np.array([LOWEST_HZ * 1e-3, self.plant.nyquist_hz])  # where L is real, unless it integrates
-        values: Any = self.open_loop(np.concatenate([at, ends]))
-        real = np.abs(values.imag) <= 1e-6 * np.abs(values.real)
-        negative = values.real[real & (values.real < 0.0)]
-        return float(np.min(np.abs(20.0 * np.log10(-negative)))) if negative.size else None
 
-    def _phase_margins(self, crossovers: Float[np.ndarray, " k"]) -> tuple[float | None, float | None]:
-        if not crossovers.size:
-            return None, None
-        angle = np.angle(-self.open_loop(crossovers))
-        lag = np.mod(angle, 2 * np.pi)
-        return float(np.degrees(np.min(np.abs(angle)))), float(np.min(lag / (2 * np.pi * crossovers)))
-
-    def _tracking_band(self, f: Float[np.ndarray, " m"]) -> tuple[float, float] | None:
-        def outside(x: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-            return np.abs(np.log(np.abs(self.tracking(x)))) - np.log(np.sqrt(2.0))
-
-        edges = np.concatenate([[0.0], crossings(outside, f), [self.plant.nyquist_hz]])
-        middles = np.maximum(0.5 * (edges[:-1] + edges[1:]), LOWEST_HZ)
-        inside = outside(middles) < 0.0
-        if not np.any(inside):
-            return None
-        widths = np.where(inside, np.diff(edges), -1.0)
-        best = int(np.argmax(widths))
-        return float(edges[best]), float(edges[best + 1])
+def _gain_margin(found: Measured) -> float | None:
+    factors = found.gain_factors
+    return float(np.min(np.abs(20.0 * np.log10(factors)))) if factors.size else None
 
 
-def peak(curve: Curve, f: Float[np.ndarray, " m"]) -> tuple[float, float]:
-    """Return where a curve is largest and its value there, each local maximum near the top refined by zooming."""
-    values = curve(f)
-    inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
-    candidates = [i for i in inner if values[i] > 0.5 * values.max()]
-    best = int(np.argmax(values))
-    at, top = float(f[best]), float(values[best])
-    for i in candidates:
-        low, high = f[i - 1], f[i + 1]
-        for _ in range(6):
-            x = np.linspace(low, high, 15)
-            y = curve(x)
-            k = int(np.clip(np.argmax(y), 1, x.size - 2))
-            low, high = x[k - 1], x[k + 1]
-            if y.max() > top:
-                at, top = float(x[np.argmax(y)]), float(y.max())
-    return at, top
+def _phase_margins(found: Measured) -> tuple[float | None, float | None]:
+    """Return the least phase (deg, of either sign) and the least delay (samples) that put L through -1."""
+    if not found.crossovers.size:
+        return None, None
+    angle = found.crossover_phases
+    return float(np.degrees(np.min(np.abs(angle)))), float(np.min(np.mod(angle, 2 * np.pi) / found.crossovers))
 
 
-def crossings(curve: Curve, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " k"]:
-    """Return the zeros of a curve between grid points of opposite sign, by bisection, ascending."""
-    values = curve(f)
-    index = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
-    low, high, left = f[index], f[index + 1], np.sign(values[index])
-    if not index.size:
-        return low
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        same = np.sign(curve(middle)) == left
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return 0.5 * (low + high)
+def _tracking_band(system: ClosedLoop, inner: Float[np.ndarray, " k"]) -> tuple[float, float] | None:
+    edges = np.concatenate([[0.0], inner, [np.pi]])
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    inside = np.abs(np.log(np.abs(system.curves(middles)[TRACKING]))) < -np.log(HALF_POWER)
+    if not np.any(inside):
+        return None
+    best = int(np.argmax(np.where(inside, np.diff(edges), -1.0)))
+    return float(edges[best]), float(edges[best + 1])

@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, current_per_force, sample
-from seaopt.control.loop import crossings, peak
+from seaopt.control.response import bracketed
 
 
 def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains):
@@ -79,7 +79,7 @@ def test_figures_by_an_independent_calculation(structure, name, delay, request, 
     assert figures.ms == pytest.approx(np.abs(s).max(), rel=1e-4)
     assert figures.mt == pytest.approx(np.abs(open_loop * s).max(), rel=1e-4)
     assert figures.noise_gain == pytest.approx(np.abs(noise).max(), rel=1e-4)
-    static = abs(tracking[0])
+    static = abs(independent(loop, np.array([1e-5]))[1][0])
     assert figures.reference_peak == pytest.approx(np.abs(tracking).max() / static, rel=1e-4)
     below = f[np.flatnonzero(np.abs(tracking) < static / np.sqrt(2))[0]]
     assert figures.bandwidth_hz == pytest.approx(below, rel=1e-3)
@@ -175,8 +175,12 @@ def test_margins_scale_as_they_must(factor, extra):
     assert late.delay_margin_s == pytest.approx(base.figures().delay_margin_s - extra * 1e-3, abs=1e-8)
 
 
-def test_peak_and_crossings_on_hand_curves():
-    f = np.linspace(0, 10, 101)
-    at, top = peak(lambda x: 1 / (1 + (x - 3.1416) ** 2), f)
-    assert (at, top) == (pytest.approx(3.1416, abs=1e-5), pytest.approx(1.0))
-    np.testing.assert_allclose(crossings(lambda x: (x - 2.345) * (x - 7.1), f), [2.345, 7.1], rtol=1e-9)
+def test_zeros_in_brackets_are_found_to_rounding():
+    roots = np.array([2.345, 7.1, 1e-3, 0.0])
+
+    def curve(x, i):
+        return (x - roots[i]) * (1 + x**2)
+
+    low, high, every = roots - 0.7, roots + 1.9, np.arange(4)
+    found = bracketed(curve, low, high, curve(low, every), curve(high, every), 1e-15)
+    np.testing.assert_allclose(found, roots, rtol=1e-12, atol=1e-15)
