@@ -58,7 +58,8 @@ class Controller:
     blocked_by : tuple of str
         The limits that are broken, each with its figure.
     largest_bandwidth_hz : float or None
-        Where it is not feasible: the largest bandwidth in the specification's range that keeps the limits, if any.
+        Where it is not feasible: the largest bandwidth in the specification's range that keeps the limits, 0 if none
+        was found; None where none was looked for.
 
     """
 
@@ -87,6 +88,8 @@ class Controller:
         blocked = " and ".join(self.blocked_by or self.active_constraints)
         asked, low = self.spec.bandwidth_hz, self.spec.bandwidth_range_hz[0]
         if self.largest_bandwidth_hz is None:
+            return f"{asked:g} Hz is blocked by {blocked}"
+        if self.largest_bandwidth_hz == 0.0:
             remedy = f"no bandwidth from {low:g} Hz up was found that keeps these limits"
         else:
             remedy = f"with these limits {self.largest_bandwidth_hz:.4g} Hz is possible"

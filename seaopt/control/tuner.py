@@ -23,6 +23,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex
 
+from seaopt.control.bounds import check_current, check_delay
 from seaopt.control.controller import Controller
 from seaopt.control.convex import improved
 from seaopt.control.digital import sample
@@ -97,8 +98,8 @@ def tune(
     Raises
     ------
     ControlError
-        The measured output does not respond to the motor at 0 Hz, the plant is unstable without control, or a draw
-        names a parameter that no plant has.
+        The measured output does not respond to the motor at 0 Hz, the plant is unstable without control, a draw names
+        a parameter that no plant has, or delay or current limit rule the request out for every controller.
 
     Examples
     --------
@@ -110,6 +111,10 @@ def tune(
 
     """
     task = make_task(plant, params, spec, robust_to or {}, draws)
+    check_delay(spec, task.plants[0])
+    values = plant.complete(params)
+    friction = values["f_c"].value if "f_c" in values else 0.0
+    check_current(spec, task.k_ff, current_per_force(plant, params), friction)
     x, figures = solved(task)
     largest = None
     if broken(spec, task.names, figures):
@@ -228,8 +233,8 @@ def _missed(task: Task, x: Point, grid: Grid) -> np.ndarray:
     return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
 
 
-def largest_bandwidth(task: Task, x: Point) -> tuple[float | None, Point | None]:
-    """Return the largest bandwidth in the specification's range that keeps the limits, if any, and its numbers.
+def largest_bandwidth(task: Task, x: Point) -> tuple[float, Point | None]:
+    """Return the largest bandwidth in range that keeps the limits, and its numbers; 0 and None if there is none.
 
     Found by bisection from the bandwidth asked, which does not keep them, towards the lowest; if that does not either,
     a few others are tried first. It is right to a hundredth, if limits that can be kept at one bandwidth can be kept
@@ -249,7 +254,7 @@ def largest_bandwidth(task: Task, x: Point) -> tuple[float | None, Point | None]
     tried = [low, *np.geomspace(low, asked, PROBES + 2)[-2:0:-1]] if low < asked else []
     first = next((k for k, f in enumerate(tried) if possible(float(f))), None)
     if first is None:
-        return None, None
+        return 0.0, None
     lower, upper = tried[first], tried[first - 1] if first > 1 else asked
     while upper / lower > 1.0 + FINEST:
         middle = float(np.sqrt(lower * upper))

@@ -1,6 +1,6 @@
 """Figures and the HTML report."""
 
 from seaopt.reporting.comparison import experiment_survey
-from seaopt.reporting.report import verdict, write_frequency_figure, write_report
+from seaopt.reporting.report import verdict, write_frequency_figure, write_frontier_figure, write_report
 
-__all__ = ["experiment_survey", "verdict", "write_frequency_figure", "write_report"]
+__all__ = ["experiment_survey", "verdict", "write_frequency_figure", "write_frontier_figure", "write_report"]
