@@ -88,10 +88,11 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
         low, high = (
             (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
         )  # fmt: skip
+    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with delay_samples = {spec.delay_samples}"
     raise ControlError(
-        f"bandwidth_hz = {spec.bandwidth_hz:g} with delay_samples = {spec.delay_samples} at {spec.sample_rate_hz:g} Hz: no "
-        f"controller keeps |S| below -3 dB up to {wanted:.4g} Hz with max_sensitivity = {ms:g}; the delay allows at "
-        f"most {low:.3g} Hz, so lower bandwidth_hz or min_sensitivity_bandwidth_hz, or the delay"
+        f"{asked} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "
+        f"max_sensitivity = {ms:g}; the delay allows at most {low:.3g} Hz, so lower bandwidth_hz or "
+        "min_sensitivity_bandwidth_hz, or the delay"
     )
 
 

@@ -70,7 +70,7 @@ def _alike(task: Task, x: Point, other: Point) -> bool:
     if task.spec.notch is not None:
         apart = apart[5:]
     elif task.nominal is not None:
-        apart = apart[4]
+        apart = apart[[1, 4]]
     elif task.spec.structure == "pid":
         apart = apart[1]
     return bool(np.max(apart) < 0.4)
@@ -140,7 +140,7 @@ def _gains(task: Task, grid: Grid, at: int, rate: float) -> tuple[Float[np.ndarr
         return k_d, np.zeros(1)
     slowest = 1.3 * INTEGRAL_RAD_S * (1 + np.array([0.1, 1.0]) * inverse)
     k_i = np.append(slowest, max(0.05 * 2 * np.pi * task.spec.bandwidth_hz * inverse, 2.0 * slowest[1]))
-    return k_d, k_i if task.nominal is None else np.array([0.0, k_i[1]])
+    return k_d, k_i if task.nominal is None else np.array([0.0, k_i[2]])
 
 
 def _proportional(

@@ -39,7 +39,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
-STARTS = 3  # one more where an observer or a notch makes more valleys
+STARTS = 3  # two more where an observer or a notch makes more valleys
 POLISHED = 2  # of them; one more there too
 RECHECKS = 3
 FINEST = 0.01  # of the largest bandwidth
@@ -210,7 +210,7 @@ def best(task: Task, grid: Grid, warm: Sequence[Point] = ()) -> Point:
     """Return the best numbers on a grid."""
     more = task.nominal is not None or task.spec.notch is not None
     given = [task.tidy(x) for x in warm]
-    first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + more - bool(given))
+    first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + 2 * more - bool(given))
     ranked = sorted((improved(task, grid, x) for x in first), key=lambda item: item[0])
     chosen: list[Point] = []
     for _, x in ranked:
