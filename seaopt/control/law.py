@@ -132,7 +132,7 @@ class Nominal:
         lead = int(np.argmax(np.abs(b) > 1e-9 * np.max(np.abs(b))))
         zeros = np.roots(b[lead:]).astype(complex)
         inverted = (np.abs(zeros) < LARGEST_INVERTED) & (np.real(zeros) > 0.0)
-        stable, left = (np.real(np.poly(group)) for group in (zeros[inverted], zeros[~inverted]))
+        stable, left = (np.atleast_1d(np.real(np.poly(group))) for group in (zeros[inverted], zeros[~inverted]))
         return cls(
             kept=np.concatenate([np.zeros(lead + plant.delay_samples), left / np.sum(left)]),
             inverse=TransferFunction(num=a / (b[lead] * np.sum(left)), den=stable),

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.task import HIGHEST_NOTCH, INTEGRAL_RAD_S, Grid, Point, Task, light_modes
+from seaopt.control.task import HIGHEST_NOTCH, INTEGRAL_RAD_S, LOWEST_NOTCH, Grid, Point, Task, light_modes
 
 RATES = 24  # values of k_d
 COARSE = 90  # frequencies
@@ -108,7 +108,12 @@ def _notches(task: Task) -> list[tuple[float, float, float]]:
     centres = np.minimum(np.unique(np.round([*modes, 1.5 * f_b, 3.0 * f_b], 1)), HIGHEST_NOTCH / ts)
     shapes = ((0.2, 0.1), (0.6, 0.1), (0.6, 0.4))
     w = np.tan(np.pi * centres * ts)
-    return [(float(w[-1]), 0.5, 1.0), *((float(one), width, depth) for one in w for width, depth in shapes)]
+    least = float(np.tan(np.pi * min(LOWEST_NOTCH * f_b, HIGHEST_NOTCH / ts) * ts))
+    return [
+        (float(w[-1]), 0.5, 1.0),
+        (least, 0.05, 0.05),
+        *((float(one), width, depth) for one in w for width, depth in shapes),
+    ]
 
 
 def _ranked(
