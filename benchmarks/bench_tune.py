@@ -67,25 +67,24 @@ class Judge:
         gain = current_per_force(case.plants[0], case.params)
         self.held = [self.hold(plant.linearize(case.params), gain) for plant in case.plants]
         nyquist = 0.5 / self.ts
-        f = [np.geomspace(LOWEST_HZ, 0.9999 * nyquist, 500), np.linspace(0.5, 1.5, 40) * spec.bandwidth_hz]
+        f = [np.geomspace(1e-3, LOWEST_HZ, 60)[:-1], np.geomspace(LOWEST_HZ, 0.9999 * nyquist, 500)]
+        f.append(np.linspace(0.5, 1.5, 40) * spec.bandwidth_hz)
         for a, *_ in self.held:
             poles = np.log(np.linalg.eigvals(a).astype(complex)) / self.ts
             for pole in poles[(poles.imag > 0) & (-poles.real < 0.3 * np.abs(poles))]:
                 width = max(-pole.real, 1e-3 * abs(pole)) / (2 * np.pi)
                 f.append(abs(pole) / (2 * np.pi) + width * np.linspace(-4, 4, 41))
         f = np.unique(np.concatenate([*f, [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz]]))
-        self.f = f[(f >= LOWEST_HZ) & (f < nyquist)]
+        self.f = f[(f >= 1e-3) & (f < nyquist)]
         self.q = np.exp(-2j * np.pi * self.f * self.ts)
         self.p = [self.response(held) for held in self.held]
         self.at = int(np.argmin(np.abs(self.f - spec.bandwidth_hz)))
         a, b, c = self.held[0]
         self.k_ff = 1.0 / float(c @ np.linalg.solve(np.eye(a.shape[0]) - a, b))
-        inside = self.f <= spec.bandwidth_hz
+        inside = np.flatnonzero((self.f >= LOWEST_HZ) & (self.f <= spec.bandwidth_hz))
         self.weights = np.zeros(self.f.size)
-        logs = np.log(self.f[inside])
-        self.weights[inside] = np.gradient(logs)
-        self.weights[0] *= 0.5
-        self.weights[np.count_nonzero(inside) - 1] *= 0.5
+        self.weights[inside] = np.gradient(np.log(self.f[inside]))
+        self.weights[inside[[0, -1]]] *= 0.5
         observer = controller.observer
         if observer is not None:
             polynomial = np.polynomial.polynomial.polyval

@@ -19,7 +19,16 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.task import HIGHEST_NOTCH, INTEGRAL_RAD_S, LOWEST_NOTCH, Grid, Point, Task, light_modes
+from seaopt.control.task import (
+    HIGHEST_NOTCH,
+    INTEGRAL_RAD_S,
+    LOWEST_NOTCH,
+    OBJECTIVE_HZ,
+    Grid,
+    Point,
+    Task,
+    light_modes,
+)
 
 RATES = 24  # values of k_d
 COARSE = 90  # frequencies
@@ -80,7 +89,7 @@ def _coarse(task: Task, grid: Grid) -> Grid:
     """Return about COARSE of the grid's frequencies, the bandwidth and the plants' light modes among them."""
     wanted = [task.spec.bandwidth_hz, *(f for plant in task.plants[:SCANNED_PLANTS] for f, _ in light_modes(plant))]
     near = [int(np.argmin(np.abs(grid.f - f))) for f in wanted]
-    even = np.searchsorted(grid.f, np.geomspace(grid.f[0] * 3, grid.f[-1], COARSE))
+    even = np.searchsorted(grid.f, np.geomspace(OBJECTIVE_HZ, grid.f[-1], COARSE))
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
     return Grid(f=coarse.f, q=coarse.q, p=coarse.p[:SCANNED_PLANTS], kept=coarse.kept, inverse=coarse.inverse)

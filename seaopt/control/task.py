@@ -26,9 +26,11 @@ from seaopt.control.law import Gains, Nominal, Notch, Observer, Terms, terms
 from seaopt.control.loop import Loop
 from seaopt.control.spec import ControllerSpec
 
-LOWEST_HZ = 0.1
+LOWEST_HZ = 1e-3  # limits are kept from here
+OBJECTIVE_HZ = 0.1  # disturbances count from here
 INTEGRAL_RAD_S = 2 * np.pi * 0.05  # k_i / (1 + k_p) at least, so that the integral does something
 FREQUENCIES = 300
+SLOW = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
 LIGHT = 0.2  # damping ratio below which a mode is resolved
 NO_RATE = 1e-3  # rad/s
@@ -220,11 +222,11 @@ class Task:
         return f < 0.97 * self.spec.bandwidth_hz
 
     def weights(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return trapezoidal weights over ln f from the first frequency to the bandwidth."""
-        inside = int(np.searchsorted(f, self.spec.bandwidth_hz * (1 + 1e-9)))
-        out, step = np.zeros(f.size), 0.5 * np.diff(np.log(f[:inside]))
-        out[: inside - 1] += step
-        out[1:inside] += step
+        """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
+        first, last = np.searchsorted(f, [OBJECTIVE_HZ * (1 - 1e-9), self.spec.bandwidth_hz * (1 + 1e-9)])
+        out, step = np.zeros(f.size), 0.5 * np.diff(np.log(f[first:last]))
+        out[first : last - 1] += step
+        out[first + 1 : last] += step
         return out
 
     def miss(self, grid: Grid, x: Point) -> float:
@@ -263,7 +265,7 @@ def light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
 
 
 def frequencies(task: Task) -> Float[np.ndarray, " m"]:
-    """Return a logarithmic grid from 0.1 Hz to the Nyquist frequency, with f_b and f_s in it.
+    """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with 0.1 Hz, f_b and f_s in it.
 
     About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
     what falls between is found afterwards.
@@ -275,8 +277,8 @@ def frequencies(task: Task) -> Float[np.ndarray, " m"]:
         near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
     extra = np.sort(np.concatenate([np.zeros(0), *near]))
     extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
-    base = np.geomspace(LOWEST_HZ, 0.999 * nyquist, FREQUENCIES)
-    grid = np.unique(np.concatenate([base, extra, [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz]]))
+    slow, base = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW), np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
+    grid = np.unique(np.concatenate([slow[:-1], base, extra, [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz]]))
     return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
 
 

@@ -32,7 +32,7 @@ from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.polish import polished
 from seaopt.control.spec import ControllerSpec
 from seaopt.control.starts import starts
-from seaopt.control.task import LOWEST_HZ, Grid, Point, Task, frequencies
+from seaopt.control.task import LOWEST_HZ, OBJECTIVE_HZ, Grid, Point, Task, frequencies
 from seaopt.control.verdict import BANDWIDTH_TOLERANCE as BANDWIDTH_TOLERANCE
 from seaopt.control.verdict import active, broken, explained
 from seaopt.errors import ControlError, suggestion
@@ -307,6 +307,6 @@ def controller_of(
 
 def disturbance(loop: Loop, bandwidth_hz: float) -> float:
     """Return the integral over ln f of abs(S) from 0.1 Hz to the bandwidth."""
-    f = np.geomspace(LOWEST_HZ, bandwidth_hz, 2000)
+    f = np.geomspace(OBJECTIVE_HZ, bandwidth_hz, 2000)
     s: Complex[np.ndarray, " m"] = loop.sensitivity(f)
     return float(np.trapezoid(np.abs(s), np.log(f)))
