@@ -151,7 +151,8 @@ def thor_frontiers() -> dict[str, Frontier]:
     for name, ((plant, others), notch) in asked.items():
         spec = so.ControllerSpec(notch=notch, **limits)
         params = plant.complete(so.plants.thor())
-        found[name] = sweep(plant, params, spec, np.arange(15.0, 61.0, 5.0), {k: (p, params) for k, p in others.items()})
+        robust_to = {key: (other, params) for key, other in others.items()}
+        found[name] = sweep(plant, params, spec, list(np.arange(15.0, 61.0, 5.0)), robust_to)
     return found
 
 
