@@ -40,7 +40,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
 STARTS = 3  # two more where an observer or a notch makes more valleys
-POLISHED = 2  # of them; one more there too
+POLISHED = 2  # of them; one more with an observer, all with a notch
 RECHECKS = 3
 FINEST = 0.01  # of the largest bandwidth
 OUT_OF_REACH = 1.03  # usage
@@ -212,9 +212,10 @@ def best(task: Task, grid: Grid, warm: Sequence[Point] = ()) -> Point:
     given = [task.tidy(x) for x in warm]
     first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + 2 * more - bool(given))
     ranked = sorted((improved(task, grid, x) for x in first), key=lambda item: item[0])
+    polish = len(ranked) if task.spec.notch is not None else POLISHED + more
     chosen: list[Point] = []
     for _, x in ranked:
-        if len(chosen) < POLISHED + more and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
+        if len(chosen) < polish and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
     return min((polished(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
 
