@@ -10,7 +10,19 @@ from matplotlib.figure import Figure
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
-from seaopt.control import Gains, MPCSpec, NoiseModel, close_loop, current_per_force, estimator, force_mpc, sample
+from seaopt.control import (
+    Frontier,
+    Gains,
+    MPCSpec,
+    NoiseModel,
+    Notch,
+    close_loop,
+    current_per_force,
+    estimator,
+    force_mpc,
+    sample,
+    sweep,
+)
 from seaopt.control.passivity import held, port_of
 from seaopt.control.realisation import realise, runnable
 from seaopt.estimation import Limits, design_experiment
@@ -263,6 +275,40 @@ def predictive_control() -> None:
     save(figure, "mpc")
 
 
+def thor_frontiers() -> dict[str, Frontier]:
+    """Sweep THOR's bandwidth at Ms 1.6, the swinging output in robust_to, as it is and with the screw's mode."""
+    limits = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
+    mode = {"parts": ("screw_mode",)}
+    stiff = (so.plants.high_impedance(), {"swing": so.plants.moving_output()})
+    soft = (
+        so.plants.high_impedance(**mode),
+        {"swing with mode": so.plants.moving_output(**mode), "stiff stand": stiff[0], "stiff swing": stiff[1]["swing"]},
+    )
+    asked = {"no mode": (stiff, None), "80 Hz mode": (soft, None), "80 Hz mode, notch": (soft, Notch())}
+    found = {}
+    for name, ((plant, others), notch) in asked.items():
+        spec = so.ControllerSpec(notch=notch, **limits)
+        params = plant.complete(so.plants.thor())
+        robust_to = {key: (other, params) for key, other in others.items()}
+        found[name] = sweep(plant, params, spec, list(np.arange(15.0, 61.0, 5.0)), robust_to)
+    return found
+
+
+def tuning() -> None:
+    figure, axes = new(["noise gain [N/N]", "largest Ms", "disturbance"], "", "bandwidth [Hz]")
+    for (name, found), colour in zip(thor_frontiers().items(), ("#0072b2", "#d55e00", "#009e73"), strict=True):
+        f = [row.bandwidth_hz for row in found.rows]
+        for axis, figure_of in zip(axes, ("noise_gain", "ms", "disturbance"), strict=True):
+            values = [getattr(row, figure_of) for row in found.rows]
+            axis.plot(f, values, color=colour, linewidth=1.0, label=name)
+            for x, y, row in zip(f, values, found.rows, strict=True):
+                axis.plot(x, y, "o", color=colour, markersize=4, markerfacecolor=colour if row.feasible else "white")
+        print(name)  # noqa: T201
+        print(found)  # noqa: T201
+    axes[0].legend(frameon=False, fontsize="x-small")
+    save(figure, "tuning")
+
+
 if __name__ == "__main__":
     force_responses(so.plants.high_impedance, "high_impedance")
     force_responses(so.plants.moving_output, "moving_output")
@@ -275,3 +321,4 @@ if __name__ == "__main__":
     state_estimator()
     predictive_control()
     verification()
+    tuning()

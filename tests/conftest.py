@@ -25,7 +25,7 @@ CHOICES = (
     ("zero", "first"),
     ("split", "error"),
     ("auto", "declared", "none"),
-    ("pd", "pid"),
+    ("pd", "pid", "pid_dob"),
     ("error", "measurement"),
     ("disturbance", "noise"),
 )

@@ -137,6 +137,28 @@ def inspect(
     )  # fmt: skip
 
 
+@app.command()
+def tune(
+    problem: ProblemFile,
+    output: Folder = Path("out"),
+    json: Json = False,
+    sweep: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW:HIGH:STEP", help="Tune at each bandwidth (Hz) instead; write frontier.json and figure."
+        ),
+    ] = None,
+) -> None:
+    """Tune the controller with the fit in DIR; write controller.json."""
+    from seaopt.cli.frontier import bandwidths
+    from seaopt.cli.session import Session
+
+    stage = "tune" if sweep is None else "sweep"
+    session = Session(problem, output, bandwidths_hz=() if sweep is None else bandwidths(sweep))
+    session.run(stage)
+    _finish(session, json, [stage])
+
+
 def _stage(name: str, text: str) -> Callable[..., None]:
     def command(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
         from seaopt.cli.session import Session
@@ -151,7 +173,6 @@ def _stage(name: str, text: str) -> Callable[..., None]:
 
 for _name, _text in (
     ("fit", "Fit the parameters to the logs; write fit.json."),
-    ("tune", "Tune the controller with the fit in DIR; write controller.json."),
     ("certify", "Certify the controller in DIR; write robustness.json."),
     ("report", "Write report.html and figures from the results in DIR."),
 ):

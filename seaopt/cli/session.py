@@ -15,15 +15,16 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from seaopt.cli.frontier import show_frontier
 from seaopt.cli.responses import responses
-from seaopt.control import Controller, tune
+from seaopt.control import Controller, sweep, tune
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, fit
 from seaopt.files import read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.problem import Problem, read_problem
-from seaopt.reporting import verdict, write_report
+from seaopt.reporting import verdict, write_frontier_figure, write_report
 from seaopt.robustness import Certificate, certify
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
@@ -32,14 +33,22 @@ SCHEMAS = {
     "fit": "seaopt/fit/1",
     "frf": "seaopt/frf/1",
     "tune": "seaopt/controller/1",
+    "sweep": "seaopt/frontier/1",
     "certify": "seaopt/robustness/1",
 }
-FILES = {"fit": "fit.json", "frf": "frf.json", "tune": "controller.json", "certify": "robustness.json"}
+FILES = {
+    "fit": "fit.json",
+    "frf": "frf.json",
+    "tune": "controller.json",
+    "sweep": "frontier.json",
+    "certify": "robustness.json",
+}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",
     "fit": "fitting the logs",
     "tune": "tuning the controller",
+    "sweep": "tuning at every bandwidth",
     "certify": "certifying",
     "report": "writing the report",
 }
@@ -53,7 +62,9 @@ def digest(path: Path) -> str:
 class Session:
     """Runs stages for one problem and one folder; later stages read earlier ones' JSON where they did not run."""
 
-    def __init__(self, problem: Path, folder: Path, stretch_s: float | None = None) -> None:
+    def __init__(
+        self, problem: Path, folder: Path, stretch_s: float | None = None, bandwidths_hz: tuple[float, ...] = ()
+    ) -> None:
         if folder.exists() and not folder.is_dir():
             raise ProblemError(f"{folder}: is a file; give a folder for the results with -o")
         self.problem: Problem = read_problem(problem)
@@ -63,6 +74,7 @@ class Session:
             raise ProblemError(f"{folder}: cannot be made ({error.strerror}); give another folder with -o") from error
         self.folder = folder
         self.stretch_s = stretch_s
+        self.bandwidths_hz = bandwidths_hz
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
@@ -91,7 +103,7 @@ class Session:
         """Run one stage and write its result."""
         stages: dict[str, Callable[[Callable[[str], None]], None]] = {
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
-            "report": self._report, "frf": self._frf,
+            "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
         with self._progress(LABELS[stage]) as tell:
             stages[stage](tell)
@@ -164,7 +176,9 @@ class Session:
         """Return digests of the parts of the problem that a stage reads, and of the result before it, by its file."""
         table = self.problem.table.model_dump(mode="json")
         parts = ["parameters", "plant", "experiment", "fit"]
-        earlier = {"fit": None, "frf": None, "tune": "fit.json", "certify": "controller.json"}[stage]
+        earlier = {"fit": None, "frf": None, "tune": "fit.json", "sweep": "fit.json", "certify": "controller.json"}[
+            stage
+        ]
         if stage not in ("fit", "frf"):
             parts += ["controller", "robustness"]
         if earlier == "fit.json" and not self.problem.table.experiment:
@@ -244,9 +258,23 @@ class Session:
         spec = self.problem.spec
         assert spec is not None
         tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
-        result = tune(design, values, spec, self.problem.robust_to(values))
+        draws = self.problem.draws(self.parameters())
+        result = tune(design, values, spec, self.problem.robust_to(values), draws=draws)
         self.results["tune"] = result
         self._write("tune", result.to_dict())
+
+    def _sweep(self, tell: Callable[[str], None]) -> None:
+        design, values = self.problem.design_plant, self.values()
+        spec = self.problem.spec
+        assert spec is not None
+        tell(f"{spec.structure}, {len(self.bandwidths_hz)} bandwidths")
+        result = sweep(
+            design, values, spec, self.bandwidths_hz, self.problem.robust_to(values),
+            draws=self.problem.draws(self.parameters()),
+        )  # fmt: skip
+        self.results["sweep"] = result
+        self._write("sweep", result.to_dict())
+        self.written += write_frontier_figure(result, self.folder / "frontier")
 
     def _certify(self, tell: Callable[[str], None]) -> None:
         controller, source = self.controller(), self.parameters()
@@ -308,6 +336,8 @@ class Session:
         for stage in stages:
             if stage == "frf":
                 self.results[stage].show(console)
+            elif stage == "sweep":
+                show_frontier(self.results[stage], console)
             elif stage in ("fit", "tune", "certify"):
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
         for stage in ["fit", "tune", "certify"] if "report" in stages else stages:

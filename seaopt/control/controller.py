@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.control.digital import DigitalPlant, sample
-from seaopt.control.law import TransferFunction
+from seaopt.control.law import Nominal, Notch, Observer, TransferFunction
 from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.spec import ControllerSpec
 from seaopt.errors import FileError
@@ -18,6 +18,8 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
 SCHEMA = "seaopt/controller/1"
+UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
+CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
@@ -28,7 +30,7 @@ class Controller:
     Parameters
     ----------
     structure : str
-        "pd" or "pid".
+        "pd", "pid" or "pid_dob".
     gains : mapping
         For reading; the law is `reference` and `measurement`.
     sample_time_s : float
@@ -51,6 +53,13 @@ class Controller:
         The plants, besides the design plant, that Ms and Mt were kept on.
     design : (Plant, ParameterSet) or None
         The design plant and its parameters.
+    observer : Observer or None
+        The disturbance observer of a pid_dob, which is in the law already.
+    blocked_by : tuple of str
+        The limits that are broken, each with its figure.
+    largest_bandwidth_hz : float or None
+        Where it is not feasible: the largest bandwidth in the specification's range that keeps the limits, 0 if none
+        was found; None where none was looked for.
 
     """
 
@@ -67,6 +76,31 @@ class Controller:
     active_constraints: tuple[str, ...]
     robust_to: tuple[str, ...] = ()
     design: tuple[Plant, ParameterSet] | None = None
+    observer: Observer | None = None
+    blocked_by: tuple[str, ...] = ()
+    largest_bandwidth_hz: float | None = None
+
+    @property
+    def explanation(self) -> str:
+        """One line: what blocks, and what bandwidth can be had; empty where every limit is met."""
+        if self.feasible:
+            return ""
+        blocked = " and ".join(self.blocked_by or self.active_constraints)
+        asked, low = self.spec.bandwidth_hz, self.spec.bandwidth_range_hz[0]
+        if self.largest_bandwidth_hz is None:
+            return f"{asked:g} Hz is blocked by {blocked}"
+        if self.largest_bandwidth_hz == 0.0:
+            remedy = f"no bandwidth from {low:g} Hz up was found that keeps these limits"
+        else:
+            remedy = f"with these limits {self.largest_bandwidth_hz:.4g} Hz is possible"
+        return f"{asked:g} Hz is blocked by {blocked}; {remedy}"
+
+    @property
+    def engineering(self) -> dict[str, float]:
+        """The gains in the units that a drive is set in: A per N of force error, its integral and its rate."""
+        scale = self.current_per_force_A_per_N
+        names = {"k_p": "k_p_A_per_N", "k_i": "k_i_A_per_Ns", "k_d": "k_d_As_per_N", "k_ff": "k_ff_A_per_N"}
+        return {names[name]: scale * value for name, value in self.gains.items() if name in names}
 
     def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
         """Return a plant as this controller sees it: from motor force, through its own current per force."""
@@ -111,6 +145,25 @@ class Controller:
             "achieved": {name: value for name, value in achieved.items() if name not in _NOT_ACHIEVED},
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
+            "engineering": self.engineering,
+            "observer": self._observer_dict(),
+            "blocked_by": list(self.blocked_by),
+            "largest_bandwidth_hz": self.largest_bandwidth_hz,
+        }
+
+    def _observer_dict(self) -> dict[str, Any] | None:
+        """Return the observer's filters, and what it takes to build it again."""
+        if self.observer is None:
+            return None
+        q, inverse = self.observer.filters(self.sample_time_s)
+        nominal = self.observer.nominal
+        return {
+            "T_q": self.observer.T_q,
+            "bandwidth_hz": self.observer.bandwidth_hz,
+            "Q": {"num": q.num, "den": q.den},
+            "Q_over_P_n": {"num": inverse.num, "den": inverse.den},
+            "kept": nominal.kept,
+            "inverse": {"num": nominal.inverse.num, "den": nominal.inverse.den},
         }
 
     @classmethod
@@ -127,6 +180,8 @@ class Controller:
             given = dict(content["spec"])
             robust_to = tuple(given.pop("robust_to", ()))
             given["bandwidth_range_hz"] = tuple(given["bandwidth_range_hz"])
+            if given.get("notch") is not None:
+                given["notch"] = Notch(**given["notch"])
             law = {
                 name: TransferFunction(
                     num=np.array(content[name]["num"], dtype=float),
@@ -144,13 +199,14 @@ class Controller:
                 reference=law["reference"], measurement=law["measurement"], current_per_force_A_per_N=gain, spec=spec,
                 achieved=Loop(plant=design, **law).figures(), feasible=bool(content["feasible"]),
                 active_constraints=tuple(content["active_constraints"]), robust_to=robust_to, design=(plant, params),
+                observer=_observer(content.get("observer")), blocked_by=tuple(content.get("blocked_by", ())),
+                largest_bandwidth_hz=content.get("largest_bandwidth_hz"),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise FileError(f"controller.json: {error} is missing or malformed; tune again") from error
 
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec
-        gains = ", ".join(f"{name} = {value:.5g}" for name, value in self.gains.items())
         verdict = "every limit met" if self.feasible else "NOT FEASIBLE: " + ", ".join(self.active_constraints)
         band = (
             "none" if a.tracking_band_hz is None else f"{a.tracking_band_hz[0]:.3g} to {a.tracking_band_hz[1]:.4g} Hz"
@@ -159,7 +215,7 @@ class Controller:
             [
                 f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
                 f"delay of {self.delay_samples} sample{'' if self.delay_samples == 1 else 's'}: {verdict}",
-                f"  {gains}",
+                *self._gain_lines(),
                 f"  bandwidth {_shown(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
                 f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
                 f"  gain margin {_shown(a.gain_margin_db)} dB, phase margin {_shown(a.phase_margin_deg)} deg, "
@@ -167,9 +223,24 @@ class Controller:
                 *self._force_lines(),
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
-                else "",
+                else f"  {self.explanation}",
             ]
         ).rstrip()
+
+    def _gain_lines(self) -> list[str]:
+        law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
+        lines = [
+            "  " + ", ".join(f"{name} = {value:.5g} {UNITS[name]}" for name, value in law.items()),
+            "  as current: " + ", ".join(
+                f"{name.split('_A')[0]} = {value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
+            ),
+        ]  # fmt: skip
+        if self.observer is not None:
+            lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
+        if "notch_depth" in self.gains:
+            f, width, depth = (self.gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
+            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}")
+        return lines
 
     def _force_lines(self) -> list[str]:
         slow, fast = self.force_limit(0.01), self.force_limit(self.spec.bandwidth_hz)
@@ -180,6 +251,13 @@ class Controller:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _observer(content: Mapping[str, Any] | None) -> Observer | None:
+    if content is None:
+        return None
+    inverse = TransferFunction(**{name: np.array(content["inverse"][name], dtype=float) for name in ("num", "den")})
+    return Observer(nominal=Nominal(kept=np.array(content["kept"], dtype=float), inverse=inverse), T_q=content["T_q"])
 
 
 def _check(content: Mapping[str, Any], spec: ControllerSpec, law: Mapping[str, TransferFunction]) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
-from seaopt.control.law import Derivative, Structure
-from seaopt.errors import ControlError
+from seaopt.control.law import STRUCTURES, Derivative, Notch, Structure
+from seaopt.errors import ControlError, suggestion
 
 LIMITS = ("max_sensitivity", "max_complementary", "max_reference_peak", "max_noise_gain")
-OPTIONAL = ("min_sensitivity_bandwidth_hz", "current_limit_A")
+OPTIONAL = ("min_disk_margin", "min_sensitivity_bandwidth_hz", "current_limit_A", "step_N")
 MAX_DELAY_SAMPLES = 1000
 
 
@@ -26,8 +26,11 @@ class ControllerSpec:
         Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
     bandwidth_range_hz : (low, high)
         What bandwidth_hz may be; give another range to leave 15 to 60.
-    structure : {"pd", "pid"}
-        Each with feedforward of the reference.
+    structure : {"pd", "pid", "pid_dob"}
+        Each with feedforward of the reference; a pid_dob has a disturbance observer whose nominal plant is the design
+        plant.
+    notch : Notch, optional
+        A notch in series; what its fields leave open is tuned.
     derivative : {"error", "measurement"}
         What is differentiated.
     sample_rate_hz : float
@@ -36,6 +39,8 @@ class ControllerSpec:
         Whole samples from measurement to output, besides the hold.
     max_sensitivity, max_complementary : float, optional
         Ms and Mt, peaks of abs(S) and abs(L/(1+L)), on every plant.
+    min_disk_margin : float, optional
+        Symmetric disk margin, below 2, on every plant.
     max_reference_peak : float, optional
         Peak of abs(F/F_ref) over its static value, design plant.
     max_noise_gain : float, optional
@@ -46,6 +51,8 @@ class ControllerSpec:
         Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
     current_limit_A : float, optional
         Of the motor; it does not shape the gains. The controller says which force it leaves (`force_limit`).
+    step_N : float, optional
+        A step of the reference that the current limit must at least hold.
     reserve : float
         Ms, Mt and the other limits are met with this fraction to spare, so that parameters as uncertain as a fit
         leaves them do not break them.
@@ -61,16 +68,19 @@ class ControllerSpec:
     bandwidth_hz: float = 30.0
     bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
     structure: Structure = "pid"
+    notch: Notch | None = None
     derivative: Derivative = "error"
     sample_rate_hz: float = 1000.0
     delay_samples: int = 1
     max_sensitivity: float | None = None
     max_complementary: float | None = None
+    min_disk_margin: float | None = None
     max_reference_peak: float | None = None
     max_noise_gain: float | None = None
     min_sensitivity_bandwidth_hz: float | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     current_limit_A: float | None = None
+    step_N: float | None = None
     reserve: float = 0.005
 
     def __post_init__(self) -> None:
@@ -83,8 +93,10 @@ class ControllerSpec:
                 f"bandwidth_hz = {self.bandwidth_hz:g} is outside {low:g} to {high:g}; choose one inside, "
                 "or give another bandwidth_range_hz"
             )
-        if self.structure not in ("pd", "pid"):
-            raise ControlError(f'structure = "{self.structure}" is not known; use "pd" or "pid"')
+        if self.structure not in STRUCTURES:
+            raise ControlError(
+                f'structure = "{self.structure}" is not known; {suggestion(str(self.structure), STRUCTURES)}'
+            )
         if self.derivative not in ("error", "measurement"):
             raise ControlError(f'derivative = "{self.derivative}" is not known; use "error" or "measurement"')
         if self.objective not in ("disturbance", "noise"):
@@ -122,10 +134,28 @@ class ControllerSpec:
                 f"min_sensitivity_bandwidth_hz = {wanted:g} is not between 0 and bandwidth_hz = "
                 f"{self.bandwidth_hz:g}; lower it"
             )
+        disk = self.min_disk_margin
+        if disk is not None and not 0.0 < disk < 2.0:
+            raise ControlError(f"min_disk_margin = {disk:g} can be met by no loop; give more than 0 and less than 2")
+        self._check_notch()
+        if self.step_N is not None and not self.step_N > 0.0:
+            raise ControlError(f"step_N = {self.step_N:g} is not positive; give the step's size")
         if self.current_limit_A is not None and not self.current_limit_A > 0.0:
             raise ControlError(f"current_limit_A = {self.current_limit_A:g} is not positive; give the motor's limit")
         if not 0.0 <= self.reserve < 0.5:
             raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
+
+    def _check_notch(self) -> None:
+        if self.notch is None:
+            return
+        if not isinstance(self.notch, Notch):
+            raise ControlError(f"notch = {self.notch!r} is a {type(self.notch).__name__}; give a Notch")
+        top = {"frequency_hz": 0.45 * self.sample_rate_hz, "width": 10.0, "depth": 1.0}
+        for name, value in asdict(self.notch).items():
+            if value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= top[name]:
+                raise ControlError(f"notch.{name} = {value!r} is not above 0 and up to {top[name]:g}")
 
     @property
     def sample_time_s(self) -> float:
@@ -140,4 +170,5 @@ class ControllerSpec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return own | {"notch": None if self.notch is None else asdict(self.notch)}

@@ -12,10 +12,12 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
-from seaopt.control import ControllerSpec
+from seaopt.control import ControllerSpec, Notch
+from seaopt.control import draw as draw_values
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
+    Fit,
     Huber,
     Linear,
     Method,
@@ -122,6 +124,11 @@ class Problem:
                     if corner is not None:
                         out[f"{name}, {parameter} = {end:g}"] = (plant, corner)
         return out
+
+    def draws(self, source: Fit | ParameterSet) -> list[dict[str, float]]:
+        """Return the draws of parameters at which the controller must hold while it is tuned."""
+        count = self.table.controller.draws if self.table.controller else 0
+        return draw_values(source, count, self.robustness.seed, self.ranges) if count else []
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Read the logs, and make the virtual ones.
@@ -442,5 +449,7 @@ def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
 def _spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    given = table.controller.model_dump(exclude={"plant", "robust_to"})
-    return ControllerSpec(**given)
+    given = table.controller.model_dump(exclude={"plant", "robust_to", "draws", "notch"})
+    notch = table.controller.notch
+    tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
+    return ControllerSpec(**given, notch=tuned)

@@ -202,12 +202,21 @@ class FitTable(_Strict):
     holdout: Annotated[Number, Field(ge=0, lt=1)] = 0.0
 
 
+class NotchTable(_Strict):
+    """A notch in series; what is left out is tuned."""
+
+    frequency_hz: Number | None = None
+    width: Number | None = None
+    depth: Number | None = None
+
+
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
     plant: Name
     measured: str = "F1"
-    structure: Literal["pd", "pid"] = "pid"
+    structure: Literal["pd", "pid", "pid_dob"] = "pid"
+    notch: Flag | NotchTable = False
     derivative: Literal["error", "measurement"] = "error"
     bandwidth_hz: Number
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
@@ -215,12 +224,15 @@ class ControllerTable(_Strict):
     delay_samples: Whole = 1
     max_sensitivity: Number | None = None
     max_complementary: Number | None = None
+    min_disk_margin: Number | None = None
     max_reference_peak: Number | None = None
     max_noise_gain: Number | None = None
     min_sensitivity_bandwidth_hz: Number | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     robust_to: list[Name] = []
+    draws: Annotated[Whole, Field(ge=0, le=200)] = 0
     current_limit_A: Number | None = None
+    step_N: Number | None = None
     reserve: Number = 0.005
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import Controller
+from seaopt.control import Controller, Frontier
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.estimation.forecasts import Percent
@@ -153,6 +153,28 @@ def write_frequency_figure(
 
     """
     figure = survey_figure(surveys, given, fitted)
+    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
+
+
+def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
+    """Draw a sweep of bandwidths to SVG and PNG.
+
+    Parameters
+    ----------
+    frontier : Frontier
+        Of `seaopt.control.sweep`.
+    path : path
+        Without suffix; ``.svg`` and ``.png`` are added.
+
+    Returns
+    -------
+    list of Path
+        Both files.
+
+    """
+    from seaopt.reporting.frontier import frontier_figure
+
+    figure = frontier_figure(frontier)
     return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
 
 

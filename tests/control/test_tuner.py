@@ -50,14 +50,14 @@ def test_it_is_as_good_as_a_long_global_search(stand, thor):
     """scipy's differential evolution over the same four numbers, penalised, a hundred times the time."""
     from scipy.optimize import differential_evolution
 
-    from seaopt.control.tuner import _loop, _task, disturbance
+    from seaopt.control.tuner import disturbance, make_task
 
     spec = so.ControllerSpec(structure="pd", bandwidth_hz=30, **{**LIMITS, "max_noise_gain": 25})
-    task = _task(stand, thor, spec, {})
+    task = make_task(stand, thor, spec, {})
 
     def cost(v):
-        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), np.exp(v[2])])
-        loop = _loop(task, x)
+        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), np.exp(v[2]), 1, 1, 1, 1])
+        loop = task.loop(x)
         f = np.geomspace(0.1, 499, 200)
         open_loop, tracking, noise = independent(loop, np.r_[f, 30.0])
         s = 1 / np.abs(1 + open_loop)

@@ -1,0 +1,294 @@
+"""The tuner against a long global search, on random plants and specifications: python benchmarks/bench_tune.py
+
+Each case draws a THOR-like actuator, a structure, limits, a rate and a delay, with or without a swinging output to be
+robust to. scipy's differential evolution then searches the same numbers for about 50 times the tuner's time, with
+the bandwidth met in closed form. Both answers are judged by the same NumPy code, which shares nothing with the
+tuner but the plant's continuous matrices and the law's definition. Options: --cases 40 --seed 1 --times 50 --only N.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import differential_evolution
+
+import seaopt as so
+from seaopt.control import Gains, Loop, current_per_force
+from seaopt.control.law import Notch
+
+LOWEST_HZ, RATE = 0.1, 2 * np.pi * 0.05
+FULL = {"pd": "dT", "pid": "idT", "pid_dob": "idTQ"}
+
+
+@dataclass(frozen=True)
+class Case:
+    spec: so.ControllerSpec
+    params: so.ParameterSet
+    swing: bool
+
+    @property
+    def plants(self):
+        return [so.plants.high_impedance(), *([so.plants.moving_output()] if self.swing else [])]
+
+
+def draw(rng: np.random.Generator) -> Case:
+    """Draw a plant and a specification, some of which nothing can meet."""
+
+    def maybe(chance, low, high):
+        return float(rng.uniform(low, high)) if rng.random() < chance else None
+
+    thor = so.plants.thor()
+    spread = {"J": 0.8, "b_r": 1.0, "k": 0.8, "m_l": 0.5}
+    values = {name: thor[name].value * np.exp(rng.uniform(-s, s)) for name, s in spread.items()}
+    params = thor.update(**values, I_p=rng.uniform(0.2, 0.6))
+    structure = str(rng.choice(["pd", "pid", "pid", "pid_dob"]))
+    noise = float(np.exp(rng.uniform(np.log(25), np.log(300)))) if rng.random() < 0.7 else None
+    spec = so.ControllerSpec(
+        structure=structure, bandwidth_hz=float(rng.uniform(15, 60)), delay_samples=int(rng.integers(0, 3)),
+        sample_rate_hz=float(rng.choice([500.0, 1e3, 1e3, 2e3])), max_sensitivity=float(rng.uniform(1.45, 2.2)),
+        max_complementary=maybe(0.6, 1.15, 1.6), max_reference_peak=maybe(0.6, 1.05, 1.5), max_noise_gain=noise,
+        min_disk_margin=maybe(0.2, 0.6, 1.1), objective=str(rng.choice(["disturbance", "disturbance", "noise"])),
+        derivative=str(rng.choice(["error", "error", "measurement"])),
+        notch=Notch() if structure == "pid" and rng.random() < 0.2 else None,
+    )  # fmt: skip
+    return Case(spec=spec, params=params, swing=bool(rng.random() < 0.5))
+
+
+class Judge:
+    """Limits and objective of a law in NumPy alone, for many laws at once."""
+
+    def __init__(self, case: Case, controller: so.Controller) -> None:
+        spec, self.case = case.spec, case
+        self.ts, self.spec = spec.sample_time_s, spec
+        gain = current_per_force(case.plants[0], case.params)
+        self.held = [self.hold(plant.linearize(case.params), gain) for plant in case.plants]
+        nyquist = 0.5 / self.ts
+        f = [np.geomspace(1e-3, LOWEST_HZ, 60)[:-1], np.geomspace(LOWEST_HZ, 0.9999 * nyquist, 500)]
+        f.append(np.linspace(0.5, 1.5, 40) * spec.bandwidth_hz)
+        for a, *_ in self.held:
+            poles = np.log(np.linalg.eigvals(a).astype(complex)) / self.ts
+            for pole in poles[(poles.imag > 0) & (-poles.real < 0.3 * np.abs(poles))]:
+                width = max(-pole.real, 1e-3 * abs(pole)) / (2 * np.pi)
+                f.append(abs(pole) / (2 * np.pi) + width * np.linspace(-4, 4, 41))
+        f = np.unique(np.concatenate([*f, [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz]]))
+        self.f = f[(f >= 1e-3) & (f < nyquist)]
+        self.q = np.exp(-2j * np.pi * self.f * self.ts)
+        self.p = [self.response(held) for held in self.held]
+        self.at = int(np.argmin(np.abs(self.f - spec.bandwidth_hz)))
+        a, b, c = self.held[0]
+        self.k_ff = 1.0 / float(c @ np.linalg.solve(np.eye(a.shape[0]) - a, b))
+        inside = np.flatnonzero((self.f >= LOWEST_HZ) & (self.f <= spec.bandwidth_hz))
+        self.weights = np.zeros(self.f.size)
+        self.weights[inside] = np.gradient(np.log(self.f[inside]))
+        self.weights[inside[[0, -1]]] *= 0.5
+        observer = controller.observer
+        if observer is not None:
+            polynomial = np.polynomial.polynomial.polyval
+            self.kept = polynomial(self.q, observer.nominal.kept)
+            inverse = observer.nominal.inverse
+            self.inverse = polynomial(self.q, inverse.num) / polynomial(self.q, inverse.den)
+
+    def hold(self, model, gain):
+        n = model.A.shape[0]
+        block = np.zeros((n + 1, n + 1))
+        block[:n, :n], block[:n, n] = model.A, model.B[:, 0] * gain
+        whole = expm(block * self.ts)
+        return whole[:n, :n], whole[:n, n], np.asarray(model.C)[0]
+
+    def response(self, held):
+        a, b, c = held
+        values, vectors = np.linalg.eig(a)
+        residues = (c @ vectors) * np.linalg.solve(vectors, b)
+        return (residues / (1 / self.q[:, None] - values)).sum(axis=1) * self.q**self.spec.delay_samples
+
+    def law(self, numbers):
+        """Return C_y and C_r for columns of named numbers, each of shape (n, 1)."""
+        q, ts = self.q, self.ts
+        rate = (1 - q) / (numbers["T"] + ts - q * numbers["T"])
+        series, more = 1.0, 0.0
+        if self.spec.structure == "pid_dob":
+            lag = (ts / (numbers["Q"] + ts - q * numbers["Q"])) ** 2
+            series, more = 1 / (1 - lag * self.kept), lag * self.inverse
+        if self.spec.notch is not None:
+            s, w = (1 - q) / (1 + q), np.tan(np.pi * numbers["f"] * ts)
+            damping = 2 * numbers["w"] * w * s
+            series = series * (s**2 + numbers["g"] * damping + w**2) / (s**2 + damping + w**2)
+        both = numbers["p"] + numbers["i"] * ts / 2 * (1 + q) / (1 - q)
+        forward = numbers["d"] * rate if self.spec.derivative == "error" else 0.0
+        return series * (both + numbers["d"] * rate + more), series * (both + forward + self.k_ff)
+
+    def proportional(self, numbers):
+        """Return both k_p with the bandwidth, from three samples of the quadratic equation."""
+
+        def gap(k_p):
+            c_y, c_r = (c[:, self.at] for c in self.law(numbers | {"p": np.full_like(numbers["d"], k_p)}))
+            p = self.p[0][self.at]
+            return 2 * np.abs(p * c_r) ** 2 - np.abs(1 + p * c_y) ** 2
+
+        zero, one, two = gap(0.0), gap(1.0), gap(2.0)
+        a, b = (two - 2 * one + zero) / 2, (4 * one - 3 * zero - two) / 2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            root = np.sqrt(b**2 - 4 * a * zero)
+            return [np.nan_to_num((-b + sign * root) / (2 * a), nan=-1.0)[:, None] for sign in (1, -1)]
+
+    def judge(self, numbers):
+        """Return the largest excess over a limit (as a ratio), whether loops may be stable, and the objective."""
+        spec, (c_y, c_r) = self.spec, self.law(numbers)
+        worst, value = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
+        turned = np.zeros(c_y.shape[0])
+
+        def top(curve, limit):
+            nonlocal worst
+            if limit is not None:
+                worst = np.maximum(worst, np.max(curve, axis=1) / limit)
+
+        for row, p in enumerate(self.p):
+            loop = p * c_y
+            s = 1 / (1 + loop)
+            top(np.abs(s), spec.max_sensitivity)
+            top(np.abs(loop * s), spec.max_complementary)
+            top(np.abs(s - loop * s), None if spec.min_disk_margin is None else 2 / spec.min_disk_margin)
+            angle = np.unwrap(np.angle(1 + loop), axis=1)
+            turned = np.minimum(turned, angle[:, -1] - angle[:, 0])
+            if spec.objective == "disturbance":
+                value = np.maximum(value, np.abs(s) @ self.weights)
+            if row == 0:
+                t = np.abs(p * c_r * s)
+                top(t, spec.max_reference_peak)
+                top(np.abs(c_y * s), spec.max_noise_gain)
+                top(np.abs(s)[:, self.f <= spec.sensitivity_bandwidth_limit_hz], np.sqrt(0.5))
+                top(1 / t[:, self.f < 0.97 * spec.bandwidth_hz], np.sqrt(2))
+                if spec.objective == "noise":
+                    value = np.max(np.abs(c_y * s), axis=1)
+        if spec.structure == "pid":
+            worst = np.maximum(worst, 1 + RATE * (1 + numbers["p"][:, 0]) - numbers["i"][:, 0])
+        return worst, turned > -0.3 * np.pi, value
+
+
+def ranges(case: Case, judge: Judge):
+    """Return the numbers searched, logarithmically, and their ranges."""
+    f_b, inverse = case.spec.bandwidth_hz, 1 / abs(judge.p[0][judge.at])
+    w_b = 2 * np.pi * f_b
+    every = {
+        "i": (0.3, 3 * w_b * (1 + inverse)), "d": (1e-3 * inverse / w_b, 30 * inverse / w_b),
+        "T": (1e-2 * judge.ts, 4 / w_b), "Q": (0.2 * judge.ts, 3.0),
+        "f": (1.2 * f_b, 0.45 / judge.ts), "w": (0.02, 1.0), "g": (0.01, 1.0),
+    }  # fmt: skip
+    if case.spec.structure == "pid_dob":
+        every["i"] = (1e-2, every["i"][1])
+    names = FULL[case.spec.structure] + ("fwg" if case.spec.notch is not None else "")
+    return names, [tuple(np.log(every[name])) for name in names]
+
+
+def search(case: Case, judge: Judge, seconds: float, seed: int):
+    """Return the best numbers of a differential evolution, and how many laws it looked at."""
+    names, bounds = ranges(case, judge)
+    started, looked, allowed = time.process_time(), 0, 1.0 - case.spec.reserve
+
+    def cost(v):
+        nonlocal looked
+        v = np.atleast_2d(v.T)
+        looked += 2 * v.shape[0]
+        numbers = {name: np.exp(v[:, [i]]) for i, name in enumerate(names)}
+        numbers.setdefault("i", np.zeros_like(numbers["d"]))
+        out = np.full(v.shape[0], np.inf)
+        for k_p in judge.proportional(numbers):
+            worst, stable, value = judge.judge(numbers | {"p": np.maximum(k_p, 0.0)})
+            merit = np.log(value) + 20 * np.log(np.maximum(worst / allowed, 1.0))
+            merit += np.where(stable, 0.0, 50.0) + np.where(k_p[:, 0] < 0.0, 100.0, 0.0)
+            out = np.fmin(out, merit)
+        return out
+
+    found = differential_evolution(
+        cost, bounds, seed=seed, maxiter=100_000, popsize=12, tol=1e-9, polish=False, vectorized=True, init="sobol",
+        updating="deferred", callback=lambda intermediate_result: time.process_time() - started > seconds,
+    )  # fmt: skip
+    numbers = {name: np.exp(np.array([[found.x[i]]])) for i, name in enumerate(names)}
+    numbers.setdefault("i", np.zeros((1, 1)))
+    answers = [numbers | {"p": np.maximum(k_p, 0.0)} for k_p in judge.proportional(numbers) if k_p[0, 0] >= 0.0]
+    return answers, looked
+
+
+def of_controller(controller: so.Controller):
+    names = {"p": "k_p", "i": "k_i", "d": "k_d", "T": "T_f", "Q": "T_q", "f": "notch_frequency_hz", "w": "notch_width",
+             "g": "notch_depth"}  # fmt: skip
+    return {short: np.array([[controller.gains[name]]]) for short, name in names.items() if name in controller.gains}
+
+
+def stable(case: Case, controller: so.Controller, numbers) -> bool:
+    """Tell by eigenvalues whether a law's loops are stable."""
+    one = {name: float(value[0, 0]) for name, value in numbers.items()}
+    observer = controller.observer
+    gains = Gains(
+        k_p=one["p"], k_i=one["i"], k_d=one["d"], T_f=one["T"], k_ff=1.0, derivative=case.spec.derivative,
+        observer=None if observer is None else replace(observer, T_q=one["Q"]),
+        notch=Notch(frequency_hz=one["f"], width=one["w"], depth=one["g"]) if "f" in one else None,
+    )  # fmt: skip
+    law = gains.transfer_functions(case.spec.structure, case.spec.sample_time_s)
+    loops = [Loop(plant=controller.plant(p, case.params), reference=law[0], measurement=law[1]) for p in case.plants]
+    return all(np.max(np.abs(loop.eigenvalues())) < 1.0 for loop in loops)
+
+
+def compare(case: Case, times: float, seed: int) -> dict:
+    """Tune, search, and judge both."""
+    plant, *others = case.plants
+    robust_to = dict.fromkeys(("swing",), others[0]) if others else {}
+    started = time.process_time()
+    controller = so.tune(plant, case.params, case.spec, robust_to=robust_to)
+    tuned_s = time.process_time() - started
+    judge = Judge(case, controller)
+    worst, _, value = judge.judge(of_controller(controller))
+    answers, looked = search(case, judge, times * tuned_s, seed)
+    answers = [answer for answer in answers if stable(case, controller, answer)]
+    judged = [tuple(float(np.ravel(item)[0]) for item in judge.judge(answer)) for answer in answers]
+    best = min(judged, key=lambda item: (max(item[0], 1.0) + (item[1] < 0.5), item[2]), default=(np.inf, 0.0, np.nan))
+    return {
+        "feasible": controller.feasible, "usage": float(worst[0]), "value": float(value[0]), "tuned_s": tuned_s,
+        "search_feasible": best[0] <= 1.0 + 1e-6 and best[1] > 0.5, "search_usage": best[0], "search_value": best[2],
+        "looked": looked, "largest": controller.largest_bandwidth_hz, "why": controller.explanation,
+        "structure": case.spec.structure + ("+notch" if case.spec.notch else ""), "objective": case.spec.objective,
+        "bandwidth": case.spec.bandwidth_hz, "swing": case.swing,
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, default in (("cases", 40), ("seed", 1), ("times", 50.0), ("only", -1)):
+        parser.add_argument(f"--{name}", type=type(default), default=default)
+    args = parser.parse_args()
+    rng = np.random.default_rng(args.seed)
+    cases = [draw(rng) for _ in range(args.cases)]
+    compare(cases[0], 0.0, 0)  # builds the programs once
+    rows = []
+    print(f"{'':>3} {'law':11} {'goal':5} {'Hz':>5} {'swing':5} {'tuned':>9} {'usage':>7} {'search':>9} {'usage':>7}"
+          f" {'ratio':>7} {'cpu s':>6} {'looked at':>9}")  # fmt: skip
+    for number, case in enumerate(cases):
+        if args.only >= 0 and number != args.only:
+            continue
+        row = compare(case, args.times, number)
+        rows.append(row)
+        ratio = row["value"] / row["search_value"] if row["feasible"] and row["search_feasible"] else np.nan
+        row["ratio"] = ratio
+        row["bad"] = (
+            ratio > 1.03 or (row["feasible"] and row["usage"] > 1.0 + 1e-4)
+            or (row["search_feasible"] and not row["feasible"])
+        )  # fmt: skip
+        print(f"{number:3d} {row['structure']:11} {row['objective'][:5]} {row['bandwidth']:5.1f} {row['swing']!s:5} "
+              f"{row['value']:9.4g} {row['usage']:7.4f} {row['search_value']:9.4g} {row['search_usage']:7.4f} "
+              f"{ratio:7.4f} {row['tuned_s']:6.2f} {row['looked']:9d} {'BAD' if row['bad'] else ''} {row['why']}",
+              flush=True)  # fmt: skip
+    times = np.array([row["tuned_s"] for row in rows])
+    ratios = np.array([row["ratio"] for row in rows if np.isfinite(row["ratio"])])
+    print(f"{len(rows)} cases, {sum(row['feasible'] for row in rows)} feasible, {sum(row['bad'] for row in rows)} bad; "
+          f"processor time of a tune: median {np.median(times):.3f} s, largest {times.max():.2f} s")  # fmt: skip
+    if ratios.size:
+        print(f"objective over the search's: median {np.median(ratios):.4f}, largest {ratios.max():.4f}, "
+              f"least {ratios.min():.4f}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Parameter values at which a controller must hold while it is tuned: corners of ranges, and draws."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+
+from seaopt.errors import ControlError
+from seaopt.estimation import Fit
+from seaopt.parameters import ParameterSet
+
+MOST_CORNERS = 256
+
+
+def corners(ranges: Mapping[str, tuple[float, float]]) -> list[dict[str, float]]:
+    """Return every combination of the ends of ranges.
+
+    Parameters
+    ----------
+    ranges : mapping of name to (low, high)
+        At most eight.
+
+    Raises
+    ------
+    ControlError
+        A range is empty, or there are more than 256 corners.
+
+    Examples
+    --------
+    >>> corners({"I_p": (0.2, 0.6)})
+    [{'I_p': 0.2}, {'I_p': 0.6}]
+
+    """
+    for name, (low, high) in ranges.items():
+        if not low <= high:
+            raise ControlError(f"ranges: {name} = ({low:g}, {high:g}) is empty; give (low, high)")
+    if 2 ** len(ranges) > MOST_CORNERS:
+        raise ControlError(f"ranges names {len(ranges)} parameters, with too many corners; use draw instead")
+    return [dict(zip(ranges, map(float, ends), strict=True)) for ends in itertools.product(*ranges.values())]
+
+
+def draw(
+    parameters: Fit | ParameterSet,
+    count: int,
+    seed: int,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+) -> list[dict[str, float]]:
+    """Draw parameter values: a fit's joint normal distribution, or prior_stds, and uniform ranges.
+
+    Parameters
+    ----------
+    parameters : Fit or ParameterSet
+        Values are kept within their bounds.
+    count : int
+        How many draws.
+    seed : int
+        The same seed gives the same draws.
+    ranges : mapping of name to (low, high), optional
+        Parameters drawn uniformly instead.
+
+    Raises
+    ------
+    ControlError
+        Nothing is uncertain.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> [sorted(values) for values in draw(so.plants.thor().prior(k=3000.0), 2, 1, {"I_p": (0.2, 0.6)})]
+    [['I_p', 'k'], ['I_p', 'k']]
+
+    """
+    rng, uniform = np.random.default_rng(seed), dict(ranges or {})
+    values = parameters.parameters if isinstance(parameters, Fit) else parameters
+    if isinstance(parameters, Fit):
+        names, matrix = list(parameters.covariance.names), np.asarray(parameters.covariance.matrix)
+    else:
+        names = [name for name, item in values.items() if item.prior_std is not None]
+        matrix = np.diag([float(values[name].prior_std or 0.0) ** 2 for name in names])
+    used = [i for i, name in enumerate(names) if name in values and name not in uniform and np.isfinite(matrix[i, i])]
+    if not used and not uniform:
+        raise ControlError("parameters has no covariance and no prior_std, and there are no ranges: nothing to draw")
+    names, matrix = [names[i] for i in used], matrix[np.ix_(used, used)]
+    out: list[dict[str, float]] = []
+    for _ in range(count):
+        normal = rng.multivariate_normal([values[name].value for name in names], matrix) if names else []
+        drawn = {
+            name: float(np.clip(value, values[name].min, values[name].max))
+            for name, value in zip(names, normal, strict=True)
+        }
+        out.append(drawn | {name: float(rng.uniform(low, high)) for name, (low, high) in uniform.items()})
+    return out

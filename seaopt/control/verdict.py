@@ -1,0 +1,75 @@
+"""Whether measured figures keep a specification, and how near they come to its limits."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from seaopt.control.loop import LoopFigures
+from seaopt.control.spec import ControllerSpec
+
+BANDWIDTH_TOLERANCE = 0.005
+ROUNDING = 1e-6
+
+
+class Use(NamedTuple):
+    """One limit: its name, with the plant where it holds for all, the figure, what is allowed, and their ratio."""
+
+    label: str
+    value: float
+    allowed: float
+    ratio: float
+
+
+def uses(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> list[Use]:
+    """Return each peak limit that is imposed; the first figures are the design plant's."""
+    out: list[Use] = []
+
+    def at_most(label: str, value: float, allowed: float | None) -> None:
+        if allowed is not None:
+            out.append(Use(label, value, allowed, value / allowed))
+
+    for name, item in zip(names, figures, strict=True):
+        at_most(f"max_sensitivity ({name})", item.ms, spec.max_sensitivity)
+        at_most(f"max_complementary ({name})", item.mt, spec.max_complementary)
+        if spec.min_disk_margin is not None:
+            ratio = spec.min_disk_margin / max(item.disk_margin, 1e-12)
+            out.append(Use(f"min_disk_margin ({name})", item.disk_margin, spec.min_disk_margin, ratio))
+    at_most("max_reference_peak", figures[0].reference_peak, spec.max_reference_peak)
+    at_most("max_noise_gain", figures[0].noise_gain, spec.max_noise_gain)
+    return out
+
+
+def broken(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> list[str]:
+    """Return the limits that the figures break, with the plant that breaks them."""
+    design = figures[0]
+    out = [f"stability ({name})" for name, item in zip(names, figures, strict=True) if not item.stable]
+    out += [use.label for use in uses(spec, names, figures) if use.ratio > 1 + ROUNDING]
+    reached = design.bandwidth_hz
+    if reached is None or abs(reached / spec.bandwidth_hz - 1) > BANDWIDTH_TOLERANCE:
+        out.append("bandwidth_hz")
+    if design.sensitivity_bandwidth_hz < spec.sensitivity_bandwidth_limit_hz * (1 - 1e-3):
+        out.append("min_sensitivity_bandwidth_hz")
+    return out
+
+
+def active(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> list[str]:
+    """Return the limits that are met with no more than the reserve and a hundredth to spare."""
+    near = 1.0 - spec.reserve - 0.01
+    out = [use.label for use in uses(spec, names, figures) if use.ratio > near]
+    if figures[0].sensitivity_bandwidth_hz < 1.01 * spec.sensitivity_bandwidth_limit_hz:
+        out.append("min_sensitivity_bandwidth_hz")
+    return out
+
+
+def explained(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> tuple[str, ...]:
+    """Return what blocks, each limit with the figure that the best compromise reaches."""
+    known = {use.label: f"{use.label} {use.value:.4g} of {use.allowed:g}" for use in uses(spec, names, figures)}
+    design = figures[0]
+    known["bandwidth_hz"] = (
+        "bandwidth_hz, of which there is none" if design.bandwidth_hz is None
+        else f"bandwidth_hz {design.bandwidth_hz:.4g} of {spec.bandwidth_hz:g}"
+    )  # fmt: skip
+    known["min_sensitivity_bandwidth_hz"] = (
+        f"min_sensitivity_bandwidth_hz {design.sensitivity_bandwidth_hz:.4g} of {spec.sensitivity_bandwidth_limit_hz:g}"
+    )
+    return tuple(known.get(label, label) for label in broken(spec, names, figures))

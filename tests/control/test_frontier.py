@@ -1,0 +1,68 @@
+"""The sweep of bandwidths: rows are recomputed, infeasible rows are results, the command writes them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.cli.frontier import bandwidths
+from seaopt.control import sweep
+from seaopt.errors import ControlError
+
+from .test_loop import independent
+
+PROBLEM = """
+schema = 1
+[plant.stand]
+kind = "high_impedance"
+[controller]
+plant = "stand"
+structure = "pd"
+bandwidth_hz = 30
+max_sensitivity = 1.6
+max_noise_gain = 25
+current_limit_A = 9.0
+"""
+
+
+def test_rows_are_what_a_recomputation_gives(stand, swing, thor):
+    spec = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+    found = sweep(stand, thor, spec, [20, 60], {"swing": swing})
+    assert [row.feasible for row in found.rows] == [True, False]
+    assert found.rows[1].blocked_by
+    row, controller = found.rows[0], found.controllers[0]
+    f = np.geomspace(0.1, 499.9, 20_000)
+    loops = [controller.close(plant, thor) for plant in (stand, swing)]
+    s = [1 / (1 + independent(loop, f)[0]) for loop in loops]
+    assert row.ms == pytest.approx(max(np.abs(one).max() for one in s), rel=1e-3)
+    inside = f <= 20
+    integral = [np.trapezoid(np.abs(one[inside]), np.log(f[inside])) for one in s]
+    assert row.disturbance == pytest.approx(max(integral), rel=1e-2)
+    assert row.noise_gain == pytest.approx(np.abs(independent(loops[0], f)[2]).max(), rel=1e-3)
+    at = np.array([20.0])
+    motor = abs(controller.reference.response(at, 1e-3) * loops[0].sensitivity(at))[0]
+    assert row.force_limit_N == pytest.approx(9.0 / controller.current_per_force_A_per_N / motor, rel=1e-6)
+
+
+def test_the_command_writes_table_json_and_figure(tmp_path):
+    problem = tmp_path / "p.toml"
+    problem.write_text(PROBLEM)
+    command = [sys.executable, "-m", "seaopt.cli", "tune", str(problem), "-o", str(tmp_path / "out")]
+    result = subprocess.run([*command, "--sweep", "40:60:20", "--json"], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    content = json.loads(result.stdout)
+    assert content["schema"] == "seaopt/frontier/1"
+    assert [row["bandwidth_hz"] for row in content["rows"]] == [40, 60]
+    assert [row["feasible"] for row in content["rows"]] == [True, False]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"frontier.json", "frontier.png", "frontier.svg"}
+
+
+@pytest.mark.parametrize("text", ["15", "15:60", "60:15:5", "15:60:0", "a:b:c", "1:2:1e-9", "nan:60:5"])
+def test_bad_sweeps(text):
+    with pytest.raises(ControlError, match="--sweep"):
+        bandwidths(text)
