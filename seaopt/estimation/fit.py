@@ -147,10 +147,10 @@ def _check_motion(experiments: tuple[Experiment, ...]) -> None:
             "wiring, or choose another column"
         )
     still = all(e.plant.inputs and all(is_constant(u) for u in input_samples(e.plant, e.log)) for e in experiments)
-    if still and all(isinstance(experiment.initial_state, str) for experiment in experiments):
+    if still and all(experiment.initial_state == "estimate" for experiment in experiments):
         raise EstimationError(
             f"{where}: {' and '.join(first.plant.inputs)} constant throughout, nothing drives the plant; choose "
-            "another column, or give the initial_state that it swings from"
+            'another column, or say where it starts: initial_state = "rest", or a mapping'
         )
 
 

@@ -293,17 +293,16 @@ def test_a_channel_in_the_wrong_unit_is_refused(stand, short_log):
 
 
 @pytest.mark.parametrize(
-    ("still", "options", "words"),
+    ("still", "words"),
     [
-        (("F1", "F2"), {}, "F1 and F2 constant throughout, nothing can be learnt"),
-        (("I", "F1", "F2"), {}, "F1 and F2 constant throughout"),
-        (("I",), {}, "I constant throughout, nothing drives the plant"),
-        (("I",), {"initial_state": "rest"}, "I constant throughout"),
+        (("F1", "F2"), "F1 and F2 constant throughout, nothing can be learnt"),
+        (("I", "F1", "F2"), "F1 and F2 constant throughout"),
+        (("I",), "I constant throughout, nothing drives the plant"),
     ],
 )
-def test_a_log_in_which_nothing_moves_is_refused(stand, short_log, thor, still, options, words):
+def test_a_log_in_which_nothing_moves_is_refused(stand, short_log, thor, still, words):
     arrays = short_log.to_arrays() | {name: np.full(len(short_log), 2.0) for name in still}
-    bench = experiment(stand, so.Log.from_arrays(**arrays), **options)
+    bench = experiment(stand, so.Log.from_arrays(**arrays))
     with pytest.raises(EstimationError, match=words):
         so.fit([bench], thor.free("J", "b_r"))
 
