@@ -212,3 +212,17 @@ def test_a_fault_of_time_is_found_wherever_it_is(row: int, value: float, said: s
 def test_a_step_of_time_beyond_all_numbers_is_refused() -> None:
     with pytest.raises(LogError, match="leaps at sample 2"):
         so.Log.from_arrays(time=[-1.7e308, 1.7e308], I=np.ones(2))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"time": "zeit"}, 'no column "zeit" for time'), ({"channels": {"time": "F [N]"}}, 'a channel is named "time"')],
+)
+def test_a_frame_s_clock_is_the_one_named(options, words):
+    with pytest.raises(LogError, match=words):
+        so.Log.from_frame(pl.DataFrame({"time [s]": [0.0, 1.0], "F [N]": [1.0, 2.0]}), **options)
+
+
+def test_columns_of_one_name_in_two_units_are_both_kept():
+    log = so.Log.from_frame(pl.DataFrame({"time [s]": [0.0, 1.0], "F [N]": [1.0, 2.0], "F [kN]": [3.0, 4.0]}))
+    assert {name: log[name].tolist() for name in log.signals} == {"F [N]": [1.0, 2.0], "F [kN]": [3000.0, 4000.0]}
