@@ -181,6 +181,8 @@ def _log_clock(sources: Sequence[Source], time: str | Column | None, found: list
         raise LogError(
             f"{_paths(sources)}: holds no column of numbers; list it with contents(path) (seaopt inspect --list)"
         )
+    if all(item.length == 0 for _, item in found):
+        raise LogError(f"{_paths(sources)}: holds no sample; record the log again")
     source = found[0][0]
     clocks = list(dict.fromkeys(item.clock for _, item in found))
     if len(clocks) > 1:

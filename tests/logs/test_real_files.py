@@ -211,6 +211,11 @@ def test_a_load_that_wraps_is_noted(data):
         assert [note.split(":")[0] for note in notes if "field of 16 bits" in note] == ["load"] * wraps
 
 
+def test_a_recording_without_messages_is_refused(formats):
+    with pytest.raises(LogError, match="empty_bag_0.db3: holds no sample"):
+        read_table(formats / "ros2" / "empty_bag_0.db3")
+
+
 def test_every_file_opens_or_fails_in_one_line(data):
     for path in sorted(data.rglob("*")):
         error = failure(path)
