@@ -126,11 +126,17 @@ def inspect(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write quality.json and the figure there.")
     ] = None,
+    listed: Annotated[bool, typer.Option("--list", help="Only list the columns, their units and clocks.")] = False,
     json: Json = False,
 ) -> None:
     """Look for every fault in a log, and say what it excites."""
     from seaopt.cli.inspect import inspect_log
 
+    if listed:
+        from seaopt.logs import contents
+
+        typer.echo(contents(log))
+        return
     inspect_log(
         log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
         counter=counter, folder=output, json=json,

@@ -113,6 +113,31 @@ def bare_name(header: str) -> str:
     return found["name"].strip() or header if found else header
 
 
+def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:
+    """Return of how many bits the unsigned field seems to be in which small signed numbers were stored.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+        Samples.
+    low, high : float
+        The least and the greatest of them.
+
+    Examples
+    --------
+    >>> suspect_wrap(np.array([0.0, 3.0, 65530.0, 65535.0, 1.0]), 0.0, 65535.0)
+    16
+
+    """
+    bits = next((bits for bits in (8, 16, 32) if 0.75 * 2**bits <= high < 2**bits and 0 <= low < 0.25 * 2**bits), None)
+    if bits is None:
+        return None
+    small, large = values[values < 0.25 * 2**bits], values[values >= 0.75 * 2**bits]
+    whole = np.all(small == np.floor(small)) and np.all(large == np.floor(large))
+    apart = small.size + large.size == np.count_nonzero(~np.isnan(values))
+    return bits if whole and apart and np.ptp(small) > 0 and np.ptp(large) > 0 else None
+
+
 def _wrapped(values: Float[np.ndarray, " n"], bits: int, where: str) -> Float[np.ndarray, " n"]:
     """Return two's complement of unsigned integers."""
     whole = 2.0**bits

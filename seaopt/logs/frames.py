@@ -74,7 +74,7 @@ def from_frame(
     time : str
         Name of the time column.
     channels : mapping of channel name to column name, optional
-        Every other column if left out, under its name without the brackets.
+        Every other column if left out, under its name without the brackets where that is clear.
     units : mapping of channel name to unit, optional
         Of columns without brackets; what has neither is SI already.
     source : str
@@ -99,7 +99,12 @@ def from_frame(
     if not columns:
         raise LogError(f"{type(frame).__name__} is no frame with columns; give a polars or pandas DataFrame")
     if channels is None:
-        channels = {bare_name(column): column for column in columns if column != time}
+        bare = [bare_name(column) for column in columns]
+        clear = [bare.count(name) == 1 and name != "time" for name in bare]
+        pairs = [(name if alone else full, full) for name, full, alone in zip(bare, columns, clear, strict=True)]
+        channels = {name: column for name, column in pairs if column != time}
+    if "time" in channels:
+        raise LogError(f'{source}: a channel is named "time"; rename it, time is the clock')
     wanted = {"time": time} | dict(channels)
     for name, column in wanted.items():
         if column not in columns:

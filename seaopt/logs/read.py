@@ -13,7 +13,7 @@ from jaxtyping import Float
 from seaopt.errors import LogError
 from seaopt.files import write_text
 from seaopt.logs.align import Rule, check_clock
-from seaopt.logs.column import Column
+from seaopt.logs.column import Column, suspect_wrap
 from seaopt.logs.counter import Counter
 from seaopt.logs.formats import Window, open_source
 from seaopt.logs.log import Log
@@ -249,6 +249,12 @@ def _remarks(signal: Signal) -> list[str]:
         return [f"{signal.name}: holds no number"]
     if low == high:
         return [f"{signal.name}: is constant at {low:.6g} {signal.unit}".rstrip()]
+    bits = suspect_wrap(signal.values, low, high)
+    if bits is not None:
+        return [
+            f"{signal.name}: looks like signed numbers in an unsigned field of {bits} bits; if so, give "
+            f'Column(column="{signal.origin.column}", wrap_bits={bits})'
+        ]
     loss = Counter.suspect(signal.values)
     if loss:
         return [

@@ -126,5 +126,6 @@ def restamp(log: Log) -> Log:
                 f"rounding to {step:.3g} s explains; call log.resample(rate_hz=...)"
             )
         time[piece] = place + 0.5 * (np.min(strays) + np.max(strays))
-    note = f"timestamps, rounded to {step:.3g} s, put on a uniform clock of {log.rate_hz:.6g} Hz"
+    rounded = f", rounded to {step:.3g} s," if step else ""
+    note = f"timestamps{rounded} put on a uniform clock of {log.rate_hz:.6g} Hz"
     return log.with_values(time, {name: log[name] for name in log.signals}, note)

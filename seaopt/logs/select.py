@@ -13,7 +13,7 @@ from seaopt.logs.column import Column, bare_name
 from seaopt.logs.counter import Counter
 from seaopt.logs.formats import Field, Source
 from seaopt.logs.formats.layout import is_unit
-from seaopt.units import factor, si_unit
+from seaopt.units import factor, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 SHOWN = 20  # names in a message
@@ -129,7 +129,8 @@ def known_names(name: str, names: Sequence[str]) -> str:
     """Return what to say after an unknown name, however many names there are."""
     said = suggestion(name, names)
     if said.startswith("known") and len(names) > SHOWN:
-        return f"known: {', '.join(names[:SHOWN])}, ... ({len(names)} in all; contents(path) lists them)"
+        shown = ", ".join(names[:SHOWN])
+        return f"known: {shown}, ... ({len(names)} in all; contents(path), or seaopt inspect --list, lists them)"
     return said
 
 
@@ -138,9 +139,9 @@ def unit_of(source: Source, column: Column, item: Field) -> str:
     unit = column.unit if column.unit is not None else item.unit
     if unit is None:
         how = (
-            f'write it in the header\'s brackets, "{item.name} [unit]", or give it with the column'
+            f'write it in the header\'s brackets, "{item.name} [unit]", or give it with the column (--unit)'
             if source.format == "CSV"
-            else f'give it: Column(column="{item.name}", unit="...")'
+            else f'give it: Column(column="{item.name}", unit="...") (--unit)'
         )
         raise LogError(f'{source.path}: column "{item.name}" has no unit; {how}')
     try:
@@ -175,15 +176,19 @@ def _log_clock(sources: Sequence[Source], time: str | Column | None, found: list
         found = [(source, item) for source in sources for item in source.fields if item.numeric]
     files = list(dict.fromkeys(str(source.path) for source, _ in found))
     if len(files) > 1:
-        raise LogError(f"{', '.join(files)}: several files have several clocks; name the log's with time=")
+        raise LogError(f"{', '.join(files)}: several files have several clocks; name the log's with time= (--time)")
     if not found:
-        raise LogError(f"{_paths(sources)}: holds no column of numbers; list it with contents(path)")
+        raise LogError(
+            f"{_paths(sources)}: holds no column of numbers; list it with contents(path) (seaopt inspect --list)"
+        )
+    if all(item.length == 0 for _, item in found):
+        raise LogError(f"{_paths(sources)}: holds no sample; record the log again")
     source = found[0][0]
     clocks = list(dict.fromkeys(item.clock for _, item in found))
     if len(clocks) > 1:
         names = [clock for clock in clocks if clock is not None]
         shown = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
-        raise LogError(f"{source.path}: holds several clocks ({shown}); name the log's with time=")
+        raise LogError(f"{source.path}: holds several clocks ({shown}); name the log's with time= (--time)")
     column = Column(column=clocks[0]) if clocks[0] is not None else _time_like(source)
     return _clock(*_with(column, find([source], "time", column)))
 
@@ -195,12 +200,20 @@ def _with(column: Column, found: tuple[Source, Field]) -> tuple[Source, Column, 
 def _time_like(source: Source) -> Column:
     """Return the one column that is named like a time."""
     names = [item.name for item in source.fields if item.numeric]
-    found = [name for name in names if _last(name).casefold() in _TIME_NAMES]
+    named = [item for item in source.fields if item.numeric and _last(item.name).casefold() in _TIME_NAMES]
+    # Of several, T in degrees is a temperature.
+    found = [item.name for item in named if len(named) == 1 or _maybe_time(item.unit)]
     if len(found) == 1:
         return Column(column=found[0])
     why = "no column is" if not found else f"{len(found)} columns are"
     shown = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
-    raise LogError(f"{source.path}: {why} named like a time; give time=, one of the columns: {shown or 'none'}")
+    raise LogError(
+        f"{source.path}: {why} named like a time; give time= (--time), one of the columns: {shown or 'none'}"
+    )
+
+
+def _maybe_time(unit: str | None) -> bool:
+    return not unit or not is_unit(unit) or same_dimension(unit, "s")
 
 
 def _last(name: str) -> str:
@@ -259,7 +272,9 @@ def _every_channel(
     if rest := [item.name for pair in numeric if pair not in chosen for item in pair[1:]]:
         notes.append(f'columns on other clocks than "{clock.name}" were left out: {_listed(rest)}')
     if not chosen:
-        raise LogError(f'{clock.path}: no column of numbers is on the clock "{clock.name}"; choose another time=')
+        raise LogError(
+            f'{clock.path}: no column of numbers is on the clock "{clock.name}"; choose another time= (--time)'
+        )
     units, unknown = _units(chosen)
     notes += unknown
     bare = [bare_name(item.name) if units[index] else item.name for index, (_, item) in enumerate(chosen)]
@@ -291,6 +306,10 @@ def _units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str]]:
     """Return each column's unit, "" where none is known; brackets that hold no unit are part of the name."""
     given = [item.unit for _, item in chosen]
     text = [source.format == "CSV" for source, _ in chosen]
+    for source, item in chosen:
+        known = any(unit and is_unit(unit) for unit in given)
+        if source.format == "CSV" and known and _meant(item) and not is_unit(item.unit or ""):
+            unit_of(source, Column(column=item.name), item)
     if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, given, strict=True)):
         notes = ["brackets in the headers that are no units were taken as names; no unit is known"]
         return [""] * len(given), notes
@@ -298,6 +317,11 @@ def _units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str]]:
     lost = [f"{item.name} [{old}]" for old, new, (_, item) in zip(given, units, chosen, strict=True) if old and not new]
     notes = [f"units that are not known were left out: {_listed(lost)}"] if lost else []
     return units, notes
+
+
+def _meant(item: Field) -> bool:
+    """Tell whether a header's brackets are meant as a unit: square ones without a number, which would be an index."""
+    return item.unit is not None and item.name.endswith("]") and not item.unit.isdecimal()
 
 
 def _scales(unit: str) -> bool:

@@ -70,6 +70,12 @@ def test_json_stands_alone_on_stdout(folder):
     assert content["channels"]["cur"]["unit"] == "A"
 
 
+def test_the_columns_alone_are_listed(folder):
+    done = seaopt("bare.csv", "--list", cwd=folder)
+    assert done.returncode == 0 and done.stdout.startswith("bare.csv: CSV")
+    assert "time [s]" in done.stdout
+
+
 def test_bad_input_exits_2(folder):
     done = seaopt("nothing.csv", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")

@@ -204,6 +204,18 @@ def test_the_servos_wrapping_load_is_declared(data):
         assert np.abs(log["load"]).max() <= 1.0
 
 
+def test_a_load_that_wraps_is_noted(data):
+    for path in sorted((data / "xl330").glob("*.json")):
+        notes = read_table(path, time=Column(column="timestamp", unit="s")).notes
+        wraps = max(entry["load"] for entry in json.loads(path.read_text())["entries"]) >= 2**15
+        assert [note.split(":")[0] for note in notes if "field of 16 bits" in note] == ["load"] * wraps
+
+
+def test_a_recording_without_messages_is_refused(formats):
+    with pytest.raises(LogError, match="holds no sample; record"):
+        read_table(formats / "ros2" / "empty_bag_0.db3")
+
+
 def test_every_file_opens_or_fails_in_one_line(data):
     for path in sorted(data.rglob("*")):
         error = failure(path)

@@ -180,3 +180,13 @@ def test_contents_lists_without_reading(file):
         ("note", "text", None),
     ]
     assert "CSV, 3 columns" in repr(found) and "1 line above the header passed over" in repr(found)
+
+
+def test_an_unknown_unit_is_refused_where_others_are_known(file):
+    with pytest.raises(UnitError, match='column "I \\[zorg\\]": unit "zorg" is not known'):
+        read_table(file(b"time [s],I [zorg],F1 [N]\n0,1,2\n1,2,3\n"))
+
+
+def test_an_index_in_brackets_is_no_unit(file):
+    table = read_table(file(b"time [s],q[0],q[1],T [\xc2\xb0C]\n0,1,2,20\n1,2,3,21\n"))
+    assert list(table.signals)[:2] == ["q[0]", "q[1]"]
