@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError, suggestion
 from seaopt.logs import Log
@@ -230,6 +230,10 @@ class Experiment:
             missing = int(np.count_nonzero(~np.isfinite(log[name])))
             if missing:
                 notes.append(f"{name}: {missing} of {len(log)} samples are missing or masked and have no weight")
+        for name in (*self.plant.inputs, *self.outputs):
+            if name in log.signals and is_constant(log[name]):
+                text = f"{name}: is constant at {np.fmax.reduce(log[name]):.6g} {log.signal(name).unit}".rstrip()
+                notes += [text] if text not in notes else []  # reading a file says it already
         return tuple(notes)
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
@@ -264,6 +268,11 @@ class Experiment:
     def renamed(self, name: str) -> Experiment:
         """Return the experiment under another name."""
         return replace(self, name=name)
+
+
+def is_constant(values: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether all samples are the same, as far as they are there."""
+    return bool(np.fmin.reduce(values) == np.fmax.reduce(values))
 
 
 def shot_edges(n: int, shots: int) -> Int[np.ndarray, " shots1"]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.experiment import Experiment
+from seaopt.estimation.experiment import Experiment, is_constant
 from seaopt.estimation.least_squares import Callback
 from seaopt.estimation.leftover import counted
 from seaopt.estimation.losses import Huber, Linear, Loss, SoftL1
@@ -22,6 +22,7 @@ from seaopt.estimation.solve import Solved, output_error, prediction_error
 from seaopt.estimation.summary import summarise
 from seaopt.estimation.unknowns import Unknowns, collect
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.simulation.simulate import input_samples
 
 
 def fit(
@@ -86,6 +87,7 @@ def fit(
     if not 0.0 <= holdout <= 0.9:
         raise EstimationError(f"holdout = {holdout:g} is not a fraction; give 0 (none) to 0.9")
     check_choices(chosen, loss, band_hz)
+    _check_motion(named)
     complete = _complete(named, params)
     unknowns = collect(named, complete, noise=isinstance(chosen, PredictionError), band_hz=band_hz)
     problem = _problem(named, unknowns, loss if loss is not None else Linear(), band_hz, holdout)
@@ -133,6 +135,23 @@ def _named(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
         seen.add(name)
         out.append(experiment if name == experiment.name else experiment.renamed(name))
     return tuple(out)
+
+
+def _check_motion(experiments: tuple[Experiment, ...]) -> None:
+    """Refuse logs in which no output moves, or that nothing drives: parameters would fit whatever they are."""
+    where = ", ".join(f"experiment {experiment.name} ({experiment.log.source})" for experiment in experiments)
+    first = experiments[0]
+    if all(is_constant(e.log[name]) for e in experiments for name in e.outputs):
+        raise EstimationError(
+            f"{where}: {' and '.join(first.outputs)} constant throughout, nothing can be learnt from that; check the "
+            "wiring, or choose another column"
+        )
+    still = all(e.plant.inputs and all(is_constant(u) for u in input_samples(e.plant, e.log)) for e in experiments)
+    if still and all(experiment.initial_state == "estimate" for experiment in experiments):
+        raise EstimationError(
+            f"{where}: {' and '.join(first.plant.inputs)} constant throughout, nothing drives the plant; choose "
+            'another column, or say where it starts: initial_state = "rest", or a mapping'
+        )
 
 
 def _complete(experiments: tuple[Experiment, ...], params: ParameterSet) -> ParameterSet:

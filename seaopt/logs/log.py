@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
 GAP = 1.5  # periods between two samples that make a gap
+BLOCK = 100_000  # samples that are looked at in one go
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,16 +62,8 @@ class Log:
         n = self.time.size
         if self.time.ndim != 1 or n < 2:
             raise LogError(f"{self.source}: time has shape {self.time.shape}; a log needs at least 2 samples")
-        if not np.all(np.isfinite(self.time)):
-            row = int(np.flatnonzero(~np.isfinite(self.time))[0])
-            raise LogError(f"{self.source}: time is not a number in sample {row + 1}; remove that row")
-        step = np.diff(self.time)
-        if np.any(step <= 0):
-            row = int(np.flatnonzero(step <= 0)[0]) + 1
-            how = "repeats" if step[row - 1] == 0 else "runs backwards"
-            raise LogError(
-                f"{self.source}: time {how} at sample {row + 1} (t = {self.time[row]:g} s); sort or remove such rows"
-            )
+        if not _rises(self.time):
+            raise LogError(f"{self.source}: {_fault(self.time)}")
         for name, signal in self.signals.items():
             if signal.values.size != n:
                 raise LogError(
@@ -283,13 +276,44 @@ class Log:
         return f"<pre>{html.escape(repr(self))}</pre>"
 
 
+def _steps(time: Float[np.ndarray, " n"]) -> Iterator[Float[np.ndarray, " _"]]:
+    """Return the steps of time in blocks that stay in the cache, where they are looked at more than once."""
+    for start in range(0, time.size - 1, BLOCK):
+        yield np.diff(time[start : start + BLOCK + 1])
+
+
+def _rises(time: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether time is finite and strictly increasing; a time that is not finite has a step that is not."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return all(step.min() > 0 and step.max() < np.inf for step in _steps(time))
+
+
+def _fault(time: Float[np.ndarray, " n"]) -> str:
+    """Say where time does not increase, and what to do."""
+    if not np.all(np.isfinite(time)):
+        row = int(np.flatnonzero(~np.isfinite(time))[0])
+        return f"time is not a number in sample {row + 1}; remove that row"
+    with np.errstate(over="ignore"):
+        step = np.diff(time)
+    row = int(np.flatnonzero((step <= 0) | np.isinf(step))[0]) + 1
+    how = "repeats" if step[row - 1] == 0 else "runs backwards" if step[row - 1] < 0 else "leaps"
+    return f"time {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows"
+
+
 def _period(time: Float[np.ndarray, " n"]) -> float:
     """Return the sample period: the mean step between samples that are not across a gap.
 
-    The mean over gap-free steps is insensitive to timestamps rounded to a few digits; the median is not.
+    The mean over gap-free steps is insensitive to timestamps rounded to a few digits; the median is not. The median
+    that tells the gaps is over at most `BLOCK` steps; the odd stride meets both of two steps that alternate.
     """
-    step = np.diff(time)
-    return float(np.mean(step[step <= GAP * np.median(step)]))
+    first = np.arange(0, time.size - 1, (time.size - 2) // BLOCK | 1)
+    longest = GAP * float(np.median(time[first + 1] - time[first]))
+    total, count = 0.0, 0
+    for step in _steps(time):
+        short = step[step <= longest] if step.max() > longest else step
+        total += float(short.sum())
+        count += short.size
+    return total / count
 
 
 def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:

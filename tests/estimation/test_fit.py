@@ -292,6 +292,28 @@ def test_a_channel_in_the_wrong_unit_is_refused(stand, short_log):
         so.Experiment(plant=stand, log=log)
 
 
+@pytest.mark.parametrize(
+    ("still", "words"),
+    [
+        (("F1", "F2"), "F1 and F2 constant throughout, nothing can be learnt"),
+        (("I", "F1", "F2"), "F1 and F2 constant throughout"),
+        (("I",), "I constant throughout, nothing drives the plant"),
+    ],
+)
+def test_a_log_in_which_nothing_moves_is_refused(stand, short_log, thor, still, words):
+    arrays = short_log.to_arrays() | {name: np.full(len(short_log), 2.0) for name in still}
+    bench = experiment(stand, so.Log.from_arrays(**arrays))
+    with pytest.raises(EstimationError, match=words):
+        so.fit([bench], thor.free("J", "b_r"))
+
+
+def test_one_constant_output_is_noted_and_the_other_fitted(stand, short_log, thor):
+    log = so.Log.from_arrays(**short_log.to_arrays() | {"F2": np.full(len(short_log), 2.0)})
+    fit = so.fit([experiment(stand, log, sigma={"F1": 2.0, "F2": 1e6})], thor.update(J=2e-6).free("J"))
+    assert "chirp: F2: is constant at 2" in fit.notes
+    so.testing.assert_recovered(fit, thor, sigmas=4)
+
+
 @given(st.integers(0, 1000))
 @settings(max_examples=5)
 def test_scaling_the_force_scales_eta(seed):

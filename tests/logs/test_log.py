@@ -185,3 +185,30 @@ def test_arrays_round_trip(short_log):
 def test_bad_arguments_are_refused(gapped, call, error, words):
     with pytest.raises(error, match=words):
         call(gapped)
+
+
+@pytest.mark.parametrize("n", [2, 99_999, 100_002, 450_001])
+def test_the_period_is_the_mean_step_within_stretches(n: int) -> None:
+    step = np.random.default_rng(n).uniform(0.9e-3, 1.1e-3, n - 1)
+    kept = step.copy()
+    if n > 2:
+        step[[n // 3, n - 2]], kept[[n // 3, n - 2]] = (7.0, 2.0), np.nan
+    log = so.Log.from_arrays(time=np.concatenate([[0.0], np.cumsum(step)]), I=np.ones(n))
+    assert log.period == pytest.approx(np.nanmean(kept), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "said"),
+    [(250_000, np.nan, "not a number in sample 250001"), (299_999, np.inf, "not a number in sample 300000"),
+     (100_000, 99_999.0, "repeats at sample 100001"), (200_001, 5.0, "runs backwards at sample 200002")],
+)  # fmt: skip
+def test_a_fault_of_time_is_found_wherever_it_is(row: int, value: float, said: str) -> None:
+    time = np.arange(300_000.0)
+    time[row] = value
+    with pytest.raises(LogError, match=said):
+        so.Log.from_arrays(time=time, I=np.ones(time.size))
+
+
+def test_a_step_of_time_beyond_all_numbers_is_refused() -> None:
+    with pytest.raises(LogError, match="leaps at sample 2"):
+        so.Log.from_arrays(time=[-1.7e308, 1.7e308], I=np.ones(2))

@@ -38,7 +38,8 @@ _REFUSED: tuple[tuple[bytes, str], ...] = (
     *((b"\x80" + bytes([n]), "is a Python pickle, which could run code; save it as NPZ or CSV") for n in (2, 3, 4, 5)),
 )  # fmt: skip
 _JSON_NAMES = (".json", ".jsonl", ".ndjson")
-_BINARY_NAMES = {".mat": "MAT file of version 5 or 7.3; save it with -v7", ".bag": "ROS bag", ".mcap": "MCAP file",
+_BINARY_NAMES = {".mat": "MAT file of version 5 or 7.3 (save one of version 4 again with -v7)",
+                 ".bag": "ROS bag", ".mcap": "MCAP file",
                  ".db3": "ROS 2 bag", ".parquet": "Parquet file", ".npz": "NPZ archive", ".h5": "HDF5 file",
                  ".hdf5": "HDF5 file", ".mf4": "MDF file", ".tdms": "TDMS file"}  # fmt: skip
 

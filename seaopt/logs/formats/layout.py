@@ -114,7 +114,8 @@ def _head(path: Path) -> tuple[str, list[str]]:
         raise LogError(f"{path}: the file is empty; record the log again")
     encoding = next((name for bom, name in _BOMS if raw.startswith(bom)), "utf-8")
     if encoding != "utf-16" and b"\x00" in raw[:4096]:
-        raise LogError(f"{path}: is not a text file; save the log as CSV")
+        line = raw.count(b"\n", 0, raw.index(0)) + 1
+        raise LogError(f"{path}: line {line} holds a zero byte, it is not a text file; save the log as CSV")
     try:
         text = codecs.getincrementaldecoder(encoding)().decode(raw, final=len(raw) < HEAD)
     except UnicodeError as error:

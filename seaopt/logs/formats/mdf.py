@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import gc
+import sys
+import traceback
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,13 +26,9 @@ Places = Mapping[str, tuple[int, int]]
 
 def open_mdf(path: Path) -> Source:
     """List the channels of an MDF 4 file; a name that several groups have carries the group's number."""
-    asammdf = optional("asammdf", "mdf", path, "MDF")
     fields: list[Field] = []
     places: dict[str, tuple[int, int]] = {}
-    with path.open("rb") as stream:
-        if stream.read(68)[64:] != b"##HD":
-            raise LogError(f"{path}: is no MDF 4 file, or is cut off; convert an older one to MDF 4")
-    with path.open("rb") as stream, asammdf.MDF(stream) as file:
+    with _opened(path) as file:
         groups = list(file.groups)
         check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
         names = Counter(channel.name for group in groups for channel in group.channels)
@@ -46,6 +46,28 @@ def open_mdf(path: Path) -> Source:
                 )  # fmt: skip
                 places[label] = (number, index)
     return Source(path=path, format="MDF", fields=tuple(fields), load=partial(_load, path, places))
+
+
+@contextmanager
+def _opened(path: Path) -> Generator[Any]:
+    asammdf = optional("asammdf", "mdf", path, "MDF")
+    with path.open("rb") as stream:
+        if stream.read(68)[64:] != b"##HD":
+            raise LogError(f"{path}: is no MDF 4 file, or is cut off; convert an older one to MDF 4")
+    complain = sys.unraisablehook
+    try:
+        with path.open("rb") as stream, asammdf.MDF(stream) as file:
+            yield file
+    except Exception as error:
+        # What asammdf has half opened complains as it goes: it has to go here.
+        sys.unraisablehook = lambda _: None
+        while error is not None:
+            traceback.clear_frames(error.__traceback__)
+            error = error.__context__
+        gc.collect()
+        raise
+    finally:
+        sys.unraisablehook = complain
 
 
 def _label(name: str, group: int, names: Mapping[str, int]) -> str:
@@ -71,8 +93,7 @@ def _unit(channel: Any) -> str | None:
 def _load(
     path: Path, places: Places, names: Sequence[str], window: Window | None
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    asammdf = optional("asammdf", "mdf", path, "MDF")
-    with path.open("rb") as stream, asammdf.MDF(stream) as file:
+    with _opened(path) as file:
 
         def one(name: str, rows: slice) -> Float[np.ndarray, " n"]:
             group, index = places[name]

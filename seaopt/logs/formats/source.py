@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -174,7 +175,9 @@ def spread(
 
 @contextmanager
 def reading(path: Path, form: str) -> Generator[None]:
-    """Turn whatever a library raises on a damaged file into one line, and keep its warnings to ourselves."""
+    """Turn whatever a library raises on a damaged file into one line, and keep what else it says to ourselves."""
+    silenced = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -190,6 +193,8 @@ def reading(path: Path, form: str) -> Generator[None]:
             f"{path}: cannot be read as {form} ({one_line(error)}); the file may be cut off or damaged, copy or record "
             "it again"
         ) from error
+    finally:
+        logging.disable(silenced)
 
 
 def one_line(error: BaseException) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from seaopt.errors import LogError
 from seaopt.logs.formats.source import Field, Source, by_rows, check_size, optional
 
 UNIT = ("unit_string", "NI_UnitDescription")
@@ -20,6 +21,8 @@ def open_tdms(path: Path) -> Source:
     fields: list[Field] = []
     places: dict[str, tuple[str, str]] = {}
     with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
+        if file.file_status.incomplete_final_segment:
+            raise LogError(f"{path}: is cut off within its last segment; copy it again, or save what is left anew")
         for group in file.groups():
             clocks = _clocks(group)
             for channel in group.channels():
