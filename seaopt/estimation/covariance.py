@@ -7,7 +7,9 @@ residuals is :math:`H^{-1}`. Residuals of a real log are coloured; then
 
 with R the correlation of the residuals of all outputs, at all lags (Ljung, System Identification, 2nd ed., Sec. 9.5;
 Newey and West 1987). R is estimated from the residuals under a Parzen window, whose spectral matrix is never
-indefinite. With a robust loss the residuals in B are what the loss makes of them, and J^T J counts each sample with the
+indefinite. A fit takes out of a short log's residuals what its parameters can follow, which leaves them anticorrelated
+and would make B too small: where no lag of a short log can be told from chance, lags may widen the covariance but not
+narrow it. With a robust loss the residuals in B are what the loss makes of them, and J^T J counts each sample with the
 loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
 
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
@@ -31,6 +33,7 @@ from seaopt.estimation.residuals import CHUNK, Residuals
 
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
 SMALL = 512  # samples of a product that the linear-algebra library does on one thread
+FEW = 5000  # samples, beyond which what a fit takes out of its own residuals no longer matters
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 
 
@@ -66,19 +69,39 @@ def coloured(
     """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E."""
     p = inverse.shape[1]
     total = np.zeros((p, p))
-    for e, (pieces, sums) in enumerate(zip(problem.segments, left, strict=True)):
+    for e, sums in enumerate(left):
         r = correlations(sums)
-        reach, chunk = len(r) - 1, max(CHUNK, 4 * len(r))
-        longest = reach + min(chunk, max(piece.n for piece in pieces))
-        whole, again = (_Form.make(r, n) for n in (longest, reach))
-        for s in range(len(pieces)):
-            into = _into(problem, e, s, inverse)
-            tail = np.zeros((*into.shape[:2], 0))
-            for _, columns, used in column_chunks(problem, e, s, z, chunk):
-                with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)
-                total += whole(with_tail) - again(tail)
-                tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
+        found = _summed(problem, e, z, inverse, r)
+        if np.max(sums.count) < FEW and not _last_told(*_normalised(sums)):
+            found = _at_least(found, _summed(problem, e, z, inverse, r[:1]))
+        total += found
     return total
+
+
+def _summed(
+    problem: Residuals, e: int, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
+    r: Float[np.ndarray, "lags1 ny ny"],
+) -> Float[np.ndarray, "p p"]:  # fmt: skip
+    """Return one experiment's part of the double sum."""
+    pieces, total = problem.segments[e], np.zeros((inverse.shape[1],) * 2)
+    reach, chunk = len(r) - 1, max(CHUNK, 4 * len(r))
+    longest = reach + min(chunk, max(piece.n for piece in pieces))
+    whole, again = (_Form.make(r, n) for n in (longest, reach))
+    for s in range(len(pieces)):
+        into = _into(problem, e, s, inverse)
+        tail = np.zeros((*into.shape[:2], 0))
+        for _, columns, used in column_chunks(problem, e, s, z, chunk):
+            with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)
+            total += whole(with_tail) - again(tail)
+            tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
+    return total
+
+
+def _at_least(found: Float[np.ndarray, "p p"], floor: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Return the floor, and of what lies beside it only the directions in which it is more."""
+    scale = np.sqrt(np.maximum(np.diag(floor), 1e-300))
+    values, vectors = np.linalg.eigh((found - floor) / np.outer(scale, scale))
+    return floor + np.outer(scale, scale) * ((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _into(problem: Residuals, e: int, s: int, inverse: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "ny p nc"]:
@@ -143,22 +166,27 @@ def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
     The window reaches three times as far as correlation can be told from chance (after Politis, J. Nonparametric
     Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
-    count = np.maximum(left.count, 1.0)
-    found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
-    reach = _reach(found, float(np.max(count)))
+    found, count = _normalised(left)
+    reach = min(max(LEAST, int(WIDER * _last_told(found, count))), found.shape[2] - 1)
     return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1)
 
 
-def _reach(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
-    """Return the last lag of the window: after a run of lags at which no correlation can be told from chance."""
+def _normalised(left: Leftover) -> tuple[Float[np.ndarray, "ny ny lags1"], float]:
+    """Return the correlations before the window, and how many samples they are of."""
+    count = np.maximum(left.count, 1.0)
+    found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
+    return found, float(np.max(count))
+
+
+def _last_told(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
+    """Return the last lag before a run of lags at which no correlation can be told from chance; 0 if there is none."""
     power = np.sqrt(np.maximum(np.diagonal(r[:, :, 0]), 1e-300))
     size = np.max(np.abs(r) / np.outer(power, power)[:, :, None], axis=(0, 1))[1:]
     seen = np.flatnonzero(size > CHANCE * np.sqrt(np.log10(max(count, 10.0)) / max(count, 1.0)))
     run = max(20, int(np.sqrt(count) / 2))
     before = np.concatenate([[-1], seen])
     quiet = np.flatnonzero(np.diff(np.append(before, size.size + run)) > run)
-    last = int(before[quiet[0]]) + 1
-    return min(max(LEAST, int(WIDER * last)), size.size)
+    return int(before[quiet[0]]) + 1
 
 
 def with_infinities(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:

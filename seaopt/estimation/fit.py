@@ -146,6 +146,13 @@ def _check_motion(experiments: tuple[Experiment, ...]) -> None:
             f"{where}: {' and '.join(first.outputs)} constant throughout, nothing can be learnt from that; check the "
             "wiring, or choose another column"
         )
+    for e in experiments:
+        for name in e.outputs:
+            if name not in e.sigma and is_constant(e.log[name]):
+                raise EstimationError(
+                    f"experiment {e.name} ({e.log.source}): output {name} is constant throughout, so that its noise "
+                    "cannot be estimated and it would take all the weight; leave it out of outputs, or give its sigma"
+                )
     still = all(e.plant.inputs and all(is_constant(u) for u in input_samples(e.plant, e.log)) for e in experiments)
     if still and all(experiment.initial_state == "estimate" for experiment in experiments):
         raise EstimationError(

@@ -30,6 +30,10 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
 CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
+ANOTHER_SIZE = 100.0  # times the start, which hints at a unit rather than at a bad guess
+FEW = (
+    400  # samples below which intervals are too narrow: in 100 windows of the stand's log 90 to 96 % at 40, 92 % at 100
+)
 VAGUE = 3.0  # a std of so many times the value is no estimate
 
 
@@ -87,10 +91,32 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         log_likelihood=_log_likelihood(problem, found),
         unknowns=z.size,
         method=_method_name(method),
-        notes=tuple(f"{e.name}: {note}" for e in problem.experiments for note in e.notes),
+        notes=(
+            *(f"{e.name}: {note}" for e in problem.experiments for note in e.notes),
+            *_oddities(fitted, params, found),
+        ),
         experiments=problem.experiments,
         minimum=Minimum(problem=problem, z=z),
     )
+
+
+def _oddities(fitted: ParameterSet, given: ParameterSet, found: Evaluation) -> list[str]:
+    """Say what a search does not mind, but a reader should: values of another size, and few samples."""
+    odd: list[str] = []
+    for name, item in fitted.items():
+        start = given[name].value
+        if not item.free or start * item.value <= 0.0:
+            continue
+        times, way = (item.value / start, "above") if item.value / start > 1.0 else (start / item.value, "below")
+        if times > ANOTHER_SIZE:
+            odd.append(
+                f"{name} = {item.value:.3g} is {times:.0f} times {way} its start of {start:.3g}: "
+                "check the units of time, inputs and outputs"
+            )
+    samples = int(max(float(np.max(row)) for row in found.counts))
+    if samples < FEW:
+        odd.append(f"{samples} samples are few: 95 % intervals of so short a log cover about 90 %")
+    return odd
 
 
 def _method_name(method: Method) -> str:

@@ -314,6 +314,34 @@ def test_one_constant_output_is_noted_and_the_other_fitted(stand, short_log, tho
     so.testing.assert_recovered(fit, thor, sigmas=4)
 
 
+def test_a_dead_output_of_unknown_noise_is_refused(stand, short_log, thor):
+    """Its noise would be estimated as zero, and its weight as infinite."""
+    log = so.Log.from_arrays(**short_log.to_arrays() | {"F1": np.full(len(short_log), 5.0)})
+    with pytest.raises(EstimationError, match="output F1 is constant throughout"):
+        so.fit([so.Experiment(plant=stand, log=log, outputs=("F1", "F2"))], thor.free("J", "b_r", "eta"))
+
+
+def test_a_unit_that_a_parameter_can_absorb_is_asked_about(stand, short_log, thor):
+    """A current in mA that is taken for A makes an efficiency a thousand times too small."""
+    log = so.Log.from_arrays(**short_log.to_arrays() | {"I": 1e3 * short_log["I"]})
+    fit = so.fit([experiment(stand, log)], thor.free("J", "b_r", "eta"))
+    assert any("1000 times below its start of 1: check the units" in note for note in fit.notes)
+
+
+@pytest.mark.parametrize("samples", [40, 100])
+def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples):
+    """Windows of one log: what a fit takes out of few residuals may not narrow their intervals."""
+    log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3,
+                         sensors=so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}))  # fmt: skip
+    off = []
+    for start in range(0, 15000, 240):
+        window = so.Log.from_arrays(**{key: x[start : start + samples] for key, x in log.to_arrays().items()})
+        fit = so.fit([so.Experiment(plant=stand, log=window, outputs=("F1", "F2"))], thor.free("J", "b_r"))
+        off += [abs(fit.parameters[name].value - thor[name].value) / fit.parameters[name].std for name in ("J", "b_r")]
+    assert np.mean(np.array(off) < 1.96) >= 0.88
+    assert any("samples are few" in note for note in fit.notes)
+
+
 @given(st.integers(0, 1000))
 @settings(max_examples=5)
 def test_scaling_the_force_scales_eta(seed):
