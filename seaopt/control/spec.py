@@ -154,8 +154,9 @@ class ControllerSpec:
     def _check_band(self) -> None:
         if self.passive_band_hz is None:
             return
-        if len(self.passive_band_hz) != 2:
-            raise ControlError(f"passive_band_hz = {self.passive_band_hz!r} is not a band; give (low, high)")
+        given: Any = self.passive_band_hz
+        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(f, (int, float)) for f in given):
+            raise ControlError(f"passive_band_hz = {given!r} is not a band; give (low, high)")
         low, high = self.passive_band_hz
         if not LOWEST_HZ <= low < high < 0.5 * self.sample_rate_hz:
             raise ControlError(
