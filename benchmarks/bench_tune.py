@@ -3,7 +3,8 @@
 Each case draws a THOR-like actuator, a structure, limits, a rate and a delay, with or without a swinging output to be
 robust to. scipy's differential evolution then searches the same numbers for about 50 times the tuner's time, with
 the bandwidth met in closed form. Both answers are judged by the same NumPy code, which shares nothing with the
-tuner but the plant's continuous matrices and the law's definition. Options: --cases 40 --seed 1 --times 50 --only N.
+tuner but the plant's continuous matrices and the law's definition. Options: --cases 40 --seed 1 --times 50 --only N;
+--mixsyn 1 sets THOR's pid beside the H-infinity law of python-control's mixsyn (slycot) instead.
 """
 
 from __future__ import annotations
@@ -255,11 +256,63 @@ def compare(case: Case, times: float, seed: int) -> dict:
     }  # fmt: skip
 
 
+def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float = 60.0) -> None:
+    """Print THOR's stand under a tuned pid and under mixed sensitivity synthesis.
+
+    The latter is continuous (mixsyn does not know a sample time): hold and delay are a second-order Pade, abs(S) is
+    to stay below ms and, below a corner, to fall to 1e-4; abs(KS) below noise_gain. No bandwidth can be asked for: the
+    corner is the highest with which both are kept (gamma = 1).
+    """
+    import control
+
+    plant, params = so.plants.high_impedance(), so.plants.thor()
+    spec = so.ControllerSpec(bandwidth_hz=bandwidth_hz, max_sensitivity=ms, max_noise_gain=noise_gain)
+    started = time.process_time()
+    found = so.tune(plant, params, spec)
+    tuned_s = time.process_time() - started
+    model, gain = plant.linearize(params), current_per_force(plant, params)
+    row = list(plant.outputs).index(spec.measured)
+    given = control.ss(model.A, gain * model.B[:, [0]], model.C[[row]], gain * model.D[[row], :1])
+    late = control.tf2ss(*control.pade((0.5 + spec.delay_samples) * spec.sample_time_s, 2))
+    low, high = 0.1, 100.0
+    started = time.process_time()
+    while high / low > 1.01:
+        corner = np.sqrt(low * high)
+        w1 = control.tf([1 / ms, 2 * np.pi * corner], [1, 2e-4 * np.pi * corner])
+        made, _, (gamma, _) = control.mixsyn(given * late, w1=w1, w2=control.tf([1], [noise_gain]))
+        if gamma <= 1.0:
+            low, law = corner, made
+        else:
+            high = corner
+    made_s = time.process_time() - started
+    f = np.geomspace(1e-3, 1e4, 20_000)
+    s = 2j * np.pi * f
+    p = control.frequency_response(given, 2 * np.pi * f).complex * np.exp(-s * (0.5 + spec.delay_samples) / 1e3)
+    k = control.frequency_response(law, 2 * np.pi * f).complex
+    sensitivity = 1 / (1 + p * k)
+    t = np.abs(p * k * sensitivity)
+    under = np.flatnonzero(t < t[0] / np.sqrt(2))
+    inside = (f >= LOWEST_HZ) & (f <= bandwidth_hz)
+    tuned = np.abs(found.close(plant, params).sensitivity(f[inside]))
+    rejected = [np.trapezoid(size, np.log(f[inside])) for size in (tuned, np.abs(sensitivity)[inside])]
+    a, slow = found.achieved, f[np.argmax(np.abs(sensitivity) > np.sqrt(0.5))]
+    print(f"{'':12}{'Hz':>7}{'Ms':>7}{'noise gain':>12}{'|S| < -3 dB to':>16}{'int |S| dlnf':>14}{'order':>7}"
+          f"{'fastest pole':>14}{'cpu s':>7}")  # fmt: skip
+    print(f"{'so.tune pid':12}{a.bandwidth_hz:7.2f}{a.ms:7.3f}{a.noise_gain:12.1f}{a.sensitivity_bandwidth_hz:13.2f} Hz"
+          f"{rejected[0]:14.3f}{found.measurement.den.size - 1:7d}{'discrete':>14}{tuned_s:7.2f}")  # fmt: skip
+    print(f"{'mixsyn':12}{f[under[0]] if under.size else np.nan:7.2f}{np.abs(sensitivity).max():7.3f}"
+          f"{np.abs(k * sensitivity).max():12.1f}{slow:13.2f} Hz{rejected[1]:14.3f}{law.nstates:7d}"
+          f"{np.abs(law.poles()).max():14.3g}{made_s:7.2f}, corner {low:.3g} Hz")  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    for name, default in (("cases", 40), ("seed", 1), ("times", 50.0), ("only", -1)):
+    for name, default in (("cases", 40), ("seed", 1), ("times", 50.0), ("only", -1), ("mixsyn", 0)):
         parser.add_argument(f"--{name}", type=type(default), default=default)
     args = parser.parse_args()
+    if args.mixsyn:
+        beside_mixsyn()
+        return
     rng = np.random.default_rng(args.seed)
     cases = [draw(rng) for _ in range(args.cases)]
     compare(cases[0], 0.0, 0)  # builds the programs once

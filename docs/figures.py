@@ -23,7 +23,7 @@ from seaopt.control import (
     sample,
     sweep,
 )
-from seaopt.control.passivity import held, port_of
+from seaopt.control.port import held, port_of
 from seaopt.control.realisation import realise, runnable
 from seaopt.estimation import Limits, design_experiment
 from seaopt.reporting.verification import large_signal_figure, stability_figure

@@ -150,3 +150,10 @@ def test_the_verification_of_the_docs_works():
                 assert row.scenario in page
         elif "coupled" in code:
             assert not space["found"].everywhere and space["found"].fixed_stable
+
+
+def test_the_tuner_of_the_docs_works():
+    space: dict = {}
+    exec(re.sub(r"(?m)^print\(.*", "", blocks("tuning.md", "python")[0]), space)
+    assert space["controller"].feasible
+    assert [round(row.bandwidth_hz) for row in space["frontier"].rows] == [20, 30, 40]

@@ -13,7 +13,8 @@ one of L, 1 - L, C_y, P C_r, becomes
 
 .. math:: \mathrm{Re}\, e^{-j \arg X_k} X(\theta) \le M \rho(\theta),
 
-one side of the disk, whose other points a trust region keeps in reach. The objective
+one side of the disk, whose other points a trust region keeps in reach. Passivity of the port, Re
+conj(u) (1 + G C_y) >= 0 with u and G known, is affine as it stands. The objective
 :math:`\int |S|\, d\ln f \le \int d\ln f / \rho` is majorised by a convex function, of which the program takes value,
 gradient and curvature; the peak of :math:`|C_y S|` enters by its own rows. Bandwidth is a linearised equality. One
 slack, at a price, is added to every row, so that the program always has a solution and a start that breaks limits
@@ -170,6 +171,10 @@ def _rows(task: Task, grid: Grid, x: Point, law: _Affine) -> _Rows:
     through, by = p * law.c_r[column], p * law.by_r[:, column]
     near = _along(one, p * law.by_y[:, column]) / np.abs(one)[:, None]
     rows.add(used, used[:, None] * (near - _along(through, by) / np.abs(through)[:, None]))
+    if task.port is not None:
+        used, _, column, _ = chosen("passive")
+        turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
+        rows.add(used, -np.real(turned * law.by_y[:, column]).T / (limits.passive * size[:, None]))
     _bandwidth_rows(task, grid, x, law, rows)
     rows.add(np.array([1.0 + _integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
     return rows

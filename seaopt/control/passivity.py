@@ -43,17 +43,16 @@ from jaxtyping import Complex, Float
 from seaopt.control.controller import Controller
 from seaopt.control.crossings import crossings
 from seaopt.control.law import TransferFunction
+from seaopt.control.port import Frequencies, Port, Response, held, port_of, sight
 from seaopt.control.spec import ControllerSpec
-from seaopt.errors import ControlError, suggestion
+from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, state_space
+from seaopt.plants import Plant
 
-Frequencies = Float[np.ndarray, " m"]
-Response = Complex[np.ndarray, " m"]
+Curve = Callable[[Frequencies], Any]
 LOWEST_HZ = 0.01
 POINTS = 2000
 ROUNDING = 1e-9  # cosines of the impedance's angle nearer to zero than this are zero
-NOT_AFFINE = 1e-6  # Delta of this share of its terms, and more, makes the condition quadratic in the gains
 TINY = float(np.finfo(float).tiny)
 
 
@@ -123,110 +122,6 @@ class Passivity:
         return "\n".join(lines)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PortResponse:
-    """G_11, G_12, G_21, G_22 of the module's docstring at some frequencies; `feedback` is the fed-back force."""
-
-    motor_to_feedback: Response
-    motion_to_feedback: Response
-    motor_to_port: Response
-    motion_to_port: Response
-
-    @property
-    def determinant(self) -> Response:
-        """Delta."""
-        return self.motor_to_feedback * self.motion_to_port - self.motion_to_feedback * self.motor_to_port
-
-    def impedance(self, law: Response) -> Response:
-        """Return Z under F_m = -law F."""
-        return (self.motion_to_port + self.determinant * law) / (1.0 + self.motor_to_feedback * law)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Port:
-    """A linearised plant whose link 2 is moved and whose link 1 is held.
-
-    Parameters
-    ----------
-    a, motor, force
-        x' = a x + motor F_m + force Fe2, shapes (n, n), (n,), (n,).
-    feedback : array, shape (n + 2,)
-        The fed-back force of x, F_m and Fe2.
-    speed : int
-        Which state is v_2.
-    mass : float
-        m_2, kg, which is taken off again.
-
-    """
-
-    a: Float[np.ndarray, "n n"]
-    motor: Float[np.ndarray, " n"]
-    force: Float[np.ndarray, " n"]
-    feedback: Float[np.ndarray, " n+2"]
-    speed: int
-    mass: float
-
-    def response(self, f: Frequencies) -> PortResponse:
-        """Return the responses to motor force and to motion, Fe2 being what that motion takes."""
-        n, s = self.motor.size, 2j * np.pi * f
-        inner = np.zeros((f.size, n + 1, n + 1), dtype=complex)
-        inner[:, :n, :n] = s[:, None, None] * np.eye(n) - self.a
-        inner[:, :n, n] = -self.force
-        inner[:, n, self.speed] = 1.0
-        causes = np.zeros((n + 1, 2))
-        causes[:n, 0], causes[n, 1] = self.motor, 1.0
-        x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (f.size, n + 1, 2)))
-        taken = x[:, n]
-        read = np.einsum("i,mij->mj", self.feedback[:n], x[:, :n]) + self.feedback[n + 1] * taken
-        read[:, 0] += self.feedback[n]
-        return PortResponse(
-            motor_to_feedback=read[:, 0],
-            motion_to_feedback=read[:, 1],
-            motor_to_port=taken[:, 0],
-            motion_to_port=taken[:, 1] - s * self.mass,
-        )
-
-    def modes_hz(self) -> tuple[Frequencies, Frequencies]:
-        """Return frequency and half width of the poles with link 2 at rest."""
-        moved = self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed]
-        poles = np.linalg.eigvals(moved)
-        return np.abs(poles.imag) / (2 * np.pi), np.abs(poles.real) / (2 * np.pi)
-
-
-def port_of(plant: Plant, params: ParameterSet, measured: str, current_per_force_A_per_N: float) -> Port:
-    """Return a plant's port at link 2, driven by the current for a motor force.
-
-    Raises
-    ------
-    ControlError
-        The plant has no such port or output.
-
-    """
-    if plant.port is None:
-        raise ControlError(f"plant {plant.name} has no port at link 2; use high_impedance, moving_output or two_link")
-    port: Plant = plant.port()
-    if measured not in port.outputs:
-        raise ControlError(
-            f'measured = "{measured}" is not an output of {port.name}; {suggestion(measured, port.outputs)}'
-        )
-    a, b, c, d = state_space(port, params)
-    motor, external = (list(port.inputs).index(name) for name in ("I", "Fe2"))
-    row = list(port.outputs).index(measured)
-    return Port(
-        a=a,
-        motor=current_per_force_A_per_N * b[:, motor],
-        force=b[:, external].copy(),
-        feedback=np.concatenate([c[row], [current_per_force_A_per_N * d[row, motor], d[row, external]]]),
-        speed=list(port.states).index("v_2"),
-        mass=port.complete(params)["m_2"].value,
-    )
-
-
-def held(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:
-    """Return the response of a delay and a zero-order hold."""
-    return np.sinc(f * sample_time_s) * np.exp(-2j * np.pi * f * sample_time_s * (0.5 + delay_samples))
-
-
 def passivity(
     controller: Controller,
     plant: Plant,
@@ -274,14 +169,7 @@ def passivity(
         )
     port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
     law = controller.measurement
-
-    def impedance(f: Frequencies) -> Response:
-        return port.response(f).impedance(law.response(f, ts) * held(f, ts, controller.delay_samples))
-
-    def angle(f: Frequencies) -> Frequencies:
-        z = impedance(f)
-        return np.real(z) / np.maximum(np.abs(z), TINY)
-
+    impedance, angle = _curves(port, law, ts, controller.delay_samples)
     f = _with_minima(angle, _with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
     bands, violated = _bands(lambda x: angle(x) + ROUNDING, f)
     z = impedance(f)
@@ -296,6 +184,17 @@ def passivity(
         least_cosine=float(np.real(z[least]) / max(abs(z[least]), TINY)),
         limit_hz=_limit(port, f),
     )
+
+
+def least_cosine(
+    port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the least Re Z/abs(Z) in a band, refined to rounding, and the frequency in Hz where it is."""
+    _, angle = _curves(port, law, sample_time_s, delay_samples)
+    f = _with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
+    found = angle(f)
+    least = int(np.argmin(found))
+    return float(found[least]), float(f[least])
 
 
 def passivity_rows(
@@ -332,17 +231,22 @@ def passivity_rows(
         is quadratic in the gains.
 
     """
-    response = port_of(plant, params, spec.measured, current_per_force_A_per_N).response(f)
-    g11, g22 = response.motor_to_feedback, response.motion_to_port
-    size = np.abs(g11 * g22) + np.abs(response.motion_to_feedback * response.motor_to_port)
-    if np.any(np.abs(response.determinant) > NOT_AFFINE * size):
-        raise ControlError(
-            f"the force at the port of {plant.name} does not follow from {spec.measured} alone, so that passivity is "
-            "not affine in the gains; leave the constraint out and read the band that is reported"
-        )
-    through = (g11 * held(f, spec.sample_time_s, spec.delay_samples))[:, None] * basis
-    unit = g22 / np.abs(g22)
-    return np.real(unit[:, None] * np.conj(through)), -np.real(unit)
+    port = port_of(plant, params, spec.measured, current_per_force_A_per_N)
+    loop, unit = sight(port, spec.sample_time_s, spec.delay_samples, f)
+    return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
+
+
+def _curves(port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
+    """Return Z and Re Z/abs(Z) as functions of frequency."""
+
+    def impedance(f: Frequencies) -> Response:
+        return port.response(f).impedance(law.response(f, sample_time_s) * held(f, sample_time_s, delay_samples))
+
+    def angle(f: Frequencies) -> Frequencies:
+        z = impedance(f)
+        return np.real(z) / np.maximum(np.abs(z), TINY)
+
+    return impedance, angle
 
 
 def _grid(port: Port, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:

@@ -5,10 +5,11 @@ notch move together: minimise the objective subject to
 
 .. math:: \ln u_i(x) \le s, \qquad \ln (\sqrt2\,|P C_r| / |1 + L|)_{f_b} = 0, \qquad k_i \ge \omega_i (1 + k_p)
 
-with :math:`u_i` the usages of `seaopt.control.task` at the points of plant and frequency that matter, and one slack
-:math:`s \ge 0` at a price that is beyond any gain of the objective, so that limits that cannot all be kept are
-missed by one common factor, the least possible. Derivatives, first and second, are CasADi's; the solver is IPOPT. A
-program of given numbers of points is built once and used for every plant and specification.
+with :math:`u_i` the usages of `seaopt.control.task` at the points of plant and frequency that matter (in the passive
+band :math:`u_i - 1` in place of the logarithm), and one slack :math:`s \ge 0` at a price that is beyond any gain of the
+objective, so that limits that cannot all be kept are missed by one common factor, the least possible. Derivatives,
+first and second, are CasADi's; the solver is IPOPT. A program of given numbers of points is built once and used for
+every plant and specification.
 """
 
 from __future__ import annotations
@@ -133,14 +134,17 @@ def _choose(task: Task, grid: Grid, x: Point) -> dict[str, Int[np.ndarray, " n"]
 
 
 @lru_cache(maxsize=32)
-def _program(quadrature: int, observer: bool, notch: bool, feedback_only: bool, noise: bool) -> tuple[Any, list[str]]:
+def _program(
+    quadrature: int, observer: bool, notch: bool, feedback_only: bool, noise: bool, passive: bool
+) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
-    kinds = (*EVERYWHERE, *ON_DESIGN)
+    kinds = (*EVERYWHERE, *ON_DESIGN, *(["passive"] * passive))
     n = POINTS * len(kinds)
     total = n + quadrature * WORST * (not noise)
     shapes = {
         "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
         "inv_im": total, "weight": quadrature, "ln_limit": n, "at": 8, "ts": 1, "kff": 1, "scale": 8, "rate": 1,
+        "unit": 2 * POINTS * passive,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
     v, t, slack = ca.MX.sym("v", 8), ca.MX.sym("t"), ca.MX.sym("slack")
@@ -169,6 +173,11 @@ def _program(quadrature: int, observer: bool, notch: bool, feedback_only: bool, 
     }  # fmt: skip
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
+        if kind == "passive":  # P is the port's loop here
+            u, one = _Complex(data["unit"][:POINTS], data["unit"][POINTS:]), open_loop + 1.0
+            cosine = (u.re * one.re[where] + u.im * one.im[where]) / ca.sqrt(distance[where])
+            usage[kind] = (1 - cosine) / ca.exp(data["ln_limit"][where]) - 1
+            continue
         top = above[kind] if isinstance(above[kind], float) else above[kind][where]
         size = 0.5 * ca.log((top + NEGLIGIBLE) / distance[where])
         if kind == "low":
@@ -204,9 +213,13 @@ def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarra
     spec, noise = task.spec, task.spec.objective == "noise"
     limits = task.limits()._asdict() | {"low": 1.0}
     limits["slow"] = 1.0 / limits["slow"]
-    m, kinds = grid.f.size, (*EVERYWHERE, *ON_DESIGN)
+    m, kinds, passive = grid.f.size, (*EVERYWHERE, *ON_DESIGN), task.port is not None
     flat = np.concatenate([chosen[kind] for kind in kinds])
-    columns, p = flat % m, grid.p.ravel()[flat]
+    columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
+    if passive:
+        own, kinds = chosen["passive"], (*kinds, "passive")
+        columns, p = np.concatenate([columns, own]), np.concatenate([p, grid.port[own]])
+        unit = np.where(grid.unit[own] == 0.0, 1.0, grid.unit[own])  # outside the band nothing is asked
     weights = np.zeros(0)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
@@ -224,10 +237,15 @@ def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarra
     data = [
         *parts, weights, np.repeat(np.log([limits[kind] for kind in kinds]), POINTS),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
-        [task.least_rate],
+        [task.least_rate], np.real(unit), np.imag(unit),
     ]  # fmt: skip
     solver, _ = _program(
-        weights.size, task.nominal is not None, spec.notch is not None, spec.derivative == "measurement", noise
+        weights.size,
+        task.nominal is not None,
+        spec.notch is not None,
+        spec.derivative == "measurement",
+        noise,
+        passive,
     )
     used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
     value = task.objective(grid, start)

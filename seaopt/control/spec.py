@@ -12,6 +12,7 @@ from seaopt.errors import ControlError, suggestion
 LIMITS = ("max_sensitivity", "max_complementary", "max_reference_peak", "max_noise_gain")
 OPTIONAL = ("min_disk_margin", "min_sensitivity_bandwidth_hz", "current_limit_A", "step_N")
 MAX_DELAY_SAMPLES = 1000
+LOWEST_HZ = 1e-3  # limits are kept from here
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +48,9 @@ class ControllerSpec:
         Peak of abs(F_m / noise on F), N/N, design plant.
     min_sensitivity_bandwidth_hz : float, optional
         abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.
+    passive_band_hz : (low, high), optional
+        From here to there the actuator of the design plant is passive at link 2 with link 1 held, Re Z >= 0
+        (`seaopt.control.passivity`).
     objective : {"disturbance", "noise"}
         Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
     current_limit_A : float, optional
@@ -78,6 +82,7 @@ class ControllerSpec:
     max_reference_peak: float | None = None
     max_noise_gain: float | None = None
     min_sensitivity_bandwidth_hz: float | None = None
+    passive_band_hz: tuple[float, float] | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     current_limit_A: float | None = None
     step_N: float | None = None
@@ -138,12 +143,26 @@ class ControllerSpec:
         if disk is not None and not 0.0 < disk < 2.0:
             raise ControlError(f"min_disk_margin = {disk:g} can be met by no loop; give more than 0 and less than 2")
         self._check_notch()
+        self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
             raise ControlError(f"step_N = {self.step_N:g} is not positive; give the step's size")
         if self.current_limit_A is not None and not self.current_limit_A > 0.0:
             raise ControlError(f"current_limit_A = {self.current_limit_A:g} is not positive; give the motor's limit")
         if not 0.0 <= self.reserve < 0.5:
             raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
+
+    def _check_band(self) -> None:
+        if self.passive_band_hz is None:
+            return
+        given: Any = self.passive_band_hz
+        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(f, (int, float)) for f in given):
+            raise ControlError(f"passive_band_hz = {given!r} is not a band; give (low, high)")
+        low, high = self.passive_band_hz
+        if not LOWEST_HZ <= low < high < 0.5 * self.sample_rate_hz:
+            raise ControlError(
+                f"passive_band_hz = [{low:g}, {high:g}] is not a band; give {LOWEST_HZ:g} <= low < high < "
+                f"{0.5 * self.sample_rate_hz:g} Hz, half the sample rate"
+            )
 
     def _check_notch(self) -> None:
         if self.notch is None:

@@ -15,6 +15,7 @@ frequencies, then by the objective. Since the plants are stable, next to no feed
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -33,6 +34,7 @@ from seaopt.control.task import (
 RATES = 24  # values of k_d
 COARSE = 90  # frequencies
 SCANNED_PLANTS = 4
+IN_BAND = 20  # frequencies of the passive band
 TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: less is an encirclement
 
 
@@ -88,11 +90,12 @@ def _alike(task: Task, x: Point, other: Point) -> bool:
 def _coarse(task: Task, grid: Grid) -> Grid:
     """Return about COARSE of the grid's frequencies, the bandwidth and the plants' light modes among them."""
     wanted = [task.spec.bandwidth_hz, *(f for plant in task.plants[:SCANNED_PLANTS] for f, _ in light_modes(plant))]
+    wanted += [*np.geomspace(*task.spec.passive_band_hz, IN_BAND)] if task.spec.passive_band_hz is not None else []
     near = [int(np.argmin(np.abs(grid.f - f))) for f in wanted]
     even = np.searchsorted(grid.f, np.geomspace(OBJECTIVE_HZ, grid.f[-1], COARSE))
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
-    return Grid(f=coarse.f, q=coarse.q, p=coarse.p[:SCANNED_PLANTS], kept=coarse.kept, inverse=coarse.inverse)
+    return replace(coarse, p=coarse.p[:SCANNED_PLANTS])
 
 
 def _shapes(task: Task) -> Iterator[tuple[float, float, float, float, float]]:
@@ -175,7 +178,7 @@ def _merit(task: Task, grid: Grid, c_y: Complex[np.ndarray, "n m"], c_r: Complex
     value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
     for row, p in enumerate(grid.p):
         usage = task.everywhere(p, c_y)
-        usage |= task.on_design(grid.f, p, c_y, c_r) if row == 0 else {}
+        usage |= task.on_design(grid, c_y, c_r) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = 1.0 + p * c_y

@@ -9,7 +9,9 @@ Every limit is one curve over frequency, its *usage*, which must not exceed 1:
     \frac{\sqrt 2}{|1 + L|} \; (f \le f_s), \quad \frac{|1 + L|}{\sqrt 2 |P C_r|} \; (f < f_b)
     \qquad \text{(design plant)}
 
-with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`.
+with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`. In the passive band there is a further one,
+1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.passivity`), the gap that the reserve leaves
+taken off.
 """
 
 from __future__ import annotations
@@ -24,9 +26,10 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.digital import DigitalPlant
 from seaopt.control.law import Gains, Nominal, Notch, Observer, Terms, terms
 from seaopt.control.loop import Loop
-from seaopt.control.spec import ControllerSpec
+from seaopt.control.passivity import least_cosine
+from seaopt.control.port import Port, sight
+from seaopt.control.spec import LOWEST_HZ, ControllerSpec
 
-LOWEST_HZ = 1e-3  # limits are kept from here
 OBJECTIVE_HZ = 0.1  # disturbances count from here
 INTEGRAL_RAD_S = 2 * np.pi * 0.05  # k_i / (1 + k_p) at least, so that the integral does something
 FREQUENCIES = 300
@@ -55,6 +58,7 @@ class Limits(NamedTuple):
     peak: float
     noise: float
     slow: float  # abs(1 + L) at least
+    passive: float  # 1 - Re Z/abs(Z)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,6 +73,8 @@ class Grid:
         Plants with hold and delay; the first is the design plant.
     kept, inverse
         The nominal plant's parts at q; zeros without an observer.
+    port, unit
+        The loop with link 2 held but for C_y, and G_22/abs(G_22), in the passive band; zeros elsewhere.
 
     """
 
@@ -77,23 +83,27 @@ class Grid:
     p: Complex[np.ndarray, "n m"]
     kept: Complex[np.ndarray, " m"]
     inverse: Complex[np.ndarray, " m"]
+    port: Complex[np.ndarray, " m"]
+    unit: Complex[np.ndarray, " m"]
 
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
-            f=self.f[index], q=self.q[index], p=self.p[:, index], kept=self.kept[index], inverse=self.inverse[index]
-        )
+            f=self.f[index], q=self.q[index], p=self.p[:, index], kept=self.kept[index], inverse=self.inverse[index],
+            port=self.port[index], unit=self.unit[index],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
-    """A specification with the plants it is to hold for; the first is the design plant."""
+    """A specification with the plants it is to hold for; the first is the design plant, whose port must be passive."""
 
     spec: ControllerSpec
     plants: tuple[DigitalPlant, ...]
     names: tuple[str, ...]
     k_ff: float
     nominal: Nominal | None
+    port: Port | None = None
 
     @property
     def least_rate(self) -> float:
@@ -115,7 +125,7 @@ class Task:
             s.max_reference_peak, s.max_noise_gain,
         )  # fmt: skip
         peaks = (NO_LIMIT if value is None else max(value * keep, 1e-6) for value in given)
-        return Limits(*peaks, slow=np.sqrt(2.0) / keep)
+        return Limits(*peaks, slow=np.sqrt(2.0) / keep, passive=keep)
 
     def bounds(self) -> tuple[Point, Point]:
         """Return the least and largest values of the eight numbers; equal where a number is fixed or absent."""
@@ -165,7 +175,14 @@ class Task:
             inverse = self.nominal.inverse.response(f, self.spec.sample_time_s)
         chosen = self.plants if rows is None else [self.plants[row] for row in rows]
         p = np.array([plant.response(f) for plant in chosen])
-        return Grid(f=f, q=q, p=p, kept=kept, inverse=inverse)
+        port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
+        if self.port is not None and self.spec.passive_band_hz is not None:
+            low, high = self.spec.passive_band_hz
+            inside = np.flatnonzero((f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9)))
+            port[inside], unit[inside] = sight(
+                self.port, self.spec.sample_time_s, self.spec.delay_samples, f[inside]
+            )  # fmt: skip
+        return Grid(f=f, q=q, p=p, kept=kept, inverse=inverse, port=port, unit=unit)
 
     def terms(self, grid: Grid, x: Point) -> Terms:
         """Return the law's terms on a grid."""
@@ -189,7 +206,7 @@ class Task:
         c_r, c_y = self.law(grid, x)
         out = self.everywhere(grid.p, c_y)
         if design:
-            out |= {name: value[None] for name, value in self.on_design(grid.f, grid.p[0], c_y, c_r).items()}
+            out |= {name: value[None] for name, value in self.on_design(grid, c_y, c_r).items()}
         return out
 
     def everywhere(self, p: Complex[np.ndarray, "*k m"], c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
@@ -202,16 +219,29 @@ class Task:
         }  # fmt: skip
 
     def on_design(
-        self, f: Float[np.ndarray, " m"], p: Complex[np.ndarray, " m"], c_y: Complex[np.ndarray, "*n m"],
-        c_r: Complex[np.ndarray, "*n m"],
-    ) -> dict[str, np.ndarray]:  # fmt: skip
-        """Return the usage of the limits of the design plant."""
-        limits, distance, through = self.limits(), np.abs(1.0 + p * c_y), np.abs(p * c_r)
-        return {
+        self, grid: Grid, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
+    ) -> dict[str, np.ndarray]:
+        """Return the usage of the limits of the design plant, the grid's first."""
+        f, p, limits = grid.f, grid.p[0], self.limits()
+        distance, through = np.abs(1.0 + p * c_y), np.abs(p * c_r)
+        out = {
             "peak": through / (limits.peak * distance), "noise": np.abs(c_y) / (limits.noise * distance),
             "slow": np.where(self.slow(f), limits.slow / distance, 0.0),
             "low": np.where(self.low(f), distance / np.maximum(np.sqrt(2.0) * through, 1e-12), 0.0),
         }  # fmt: skip
+        if self.port is not None:
+            held = 1.0 + grid.port * c_y
+            cosine = np.real(grid.unit * np.conj(held)) / np.maximum(np.abs(held), 1e-300)
+            out["passive"] = np.where(grid.unit != 0.0, (1.0 - cosine) / limits.passive, 0.0)
+        return out
+
+    def least_cosine(self, x: Point) -> tuple[float, float] | None:
+        """Return the least Re Z/abs(Z) in the passive band and where it is; None where none is asked for."""
+        spec, band = self.spec, self.spec.passive_band_hz
+        if self.port is None or band is None:
+            return None
+        _, law = self.gains(x).transfer_functions(spec.structure, spec.sample_time_s)
+        return least_cosine(self.port, law, spec.sample_time_s, spec.delay_samples, band)
 
     def slow(self, f: Float[np.ndarray, " m"]) -> np.ndarray:
         """Tell where abs(S) must be below -3 dB."""
@@ -259,13 +289,14 @@ def _range(given: float | None, low: float, high: float) -> tuple[float, float]:
 
 def light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
     """Return frequency (Hz) and damping ratio of the modes that are lightly damped."""
-    poles = np.log(np.linalg.eigvals(plant.a).astype(complex)) / plant.sample_time_s
-    found = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles if p.imag > 0]
+    values = np.linalg.eigvals(plant.a).astype(complex)
+    poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
+    found = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles]
     return [(float(f), float(max(zeta, 1e-9))) for f, zeta in found if zeta < LIGHT]
 
 
 def frequencies(task: Task) -> Float[np.ndarray, " m"]:
-    """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with 0.1 Hz, f_b and f_s in it.
+    """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
 
     About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
     what falls between is found afterwards.
@@ -278,7 +309,8 @@ def frequencies(task: Task) -> Float[np.ndarray, " m"]:
     extra = np.sort(np.concatenate([np.zeros(0), *near]))
     extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
     slow, base = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW), np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
-    grid = np.unique(np.concatenate([slow[:-1], base, extra, [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz]]))
+    ends = [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz, *(spec.passive_band_hz or ())]
+    grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
     return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
 
 

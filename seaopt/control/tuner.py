@@ -30,9 +30,10 @@ from seaopt.control.digital import sample
 from seaopt.control.law import Nominal
 from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.polish import polished
-from seaopt.control.spec import ControllerSpec
+from seaopt.control.port import port_of
+from seaopt.control.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.starts import starts
-from seaopt.control.task import LOWEST_HZ, OBJECTIVE_HZ, Grid, Point, Task, frequencies
+from seaopt.control.task import OBJECTIVE_HZ, Grid, Point, Task, frequencies
 from seaopt.control.verdict import BANDWIDTH_TOLERANCE as BANDWIDTH_TOLERANCE
 from seaopt.control.verdict import active, broken, explained
 from seaopt.errors import ControlError, suggestion
@@ -99,7 +100,8 @@ def tune(
     ------
     ControlError
         The measured output does not respond to the motor at 0 Hz, the plant is unstable without control, a draw names
-        a parameter that no plant has, or delay or current limit rule the request out for every controller.
+        a parameter that no plant has, delay or current limit rule the request out for every controller, or a passive
+        band is asked of a plant without a port at link 2, or with an elastic screw before it.
 
     Examples
     --------
@@ -117,7 +119,7 @@ def tune(
     check_current(spec, task.k_ff, current_per_force(plant, params), friction)
     x, figures = solved(task)
     largest = None
-    if broken(spec, task.names, figures):
+    if broken(spec, task.names, figures, task.least_cosine(x)):
         largest, near = largest_bandwidth(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near is not None:
@@ -159,7 +161,8 @@ def make_task(
         if np.max(np.abs(np.linalg.eigvals(sampled.a))) > 1.0 + 1e-9:
             raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
-    return Task(spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal)
+    port = None if spec.passive_band_hz is None else port_of(plant, params, spec.measured, gain)
+    return Task(spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal, port=port)
 
 
 def _drawn(
@@ -284,7 +287,8 @@ def controller_of(
 ) -> Controller:
     """Return the controller of tuned numbers."""
     spec, gains = task.spec, task.gains(x)
-    blocked = broken(spec, task.names, figures)
+    port = task.least_cosine(x)
+    blocked = broken(spec, task.names, figures, port)
     reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
     return Controller(
         structure=spec.structure,
@@ -297,11 +301,11 @@ def controller_of(
         spec=spec,
         achieved=figures[0],
         feasible=not blocked,
-        active_constraints=tuple(blocked or active(spec, task.names, figures)),
+        active_constraints=tuple(blocked or active(spec, task.names, figures, port)),
         robust_to=task.names[1:],
         design=design,
         observer=gains.observer,
-        blocked_by=explained(spec, task.names, figures),
+        blocked_by=explained(spec, task.names, figures, port),
         largest_bandwidth_hz=largest,
     )
 

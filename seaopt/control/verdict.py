@@ -9,6 +9,9 @@ from seaopt.control.spec import ControllerSpec
 
 BANDWIDTH_TOLERANCE = 0.005
 ROUNDING = 1e-6
+PASSIVE = -1e-9  # Re Z/abs(Z) that is still called zero
+
+Port = tuple[float, float] | None  # the least Re Z/abs(Z) in the passive band, and where in Hz, if one is asked for
 
 
 class Use(NamedTuple):
@@ -39,7 +42,7 @@ def uses(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures
     return out
 
 
-def broken(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> list[str]:
+def broken(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], port: Port = None) -> list[str]:
     """Return the limits that the figures break, with the plant that breaks them."""
     design = figures[0]
     out = [f"stability ({name})" for name, item in zip(names, figures, strict=True) if not item.stable]
@@ -49,19 +52,25 @@ def broken(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigur
         out.append("bandwidth_hz")
     if design.sensitivity_bandwidth_hz < spec.sensitivity_bandwidth_limit_hz * (1 - 1e-3):
         out.append("min_sensitivity_bandwidth_hz")
+    if port is not None and port[0] < PASSIVE:
+        out.append("passive_band_hz")
     return out
 
 
-def active(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> list[str]:
+def active(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], port: Port = None) -> list[str]:
     """Return the limits that are met with no more than the reserve and a hundredth to spare."""
     near = 1.0 - spec.reserve - 0.01
     out = [use.label for use in uses(spec, names, figures) if use.ratio > near]
     if figures[0].sensitivity_bandwidth_hz < 1.01 * spec.sensitivity_bandwidth_limit_hz:
         out.append("min_sensitivity_bandwidth_hz")
+    if port is not None and port[0] < spec.reserve + 0.01:
+        out.append("passive_band_hz")
     return out
 
 
-def explained(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> tuple[str, ...]:
+def explained(
+    spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], port: Port = None
+) -> tuple[str, ...]:
     """Return what blocks, each limit with the figure that the best compromise reaches."""
     known = {use.label: f"{use.label} {use.value:.4g} of {use.allowed:g}" for use in uses(spec, names, figures)}
     design = figures[0]
@@ -72,4 +81,9 @@ def explained(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFi
     known["min_sensitivity_bandwidth_hz"] = (
         f"min_sensitivity_bandwidth_hz {design.sensitivity_bandwidth_hz:.4g} of {spec.sensitivity_bandwidth_limit_hz:g}"
     )
-    return tuple(known.get(label, label) for label in broken(spec, names, figures))
+    if port is not None and spec.passive_band_hz is not None:
+        low, high = spec.passive_band_hz
+        known["passive_band_hz"] = (
+            f"passive_band_hz = [{low:g}, {high:g}], Re Z/|Z| {port[0]:.3g} of 0 at {port[1]:.4g} Hz"
+        )
+    return tuple(known.get(label, label) for label in broken(spec, names, figures, port))

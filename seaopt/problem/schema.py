@@ -228,6 +228,7 @@ class ControllerTable(_Strict):
     max_reference_peak: Number | None = None
     max_noise_gain: Number | None = None
     min_sensitivity_bandwidth_hz: Number | None = None
+    passive_band_hz: tuple[Number, Number] | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     robust_to: list[Name] = []
     draws: Annotated[Whole, Field(ge=0, le=200)] = 0

@@ -14,6 +14,7 @@ from seaopt.control import Controller, Gains, Notch, Observer, corners, current_
 from seaopt.control.bounds import sensitivity_possible
 from seaopt.control.law import Nominal
 from seaopt.errors import ControlError
+from seaopt.robustness import placed
 
 from .test_loop import independent
 
@@ -132,6 +133,19 @@ def test_draws_and_corners_are_kept(stand, swing, thor):
         assert stable and ms <= 1.5 * (1 + 1e-6)
     with pytest.raises(ControlError, match='"I_q"'):
         so.tune(stand, thor, spec, {"swing": swing}, draws=[{"I_q": 1.0}])
+
+
+@pytest.mark.parametrize("delay_s", [1e-3, 2.4e-3])
+def test_a_plant_that_answers_later_is_kept_too(stand, thor, delay_s):
+    """A further delay is a pair of robust_to; the loop's response is recomputed with it as a factor."""
+    late = placed(stand, thor, "delay_s", delay_s, {"stand": stand})
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.8)
+    controller = so.tune(stand, thor, spec, {"late": (stand, late)})
+    assert controller.feasible
+    f = np.geomspace(0.01, 100.0, 4000)
+    once = controller.plant(stand, thor).response(f) * controller.measurement.response(f, controller.sample_time_s)
+    turned = np.abs(1 / (1 + once * np.exp(-2j * np.pi * f * delay_s))).max()
+    assert 1.0 < turned <= 1.8 * 1.01  # but for the images of a delay of no whole samples
 
 
 def test_draws_are_of_the_distribution(thor):

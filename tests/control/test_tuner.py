@@ -173,6 +173,7 @@ def test_the_force_limit_is_the_plants(stand, thor):
     saturation = 9.0 / controller.current_per_force_A_per_N
     assert controller.force_limit(30.0) == pytest.approx(saturation * abs(p) / abs(t), rel=1e-9)
     assert controller.force_limit(0.01) == pytest.approx(saturation, rel=1e-3)
+    assert controller.force_limit(30) == controller.force_limit(30.0)
 
 
 @pytest.mark.parametrize(
