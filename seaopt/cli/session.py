@@ -286,6 +286,10 @@ class Session:
             others=self.problem.parameters,
             progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
         )  # fmt: skip
+        tell("simulating scenarios")
+        result = result.with_simulation(
+            sensors=self.problem.sensors, current_step_A=table.current_step_A, seed=table.seed
+        )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         self.results["certify"] = result
         self._write("certify", result.to_dict())
