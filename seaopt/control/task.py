@@ -259,7 +259,8 @@ def _range(given: float | None, low: float, high: float) -> tuple[float, float]:
 
 def light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
     """Return frequency (Hz) and damping ratio of the modes that are lightly damped."""
-    poles = np.log(np.linalg.eigvals(plant.a).astype(complex)) / plant.sample_time_s
+    z = np.linalg.eigvals(plant.a).astype(complex)
+    poles = np.log(z[z != 0.0]) / plant.sample_time_s  # a pole at 0 is a sample of delay, and no mode
     found = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles if p.imag > 0]
     return [(float(f), float(max(zeta, 1e-9))) for f, zeta in found if zeta < LIGHT]
 

@@ -117,9 +117,7 @@ class Certificate:
         found = self._simulated(sensors, current_step_A, seed)
         kept = tuple(item for item in self.requirements if item.name != SIMULATION)
         requirements = (*kept, *_simulation_requirements(found))
-        return replace(
-            self, simulated=found, requirements=requirements, passed=all(item.met for item in requirements)
-        )
+        return replace(self, simulated=found, requirements=requirements, passed=all(item.met for item in requirements))
 
     def _simulated(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
         draws = {name: [worst[1]] for name, worst in self.worst.items()}

@@ -217,6 +217,7 @@ def _plain(value: Any) -> Any:
 
 
 def witness(row: Outcome) -> str:
+    """Return where a row's draw differs from nominal, as text that follows its reason."""
     return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
 
 
