@@ -125,7 +125,7 @@ class Controller:
         if self.spec.current_limit_A is None or self.design is None:
             return None
         loop = self.close(*self.design)
-        f = np.array([frequency_hz])
+        f = np.array([float(frequency_hz)])
         force = np.abs(loop.reference.response(f, self.sample_time_s) * loop.sensitivity(f))[0]
         return float(self.spec.current_limit_A / self.current_per_force_A_per_N / force)
 

@@ -175,8 +175,6 @@ def tune_certified(
     """
     if rounds < 1:
         raise ControlError(f"rounds = {rounds} is not a number of rounds; give 1 or more")
-    if not isinstance(plants, Mapping):
-        raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
     values = _values(parameters, others or ParameterSet())
     held = {name: (item, values) for name, item in plants.items() if item is not plant} | dict(robust_to or {})
     share = 1.0 - (1.0 - confidence) / rounds
