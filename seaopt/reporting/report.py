@@ -213,7 +213,7 @@ def rendered(figure: Any, kind: str) -> bytes:
 
 def _inline(svg: str, name: str) -> str:
     """Return the <svg> element alone, its ids made unique in the page."""
-    body = svg[svg.index("<svg") :]
+    body = re.sub(r'(<image\b[^>]*?)\sid="[^"]*"', r"\1", svg[svg.index("<svg") :])  # named after what they show, twice
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href|href)="#', rf'\1="#{name}-', body)
     body = body.replace("url(#", f"url(#{name}-")

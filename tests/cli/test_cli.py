@@ -100,7 +100,7 @@ def test_retune_tunes_until_certified(folder):
     assert out.returncode == 0, out.stdout + out.stderr
     assert "Joint tuning: certified in 2 rounds" in out.stdout
     assert "Certificate: passed" in out.stdout
-    held = json.loads((folder / "retune" / "controller.json").read_text(encoding="utf-8"))["robust_to"]
+    held = json.loads((folder / "retune" / "controller.json").read_text(encoding="utf-8"))["spec"]["robust_to"]
     assert any("round 1" in name for name in held)
 
 
