@@ -25,7 +25,7 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.problem import Problem, read_problem
 from seaopt.reporting import verdict, write_frontier_figure, write_report
-from seaopt.robustness import Certificate, certify
+from seaopt.robustness import Certificate, certify, tune_certified
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
@@ -258,8 +258,18 @@ class Session:
         spec = self.problem.spec
         assert spec is not None
         tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
-        draws = self.problem.draws(self.parameters())
-        result = tune(design, values, spec, self.problem.robust_to(values), draws=draws)
+        draws, robust_to = self.problem.draws(self.parameters()), self.problem.robust_to(values)
+        table = self.problem.robustness
+        if table.retune:
+            joint = tune_certified(
+                design, self.parameters(), spec, self.problem.certified_plants(), ranges=self.problem.ranges,
+                robust_to=robust_to, draws=draws, others=self.problem.parameters, samples=table.samples,
+                seed=table.seed + 1, rounds=table.retune,
+                progress=lambda done: tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz, round {done.number}"),
+            )  # fmt: skip
+            self.results["joint"], result = joint, joint.controller
+        else:
+            result = tune(design, values, spec, robust_to, draws=draws)
         self.results["tune"] = result
         self._write("tune", result.to_dict())
 
@@ -286,6 +296,10 @@ class Session:
             others=self.problem.parameters,
             progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
         )  # fmt: skip
+        tell("simulating scenarios")
+        result = result.with_simulation(
+            sensors=self.problem.sensors, current_step_A=table.current_step_A, seed=table.seed
+        )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         self.results["certify"] = result
         self._write("certify", result.to_dict())
@@ -319,7 +333,9 @@ class Session:
         found = self.results.get(stage)
         if stage == "frf":
             return found.verdict() if found is not None else []
-        return verdict(
+        joint = self.results.get("joint") if stage == "tune" else None
+        tuned = [(joint.status == "certified", f"Joint tuning: {joint.summary}")] if joint is not None else []
+        return tuned + verdict(
             found if stage == "fit" else None,
             found if stage == "tune" else None,
             found if stage == "certify" else None,
@@ -339,6 +355,8 @@ class Session:
             elif stage == "sweep":
                 show_frontier(self.results[stage], console)
             elif stage in ("fit", "tune", "certify"):
+                if stage == "tune" and "joint" in self.results:
+                    console.print(repr(self.results["joint"]), highlight=False, markup=False)
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
         for stage in ["fit", "tune", "certify"] if "report" in stages else stages:
             for good, text in self._verdict(stage):

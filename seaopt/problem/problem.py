@@ -37,6 +37,7 @@ from seaopt.problem.schema import (
     ParameterTable,
     ProblemTable,
     RobustnessTable,
+    SensorsTable,
     UnknownTable,
     VirtualTable,
 )
@@ -102,6 +103,11 @@ class Problem:
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Ranges of parameters besides the fit's covariance."""
         return dict(self.robustness.parameters)
+
+    @property
+    def sensors(self) -> Sensors:
+        """What the certificate's simulations read the measured output with."""
+        return _sensors(self.robustness.sensors)
 
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name."""
@@ -192,15 +198,9 @@ class Problem:
             if name not in truth:
                 raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, truth)}')
             truth[name] = replace(truth[name], value=value)
-        sensors = Sensors(
-            noise_std=table.noise_std,
-            offset=table.offset,
-            quantisation=table.quantisation,
-            saturation=table.saturation,
-        )
         return virtual_log(
             plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
-            seed=table.seed, sensors=sensors,
+            seed=table.seed, sensors=_sensors(table),
         )  # fmt: skip
 
 
@@ -231,6 +231,10 @@ def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
         return tuple(table.outputs)
     noisy = tuple(name for name in plant.outputs if name in table.noise_std)
     return noisy or tuple(name for name in ("F1", "F2") if name in plant.outputs) or tuple(plant.outputs)
+
+
+def _sensors(table: SensorsTable) -> Sensors:
+    return Sensors(**{name: getattr(table, name) for name in SensorsTable.model_fields})
 
 
 def _unknown(name: str, unit: str, item: float | UnknownTable) -> float | Parameter:
@@ -397,6 +401,7 @@ def _check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
             raise ProblemError(f'{place} = "{name}" is no [plant] of this file; {suggestion(name, plants)}')
     _check_measured(table, plants)
     _check_ranges(table, plants)
+    _check_sensors(table, plants)
     seen: set[str] = set()
     for item in table.experiment:
         if item.name in seen:
@@ -419,6 +424,15 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
                 f'controller.measured = "{measured}" is not an output of plant.{name}; '
                 f"{suggestion(measured, plants[name].outputs)}"
             )
+
+
+def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+    given = table.robustness.sensors if table.robustness else SensorsTable()
+    known = {name for plant in plants.values() for name in plant.outputs}
+    for kind in SensorsTable.model_fields:
+        for name in getattr(given, kind):
+            if name not in known:
+                raise ProblemError(f'robustness.sensors.{kind} names "{name}"; {suggestion(name, known)}')
 
 
 def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant]) -> None:

@@ -12,6 +12,7 @@ class _Strict(BaseModel):
 
 
 Number = Annotated[float, Strict()]
+NotNegative = Annotated[Number, Field(ge=0)]
 Whole = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
@@ -140,16 +141,21 @@ class ExcitationTable(_Strict):
     multisine: MultisineTable | None = None
 
 
-class VirtualTable(_Strict):
+class SensorsTable(_Strict):
+    """What sensors do to outputs, by name."""
+
+    noise_std: dict[str, NotNegative] = {}
+    offset: dict[str, Number] = {}
+    quantisation: dict[str, NotNegative] = {}
+    saturation: dict[str, NotNegative] = {}
+
+
+class VirtualTable(SensorsTable):
     """A virtual experiment in place of a log."""
 
     seed: Whole
     duration_s: Annotated[Number, Field(gt=0, le=1e6)]
     rate_hz: Annotated[Number, Field(gt=0, le=1e6)]
-    noise_std: dict[str, Number] = {}
-    offset: dict[str, Number] = {}
-    quantisation: dict[str, Number] = {}
-    saturation: dict[str, Number] = {}
     truth: dict[str, Number] = {}
     excitation: ExcitationTable
     outputs: list[str] = []
@@ -243,7 +249,10 @@ class RobustnessTable(_Strict):
     plants: list[Name] = []
     parameters: dict[str, tuple[Number, Number]] = {}
     samples: Annotated[Whole, Field(ge=1, le=10_000_000)] = 1375
-    seed: Whole = 1
+    seed: Annotated[Whole, Field(ge=0)] = 1
+    retune: Annotated[Whole, Field(ge=0, le=20)] = 0
+    sensors: SensorsTable = SensorsTable()
+    current_step_A: NotNegative = 0.0
 
 
 class ProblemTable(_Strict):

@@ -48,7 +48,7 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     ----------
     results : sequence of Fit, Ranking, Controller, Certificate, Verification, StabilityMap, LargeSignal
         At most one of each, of the last any number; sections of what is not there are left out. A fit that was not
-        read from a file has a section of diagnostics.
+        read from a file has a section of diagnostics. What a certificate has simulated stands for itself.
     path : path
         The page; figures go to the folder ``figures`` beside it.
     title : str
@@ -81,8 +81,12 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
         raise SeaoptError(
             "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
         )
-    if controller is None and certificate is not None:
-        controller = certificate.controller
+    if certificate is not None:
+        controller = controller or certificate.controller
+        found = certificate.simulated
+        if found is not None:
+            verification, coupled = verification or found.verification, coupled or found.environments
+            large = large or ([found.large_signal] if found.large_signal is not None else [])
     surveys = fit_surveys(fit) if fit is not None else {}
     diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None else None
     figures = all_figures(fit, surveys, controller, _plants(controller, certificate))
@@ -105,7 +109,8 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
             }
         )
     shown = {item["name"]: item["svg"] for item in drawn if item["name"] in simulated}
-    section = verification_section(verification, large, coupled, shown, number)
+    port = certificate.simulated if certificate is not None else None
+    section = verification_section(verification, large, coupled, port, shown, number)
     return write_text(
         target, _page(title, fit, diagnostics, ranking, controller, certificate, drawn, verification, section)
     )
@@ -203,12 +208,13 @@ def rendered(figure: Any, kind: str) -> bytes:
     metadata = {"Date": None} if kind == "svg" else None
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "seaopt", "font.size": 9.0}):
         figure.savefig(stream, format=kind, dpi=130, metadata=metadata)
+    figure.set_layout_engine("none")  # laying out takes as long as drawing: once is enough
     return stream.getvalue()
 
 
 def _inline(svg: str, name: str) -> str:
     """Return the <svg> element alone, its ids made unique in the page."""
-    body = svg[svg.index("<svg") :]
+    body = re.sub(r'(<image\b[^>]*?)\sid="[^"]*"', r"\1", svg[svg.index("<svg") :])  # named after what they show, twice
     body = re.sub(r'\bid="', f'id="{name}-', body)
     body = re.sub(r'(xlink:href|href)="#', rf'\1="#{name}-', body)
     body = body.replace("url(#", f"url(#{name}-")
@@ -295,6 +301,11 @@ def _page(
     )  # fmt: skip
 
 
+def _played(certificate: Certificate) -> str:
+    found = certificate.simulated.verification if certificate.simulated is not None else None
+    return "" if found is None else f", {len(found.rows)} simulations passed"
+
+
 def verdict(
     fit: Fit | None, controller: Controller | None, certificate: Certificate | None,
     verification: Verification | None = None,
@@ -311,7 +322,7 @@ def verdict(
         broken = [f"{item.name} ({item.where})" for item in certificate.requirements if not item.met]
         what = (
             f"passed – {mc.failures} failures in {mc.samples} draws, failure probability below "
-            f"{mc.failure_probability_bound:.3g}"
+            f"{mc.failure_probability_bound:.3g}{_played(certificate)}"
             if certificate.passed
             else "failed – " + "; ".join(broken)
         )

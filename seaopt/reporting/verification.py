@@ -13,6 +13,7 @@ from seaopt.robustness.environments import StabilityMap
 from seaopt.robustness.judgement import NOMINAL, Outcome
 from seaopt.robustness.large_signal import LargeSignal
 from seaopt.robustness.playback import Trace
+from seaopt.robustness.simulated import Simulated
 from seaopt.robustness.verification import Verification
 
 if TYPE_CHECKING:
@@ -141,6 +142,7 @@ def verification_section(
     verification: Verification | None,
     large: Sequence[LargeSignal],
     coupled: StabilityMap | None,
+    simulated: Simulated | None,
     svgs: Mapping[str, str],
     number: Any,
 ) -> str:
@@ -153,4 +155,8 @@ def verification_section(
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["number"] = number
     source = files("seaopt.reporting").joinpath("verification.html.jinja").read_text(encoding="utf-8")
-    return environment.from_string(source).render(verification=verification, large=large, coupled=coupled, svgs=svgs)
+    return environment.from_string(source).render(
+        verification=verification, large=large, coupled=coupled, svgs=svgs,
+        passivity=None if simulated is None else simulated.passivity,
+        left_out={} if simulated is None else simulated.left_out,
+    )  # fmt: skip

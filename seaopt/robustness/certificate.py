@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.errors import FileError, SeaoptError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.nominal import PlantMargins, plant_margins
+from seaopt.robustness.simulated import Simulated, simulated
+from seaopt.robustness.verification import witness
 from seaopt.robustness.worst import Worst, witnessed
 
 SCHEMA = "seaopt/robustness/1"
+SIMULATION = "simulation_failures"
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
     "disk_margin", "noise_gain", "spectral_radius",
@@ -67,6 +71,8 @@ class Certificate:
         What was certified.
     models : mapping of name to Plant
         What it was certified on, at `parameters`.
+    simulated : Simulated or None
+        What `with_simulation` found.
 
     """
 
@@ -79,6 +85,46 @@ class Certificate:
     controller: Controller
     models: Mapping[str, Plant]
     parameters: ParameterSet
+    simulated: Simulated | None = None
+
+    def with_simulation(
+        self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1
+    ) -> Certificate:
+        """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
+
+        Each scenario that fails is a requirement that is not met. Large signals, passivity and coupled stability are
+        found on the design plant, and require nothing.
+
+        Parameters
+        ----------
+        sensors : Sensors, optional
+            Of the measured output; ideal if left out.
+        current_step_A : float
+            What the current is rounded to; 0 for not at all.
+        seed : int
+            Of noise and random excitations.
+
+        Examples
+        --------
+        >>> import seaopt as so
+        >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+        >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
+        >>> certificate = so.certify(controller, {"stand": stand}, thor).with_simulation()
+        >>> certificate.passed, len(certificate.simulated.verification.rows)
+        (True, 8)
+
+        """
+        found = self._simulated(sensors, current_step_A, seed)
+        kept = tuple(item for item in self.requirements if item.name != SIMULATION)
+        requirements = (*kept, *_simulation_requirements(found))
+        return replace(self, simulated=found, requirements=requirements, passed=all(item.met for item in requirements))
+
+    def _simulated(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
+        draws = {name: [worst[1]] for name, worst in self.worst.items()}
+        return simulated(
+            self.controller, self.models, self.parameters, draws=draws, sensors=sensors,
+            current_step_A=current_step_A, seed=seed,
+        )  # fmt: skip
 
     @classmethod
     def from_dict(
@@ -88,7 +134,7 @@ class Certificate:
         models: Mapping[str, Plant],
         parameters: ParameterSet,
     ) -> Certificate:
-        """Return the certificate of a robustness.json; figures at the nominal parameters are computed again.
+        """Return the certificate of a robustness.json; nominal figures and simulations are computed again.
 
         Raises
         ------
@@ -101,7 +147,7 @@ class Certificate:
                 name: witnessed(controller, models[name], parameters, item["worst"]["parameters"])
                 for name, item in content["plants"].items()
             }
-            return cls(
+            found = cls(
                 passed=bool(content["passed"]),
                 requirements=tuple(Requirement(**_infinite(item)) for item in content["requirements"]),
                 plants={name: controller.close(models[name], parameters).figures() for name in worst},
@@ -112,6 +158,11 @@ class Certificate:
                 models=models,
                 parameters=parameters,
             )
+            played = content.get("simulation")
+            if played is None:
+                return found
+            sensors = Sensors(**played["sensors"])
+            return replace(found, simulated=found._simulated(sensors, played["current_step_A"], played["seed"]))
         except (KeyError, TypeError, ValueError, AttributeError, SeaoptError) as error:
             raise FileError(f"robustness.json: {error} is missing or malformed; certify again") from error
 
@@ -128,8 +179,8 @@ class Certificate:
                 for name, item in self.plants.items()
             },
             "monte_carlo": _fields(self.monte_carlo),
-            "passivity": None,
-            "simulation": None,
+            "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
+            "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
         }
 
     def __repr__(self) -> str:
@@ -143,6 +194,7 @@ class Certificate:
             if mc.samples
             else "  no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
         )
+        lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
         for item in self.requirements:
             if not item.met:
                 lines.append(f"  NOT MET: {item.name} = {item.value:.6g}, limit {item.limit:.6g} ({item.where})")
@@ -171,6 +223,29 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _simulation_requirements(found: Simulated) -> list[Requirement]:
+    """Return what the scenarios require: one row a plant where all pass, else one a run that failed, its witness."""
+    played = found.verification
+    if played is None:
+        reason = found.left_out["simulation"]
+        return [Requirement(name=SIMULATION, limit=0.0, value=np.inf, met=False, where=reason)]
+    rows: list[Requirement] = []
+    for plant in played.stages:
+        runs = [row for row in played.rows if row.plant == plant]
+        failed = [row for row in runs if not row.passed]
+        rows += [
+            Requirement(
+                name=SIMULATION, limit=0.0, value=1.0, met=False,
+                where=f"{plant}, {row.scenario}, draw {row.draw}, seed {played.seed}: {row.reason}{witness(row)}",
+            )
+            for row in failed
+        ]  # fmt: skip
+        if runs and not failed:
+            where = f"{plant}: {len(runs)} runs"
+            rows.append(Requirement(name=SIMULATION, limit=0.0, value=0.0, met=True, where=where))
+    return rows
 
 
 def _number(value: float | None) -> str:

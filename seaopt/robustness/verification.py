@@ -90,7 +90,7 @@ class Verification:
         lines = [f"Verification by simulation: {verdict}"]
         lines += [f"  {line}" for line in _table(self.worst())]
         lines += [
-            f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{_witness(row)}"
+            f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{witness(row)}"
             for row in self.failures
         ]
         lines += [f"  not played: {scenario} on {plant}, {reason}" for scenario, plant, reason in self.skipped]
@@ -216,7 +216,8 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _witness(row: Outcome) -> str:
+def witness(row: Outcome) -> str:
+    """Return where a row's draw differs from nominal, as text that follows its reason."""
     return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
 
 

@@ -66,6 +66,44 @@ def test_run_leaves_everything(folder, done):
     assert set(fit["derived"]) >= {"r", "m_k", "b_m", "natural_frequency_hz", "damping_ratio"}
 
 
+def test_certify_simulates_and_looks_at_the_port(folder, done):
+    content = json.loads((folder / "all" / "robustness.json").read_text(encoding="utf-8"))
+    assert content["simulation"]["passed"]
+    assert content["simulation"]["sensors"]["noise_std"] == {"F1": 2.0}
+    assert {row["draw"] for row in content["simulation"]["rows"]} == {"nominal", "1"}
+    assert content["passivity"]["environments"]["fixed_stable"]
+    assert "22 runs passed" in done.stdout
+
+
+DESIGN = SHORT[: SHORT.index("[[experiment]]")] + SHORT[SHORT.index("[controller]") :]
+for _old, _new in (("1.5e-6", "3.31e-6"), ("4e-4", "1.31e-4"), ("0.7", "0.95"), ("free = true", "free = false")):
+    DESIGN = DESIGN.replace(_old, _new)
+
+
+def test_a_simulation_that_fails_exits_1_with_its_witness(folder):
+    """A load cell that stops at 20 N never shows the force that is asked for."""
+    text = DESIGN.replace("noise_std = { F1 = 2.0 }", "saturation = { F1 = 20.0 }")
+    (folder / "clipped.toml").write_text(text, encoding="utf-8")
+    out = seaopt("run", "clipped.toml", "-o", "clipped", cwd=folder)
+    assert out.returncode == 1, out.stderr
+    assert "NOT MET: simulation_failures" in out.stdout
+    assert "(stand, small step, draw nominal, seed 1: " in out.stdout
+    assert "the force ends" in out.stdout
+
+
+def test_retune_tunes_until_certified(folder):
+    text = (
+        DESIGN.replace("I_p = [0.2, 0.6]", "I_p = [0.2, 0.6], eta = [0.9, 1.0], delay_s = [0.0, 2e-4]") + "retune = 4\n"
+    )
+    (folder / "retune.toml").write_text(text.replace('robust_to = ["swing"]', ""), encoding="utf-8")
+    out = seaopt("run", "retune.toml", "-o", "retune", cwd=folder)
+    assert out.returncode == 0, out.stdout + out.stderr
+    assert "Joint tuning: certified in 2 rounds" in out.stdout
+    assert "Certificate: passed" in out.stdout
+    held = json.loads((folder / "retune" / "controller.json").read_text(encoding="utf-8"))["spec"]["robust_to"]
+    assert any("round 1" in name for name in held)
+
+
 def test_stages_one_by_one_give_the_same_files(folder, done):
     for stage in ("fit", "tune", "certify", "report"):
         step = seaopt(stage, "short.toml", "-o", "steps", cwd=folder)
@@ -180,10 +218,14 @@ def test_the_report_stands_alone(folder, done):
     import re
 
     for fetched in re.findall(r'(?:src|href)="([^"]+)"', page):
-        assert fetched.startswith("#"), fetched
+        assert fetched.startswith(("#", "data:image/png;base64,")), fetched
     assert "<script" not in page
-    assert page.count("<svg") == 7  # each of two experiments: time, response, residuals; the loop
-    for words in ("Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band"):
+    # Each of two experiments: time, response, residuals; the loop; simulations of two plants, amplitudes, environments.
+    assert page.count("<svg") == 11
+    for words in (
+        "Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band",
+        "Simulation of the nonlinear plants", "Large signals", "Held against something", "Re Z falls to",
+    ):  # fmt: skip
         assert words in page
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))

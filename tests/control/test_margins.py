@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import control
 import numpy as np
 import pytest
@@ -15,6 +17,13 @@ from seaopt.errors import ControlError
 from tests.control.test_loop import loop_of
 
 ONE = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
+
+
+@cache
+def known(structure):
+    """A loop on the stand and its margins, found once."""
+    loop = loop_of(structure)
+    return loop, margins(loop)
 
 
 def gained(factor):
@@ -77,8 +86,8 @@ def test_a_disk_margins_witness_puts_a_pole_on_the_circle(name, kind, request, t
 @given(st.floats(0, 2 * np.pi), st.sampled_from(["symmetric", "S-based", "T-based"]))
 @settings(max_examples=25)
 def test_every_perturbation_inside_the_disk_is_survived(angle, kind):
-    loop = loop_of("pid")
-    found = margins(loop).disks[kind]
+    loop, whole = known("pid")
+    found = whole.disks[kind]
     delta = 0.999 * found.alpha * np.exp(1j * angle)
     f = (2 + (1 - found.skew) * delta) / (2 - (1 + found.skew) * delta)
     assert np.max(np.abs(poles_of(loop, f))) < 1.0
@@ -143,7 +152,7 @@ def test_a_light_mode_between_grid_points(zeta, hz):
 
 def test_several_crossings_are_all_there():
     loop = modal([(5.0, 0.5, 1.5), (15.0, 0.02, 0.08), (33.0, 0.02, 0.05), (60.0, 0.03, 0.07)], law=gained(1.0))
-    f = np.linspace(0.01, 499.9, 400_000)
+    f = np.concatenate([np.linspace(0.01, 90.0, 72_000), np.linspace(90.0, 499.9, 40_000)[1:]])
     open_loop = independent(loop, f)
     dense = f[np.flatnonzero(np.diff(np.sign(np.abs(open_loop) - 1)))]
     found = margins(loop)
@@ -153,7 +162,7 @@ def test_several_crossings_are_all_there():
     turns = turns[open_loop.real[turns] < 0]
     assert len(found.gain_crossings) >= len(turns) >= 1
     for k in turns:
-        assert min(abs(hz - f[k]) for hz, _ in found.gain_crossings) < 2e-3
+        assert min(abs(hz - f[k]) for hz, _ in found.gain_crossings) < (2e-3 if f[k] < 90 else 1.1e-2)
 
 
 def test_a_response_near_nyquist_is_not_cut_off():
@@ -188,9 +197,9 @@ def test_laws_with_denominators_of_their_own_share_an_integrator():
 @given(st.floats(0.3, 3.0))
 @settings(max_examples=10)
 def test_gain_takes_itself_off_the_gain_margins(factor):
-    base, scaled = loop_of("pd"), loop_of("pd", k_p=3.2 * factor, k_d=0.033 * factor)
+    scaled = loop_of("pd", k_p=3.2 * factor, k_d=0.033 * factor)
     shift = 20 * np.log10(factor)
-    assert margins(scaled).gain_up_db == pytest.approx(margins(base).gain_up_db - shift, abs=1e-8)
+    assert margins(scaled).gain_up_db == pytest.approx(known("pd")[1].gain_up_db - shift, abs=1e-8)
 
 
 @given(st.floats(0.1, 10.0))
