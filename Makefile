@@ -50,6 +50,9 @@ check: test nocompiler lint types contract notebooks
 bench: $(READY)
 	$(PYTEST) benchmarks -q -s --benchmark-only -p no:xdist -o python_files='bench_*.py' -o filterwarnings=default
 	$(BIN)/python benchmarks/bench_fit.py
+	$(BIN)/python benchmarks/bench_read.py
+	$(BIN)/python benchmarks/bench_certify.py
+	$(BIN)/python benchmarks/bench_mpc.py
 
 # Other estimators on one problem, each in an environment of its own; ARGS="--only jax,seaopt" for some of them.
 bench-peers: $(READY)

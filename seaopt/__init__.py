@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from seaopt.bench import virtual_log as virtual_log
     from seaopt.control import Controller as Controller
     from seaopt.control import ControllerSpec as ControllerSpec
+    from seaopt.control import export as export
     from seaopt.control import tune as tune
     from seaopt.errors import SeaoptError as SeaoptError
     from seaopt.estimation import Experiment as Experiment
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from seaopt.frequency import h1 as h1
     from seaopt.logs import Column as Column
     from seaopt.logs import Log as Log
+    from seaopt.logs import contents as contents
     from seaopt.logs import read_log as read_log
     from seaopt.logs import write_log as write_log
     from seaopt.parameters import Parameter as Parameter
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from seaopt.reporting import write_report as write_report
     from seaopt.robustness import Certificate as Certificate
     from seaopt.robustness import certify as certify
+    from seaopt.robustness import verify as verify
     from seaopt.simulation import simulate as simulate
 
 __version__ = "0.1.0"
@@ -51,6 +54,7 @@ _HOME = {
     "plants": "seaopt.plants",
     "Column": "seaopt.logs",
     "Log": "seaopt.logs",
+    "contents": "seaopt.logs",
     "read_log": "seaopt.logs",
     "write_log": "seaopt.logs",
     "simulate": "seaopt.simulation",
@@ -69,8 +73,10 @@ _HOME = {
     "ControllerSpec": "seaopt.control",
     "Controller": "seaopt.control",
     "tune": "seaopt.control",
+    "export": "seaopt.control",
     "Certificate": "seaopt.robustness",
     "certify": "seaopt.robustness",
+    "verify": "seaopt.robustness",
     "demo_path": "seaopt.problem",
     "read_problem": "seaopt.problem",
     "write_report": "seaopt.reporting",
@@ -78,10 +84,10 @@ _HOME = {
     "SeaoptError": "seaopt.errors",
 }
 __all__ = [  # noqa: RUF022  (in the order of the data path)
-    "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "read_log", "write_log", "simulate", "Sensors",
-    "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting", "PredictionError", "Fit",
-    "fit", "compare", "ControllerSpec", "Controller", "tune", "Certificate", "certify", "demo_path", "read_problem",
-    "write_report", "testing", "SeaoptError",
+    "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "contents", "read_log", "write_log",
+    "simulate", "Sensors", "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
+    "PredictionError", "Fit", "fit", "compare", "ControllerSpec", "Controller", "tune", "export", "Certificate",
+    "certify", "verify", "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
 ]  # fmt: skip
 
 
