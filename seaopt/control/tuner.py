@@ -301,7 +301,7 @@ def controller_of(
         robust_to=task.names[1:],
         design=design,
         observer=gains.observer,
-        blocked_by=explained(spec, task.names, figures),
+        blocked_by=explained(spec, task.names, figures, task.loop(x)),
         largest_bandwidth_hz=largest,
     )
 

@@ -110,6 +110,17 @@ def test_efficiency_changes_the_loop_gain(stand, thor):
     np.testing.assert_allclose(weak, 0.8 * strong)
 
 
+def test_a_sensitivity_over_its_limit_is_told_by_how_much(stand, thor):
+    """abs(S) may lie along -3 dB: where it first exceeds it says nothing of how nearly it is kept."""
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.2, min_sensitivity_bandwidth_hz=20)
+    controller = so.tune(stand, thor, spec)
+    loop = controller.close(stand, thor)
+    reached = np.max(np.abs(loop.sensitivity(np.linspace(0.01, 20.0, 20000))))
+    told = next(item for item in controller.blocked_by if item.startswith("min_sensitivity"))
+    assert told == (f"min_sensitivity_bandwidth_hz, |S| reaches {reached:.4f} below 20 Hz, 0.7071 allowed")
+    assert told in controller.explanation
+
+
 def test_json_round_trip(stand, swing, thor, tmp_path):
     from seaopt.files import read_json, write_json
 
