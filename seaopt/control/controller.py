@@ -20,6 +20,7 @@ from seaopt.plants import Plant
 SCHEMA = "seaopt/controller/1"
 UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
 CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
+NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
@@ -216,7 +217,8 @@ class Controller:
             lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
         if "notch_depth" in self.gains:
             f, width, depth = (self.gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
-            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}")
+            use = "" if depth < NO_NOTCH else ": of no use, tune without it"
+            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}")
         return lines
 
     def _force_lines(self) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,15 @@ def test_a_sensitivity_over_its_limit_is_told_by_how_much(stand, thor):
     told = next(item for item in controller.blocked_by if item.startswith("min_sensitivity"))
     assert told == (f"min_sensitivity_bandwidth_hz, |S| reaches {reached:.4f} below 20 Hz, 0.7071 allowed")
     assert told in controller.explanation
+
+
+@pytest.mark.parametrize(("depth", "told"), [(0.4, False), (1.0, True)])
+def test_a_notch_without_effect_is_told(depth, told, stand, thor):
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    gains = {**controller.gains, "notch_frequency_hz": 100.0, "notch_width": 0.2, "notch_depth": depth}
+    assert (
+        f"gain at its centre {depth:g}: of no use, tune without it" in repr(replace(controller, gains=gains))
+    ) is told
 
 
 def test_json_round_trip(stand, swing, thor, tmp_path):
