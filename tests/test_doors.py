@@ -9,7 +9,7 @@ import sys
 CODE = """
 import json, numpy as np, seaopt as so
 stand, thor = so.plants.high_impedance(), so.plants.thor()
-log = so.Log.from_arrays(time=np.arange(50) / 400, I=np.ones(50), F1=np.ones(50))
+log = so.Log.from_arrays(time=np.arange(50) / 400, I=np.sin(np.arange(50)), F1=np.cos(np.arange(50)))
 bench = so.Experiment(plant=stand, log=log)
 tries = {
     "sigma": lambda: so.Experiment(plant=stand, log=log, sigma=2.0),

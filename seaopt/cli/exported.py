@@ -26,7 +26,9 @@ def exported(results: Path, target: Path, json: bool, **options: Any) -> bool:
         raise ProblemError(f"{path}: no such file; give the folder of results of seaopt run or seaopt tune")
     content = read_json(path, SCHEMAS["tune"])
     fitted, made_from = results / FILES["fit"], content.get("made_from")
-    given = made_from.get(fitted.name) if isinstance(made_from, dict) else None
+    if made_from is not None and not (isinstance(made_from, dict) and isinstance(made_from.get("problem"), str)):
+        raise ProblemError(f"{path}: made_from does not say of which problem file; run seaopt tune again")
+    given = None if made_from is None else made_from.get(fitted.name)
     if given is not None and fitted.exists() and digest(fitted) != given:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     written = [str(file) for file in export(content, target, **options)]

@@ -83,6 +83,15 @@ class LoopRun:
     substeps: int
     wall_s: float
 
+    def __repr__(self) -> str:
+        peaks = ", ".join(f"{name} {np.max(value):.4g}" for name, value in self.peaks.items())
+        runs = self.current.shape[0]
+        return (
+            f"LoopRun of {runs} run{'' if runs == 1 else 's'} of {self.time.size} samples, from {self.time[0]:.4g} to "
+            f"{self.time[-1]:.4g} s: largest magnitudes {peaks}, current {np.max(np.abs(self.current)):.4g} A; "
+            f"integration error {self.error:.1g}"
+        )
+
 
 def run_loop(
     loop: SampledLoop,

@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 
 from seaopt.control.digital import DigitalPlant, sample
-from seaopt.control.law import Nominal, Notch, Observer, TransferFunction
+from seaopt.control.law import Observer, TransferFunction
 from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.spec import ControllerSpec
-from seaopt.errors import FileError
+from seaopt.control.stored import stored
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
 SCHEMA = "seaopt/controller/1"
 UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
 CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
+NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
@@ -173,39 +174,14 @@ class Controller:
         Raises
         ------
         FileError
-            A field is missing or malformed.
+            A field is missing or malformed, or gains and coefficients differ.
 
         """
-        try:
-            given = dict(content["spec"])
-            robust_to = tuple(given.pop("robust_to", ()))
-            given["bandwidth_range_hz"] = tuple(given["bandwidth_range_hz"])
-            if given.get("passive_band_hz") is not None:
-                given["passive_band_hz"] = tuple(given["passive_band_hz"])
-            if given.get("notch") is not None:
-                given["notch"] = Notch(**given["notch"])
-            law = {
-                name: TransferFunction(
-                    num=np.array(content[name]["num"], dtype=float),
-                    den=np.array(content[name]["den"], dtype=float),
-                )
-                for name in ("reference", "measurement")
-            }
-            spec = ControllerSpec(**given)
-            gain, ts = float(content["current_per_force_A_per_N"]), float(content["sample_time_s"])
-            delay = content["delay_samples"]
-            _check(content, spec, law)
-            design = sample(plant, params, spec.measured, gain, ts, delay)
-            return cls(
-                structure=content["structure"], gains=content["gains"], sample_time_s=ts, delay_samples=delay,
-                reference=law["reference"], measurement=law["measurement"], current_per_force_A_per_N=gain, spec=spec,
-                achieved=Loop(plant=design, **law).figures(), feasible=bool(content["feasible"]),
-                active_constraints=tuple(content["active_constraints"]), robust_to=robust_to, design=(plant, params),
-                observer=_observer(content.get("observer")), blocked_by=tuple(content.get("blocked_by", ())),
-                largest_bandwidth_hz=content.get("largest_bandwidth_hz"),
-            )  # fmt: skip
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise FileError(f"controller.json: {error} is missing or malformed; tune again") from error
+        given = stored(content)
+        law = {name: given[name] for name in ("reference", "measurement")}
+        ts, gain = given["sample_time_s"], given["current_per_force_A_per_N"]
+        sampled = sample(plant, params, given["spec"].measured, gain, ts, given["delay_samples"])
+        return cls(**given, achieved=Loop(plant=sampled, **law).figures(), design=(plant, params))
 
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec
@@ -241,7 +217,8 @@ class Controller:
             lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
         if "notch_depth" in self.gains:
             f, width, depth = (self.gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
-            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}")
+            use = "" if depth < NO_NOTCH else ": of no use, tune without it"
+            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}")
         return lines
 
     def _force_lines(self) -> list[str]:
@@ -253,32 +230,6 @@ class Controller:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
-
-
-def _observer(content: Mapping[str, Any] | None) -> Observer | None:
-    if content is None:
-        return None
-    inverse = TransferFunction(**{name: np.array(content["inverse"][name], dtype=float) for name in ("num", "den")})
-    return Observer(nominal=Nominal(kept=np.array(content["kept"], dtype=float), inverse=inverse), T_q=content["T_q"])
-
-
-def _check(content: Mapping[str, Any], spec: ControllerSpec, law: Mapping[str, TransferFunction]) -> None:
-    """Refuse a controller.json that contradicts itself or is not of the schema's types."""
-    for name, tf in law.items():
-        if tf.num.ndim != 1 or tf.den.ndim != 1 or not tf.num.size or not tf.den.size or tf.den[0] != 1.0:
-            raise ValueError(f"{name}, num or den, with den[0] = 1,")
-        if not (np.all(np.isfinite(tf.num)) and np.all(np.isfinite(tf.den))):
-            raise ValueError(f"{name}, whose coefficients are not all numbers,")
-    if content["structure"] != spec.structure or not isinstance(content["feasible"], bool):
-        raise ValueError("structure or feasible")
-    if content["delay_samples"] != spec.delay_samples:
-        raise ValueError("delay_samples, which is not spec.delay_samples,")
-    if not np.isclose(content["sample_time_s"] * spec.sample_rate_hz, 1.0, rtol=1e-9):
-        raise ValueError("sample_time_s, which is not 1/spec.sample_rate_hz,")
-    if not all(isinstance(value, (int, float)) for value in content["gains"].values()):
-        raise ValueError("gains")
-    if not float(content["current_per_force_A_per_N"]) > 0.0:
-        raise ValueError("current_per_force_A_per_N")
 
 
 def _shown(value: float | None) -> str:

@@ -255,15 +255,18 @@ def _exponential(
     block = np.zeros((a.shape[0], n + 1, n + 1))
     block[:, :n, :n], block[:, :n, n] = a, b
     block *= t[:, None, None]
-    norm = float(np.max(np.sum(np.abs(block), axis=2), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / REACH)))) if np.isfinite(norm) else 0
-    block *= 2.0**-squarings
+    norm = np.max(np.sum(np.abs(block), axis=2), axis=1, initial=0.0)
+    norm = np.where(np.isfinite(norm), norm, 0.0)
+    # Each its own: squared as often as the stiffest of them needs, the others would lose their digits.
+    squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, 1e-300) / REACH))).astype(int)
+    block *= np.ldexp(1.0, -squarings)[:, None, None]
     one = np.eye(n + 1)
     out = one + block / DEGREE
     for k in range(DEGREE - 1, 0, -1):
         out = one + block @ out / k
-    for _ in range(squarings):
-        out = out @ out
+    for done in range(int(squarings.max(initial=0))):
+        live = squarings > done
+        out[live] = out[live] @ out[live]
     return out[:, :n, :n], out[:, :n, n]
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -18,8 +19,8 @@ from typing import Any, Literal
 import numpy as np
 
 from seaopt.control.controller import Controller
-from seaopt.control.law import TransferFunction
 from seaopt.control.realisation import RunnableLaw, realise
+from seaopt.control.stored import stored
 from seaopt.errors import ControlError, FileError
 from seaopt.files import write_text
 
@@ -27,6 +28,15 @@ Precision = Literal["double", "float"]
 LARGEST = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
 TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja", "{}_gains.h": "gains.h.jinja", "{}_gains.m": "gains.m.jinja"}
 LONGEST_NAME = 25  # C99 promises 31 characters of an external name, and ours end in _reset
+RESERVED = (
+    # Keywords of C99 (ISO/IEC 9899:1999, 6.4.1), C11, C23 and C++ that could begin a file; headers of C23 (7.1.2).
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true "
+    "false nullptr constexpr typeof alignas alignof thread_local static_assert asm class delete export friend mutable "
+    "namespace new operator private protected public template this throw try catch typename using virtual wchar_t main "
+    "assert complex ctype errno fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic "
+    "stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
+)
 UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N"}
 FIGURES = {
     "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g} N/N",
@@ -69,9 +79,9 @@ def export(
     Raises
     ------
     ControlError
-        The controller is not feasible, or an argument is out of range.
+        The controller is not feasible or not stable on its design plant, or an argument is out of range.
     FileError
-        The content is malformed, or the folder cannot be written.
+        The content is malformed, its gains do not give its coefficients, or the folder cannot be written.
 
     Examples
     --------
@@ -86,20 +96,23 @@ def export(
     if precision not in LARGEST:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
     prefix = _identifier(name)
-    content = controller.to_dict() if isinstance(controller, Controller) else controller
-    try:
-        if not content["feasible"] and not allow_infeasible:
-            missed = ", ".join(map(str, content["active_constraints"]))
-            raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
-        law = _law(content, current_limit_A, tracking_time_s)
-        told = _told(content, law) | {"name": prefix, "NAME": prefix.upper(), "precision": precision}
-        numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
-        texts = {
-            pattern.format(prefix): _rendered(template, told | _numbers(content, law, numbers[pattern[-2:]], precision))
-            for pattern, template in TEMPLATES.items()
-        }
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise FileError(f"controller.json: {error} is missing or malformed; tune again") from error
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise FileError(f"{folder}: is a file; give a folder")
+    if isinstance(controller, Controller):
+        given = {field.name: getattr(controller, field.name) for field in fields(Controller)}
+        figures = _figures(controller)
+    else:
+        given, figures = stored(controller), _stated(controller)
+    if not given["feasible"] and not allow_infeasible:
+        missed = ", ".join(given["active_constraints"])
+        raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
+    law = _law(given, current_limit_A, tracking_time_s)
+    told = _told(given, law) | {"achieved": figures, "precision": precision, "name": prefix, "NAME": prefix.upper()}
+    numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
+    texts = {
+        pattern.format(prefix): _rendered(template, told | _numbers(given, law, numbers[pattern[-2:]], precision))
+        for pattern, template in TEMPLATES.items()
+    }
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
 
 
@@ -110,39 +123,60 @@ def _identifier(name: str) -> str:
         raise ControlError(
             f'name = "{name}" cannot begin a name in C; give a letter and up to {LONGEST_NAME - 1} letters or digits'
         )
+    if found.lower() in RESERVED.split():
+        raise ControlError(f'name = "{name}" is a keyword or a header of C; give another, such as {found}_law')
     return found
 
 
-def _law(content: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
-    given = content["spec"].get("current_limit_A")
-    c_r, c_y = (
-        TransferFunction(num=np.array(content[key]["num"], dtype=float), den=np.array(content[key]["den"], dtype=float))
-        for key in ("reference", "measurement")
-    )
+def _figures(controller: Controller) -> list[str]:
+    """Return what a controller achieves, computed again where its design plant is known."""
+    if controller.design is None:
+        return _shown("As stated by the controller, not computed again", asdict(controller.achieved))
+    found = controller.close(*controller.design).figures()
+    if not found.stable:
+        raise ControlError("the controller's law is not stable on its design plant; tune one that is")
+    return _shown("Achieved on the design plant", asdict(found))
+
+
+def _stated(content: Mapping[str, Any]) -> list[str]:
+    """Return what a controller.json, which does not hold the design plant, says of it."""
+    achieved = content.get("achieved")
+    if not isinstance(achieved, Mapping):
+        raise FileError("controller.json: achieved is missing or not a table; tune again")
+    for name, value in achieved.items():
+        if name in FIGURES and value is not None and (isinstance(value, bool) or not isinstance(value, (int, float))):
+            raise FileError(f"controller.json: achieved.{name} is {value!r}, not a number; tune again")
+    return _shown("As stated by controller.json, not computed again", achieved)
+
+
+def _shown(whence: str, achieved: Mapping[str, Any]) -> list[str]:
+    """Return the lines that the header has on figures."""
+    shown = [text.format(achieved[key]) for key, text in FIGURES.items() if achieved.get(key) is not None]
+    if len(shown) == len(FIGURES):
+        return [f"{whence}: {', '.join(shown[:3])},", f"{', '.join(shown[3:])}."]
+    return [f"{whence}: {', '.join(shown) or 'nothing that was measured'}."]
+
+
+def _law(given: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
     return realise(
-        c_r,
-        c_y,
-        sample_time_s=float(content["sample_time_s"]),
-        current_per_force_A_per_N=float(content["current_per_force_A_per_N"]),
-        current_limit_A=given if current_limit_A is None else current_limit_A,
+        given["reference"],
+        given["measurement"],
+        sample_time_s=given["sample_time_s"],
+        current_per_force_A_per_N=given["current_per_force_A_per_N"],
+        current_limit_A=given["spec"].current_limit_A if current_limit_A is None else current_limit_A,
         tracking_time_s=tracking_time_s,
     )
 
 
-def _told(content: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
+def _told(given: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     """Return what the files say in words."""
-    achieved = content["achieved"]
-    shown = [text.format(achieved[key]) for key, text in FIGURES.items() if achieved.get(key) is not None]
     return {
-        "structure": _said(content["structure"]),
-        "measured": _said(content["spec"]["measured"]),
+        "structure": _said(given["structure"]),
+        "measured": _said(given["spec"].measured),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
-        "delay_samples": int(content["delay_samples"]),
-        "feasible": bool(content["feasible"]),
-        "blocking": _said(", ".join(map(str, content["active_constraints"]))),
-        "achieved": ["Achieved on the design plant: " + ", ".join(shown[:3]) + ",", ", ".join(shown[3:]) + "."]
-        if len(shown) == len(FIGURES)
-        else ["Achieved on the design plant: " + (", ".join(shown) or "nothing that was measured") + "."],
+        "delay_samples": given["delay_samples"],
+        "feasible": given["feasible"],
+        "blocking": _said(", ".join(given["active_constraints"])),
         "limited": math.isfinite(law.current_limit_A),
         "order": law.c.size,
         "storage": max(law.c.size, 1),
@@ -168,7 +202,7 @@ def _literal(precision: Precision) -> Callable[[float], str]:
 
 
 def _numbers(
-    content: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
+    given: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
 ) -> dict[str, Any]:
     """Return the numbers as text; a law without states is given one that stays zero."""
 
@@ -194,10 +228,10 @@ def _numbers(
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
             {"name": _identifier(key), "value": number(float(value)), "unit": UNITS.get(key, "")}
-            for key, value in content["gains"].items()
+            for key, value in given["gains"].items()
         ],
         "transfer_functions": [
-            {"name": key, "num": row(content[key]["num"]), "den": row(content[key]["den"])}
+            {"name": key, "num": row(given[key].num), "den": row(given[key].den)}
             for key in ("reference", "measurement")
         ],
     }

@@ -46,6 +46,13 @@ class ForceRun:
         step = self.reference[-1] - self.force[0]
         return max(float(np.max((self.force - self.reference[-1]) / step)), 0.0)
 
+    def __repr__(self) -> str:
+        return (
+            f"ForceRun of {self.time.size} samples, {self.time[-1]:.4g} s: reference to {self.reference[-1]:.4g} N, "
+            f"force up to {np.max(np.abs(self.force)):.4g} N and {self.force[-1]:.4g} N at the end, current up to "
+            f"{np.max(np.abs(self.current)):.4g} A"
+        )
+
     def settling_time_s(self, band: float = 0.02) -> float:
         """Return the time from the reference's first change until the force stays within `band` of the step.
 

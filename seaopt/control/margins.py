@@ -170,13 +170,15 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
 
     where :math:`1 + \overline{L_2} L_1` winds about zero as often as :math:`L_2` has more poles outside the circle than
     :math:`L_1`; else it is 1 (Vinnicombe, Uncertainty and Feedback, 2001, 3.3). Computed on a grid that resolves the
-    poles of both, halved until neighbours turn by less than a right angle.
+    poles of both, halved until neighbours turn by less than a right angle. A plant that is not finite is 1 from any.
     """
     if first.plant.sample_time_s != second.plant.sample_time_s:
         raise ControlError(
             f"the loops run at sample times {first.plant.sample_time_s:g} and {second.plant.sample_time_s:g} s; "
             "a gap needs one"
         )
+    if not all(np.all(np.isfinite(loop.eigenvalues())) for loop in (first, second)):
+        return 1.0, None
     f = np.union1d(first.grid(), second.grid())
     for _ in range(40):
         turning = _turning(first, second, f)

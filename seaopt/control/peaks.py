@@ -22,6 +22,8 @@ CURVES = 5
 SENSITIVITY, TRACKING = 0, 4
 REFINED = 3  # local maxima refined of each curve before the proof
 MAX_ROUNDS = 20
+ON_CIRCLE = 1e-5  # how near a pole of L is on the circle: a double one is only known to the root of rounding
+RESOLVED = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,11 +98,16 @@ def measured(system: ClosedLoop) -> Measured:
 def _gain_factors(
     system: ClosedLoop, turns: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
-    """Return the factors -1/L at angles where L is real and negative, and these angles."""
+    """Return the factors -1/L at angles where L is real and negative, and these angles.
+
+    A pole of L on the circle, an integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is
+    rounding.
+    """
     s, t = np.real(system.curves(turns)[:2])
     with np.errstate(divide="ignore", invalid="ignore"):
         factors = -s / t
-    crossing = (factors > 1e-9) & np.isfinite(factors)
+    infinite = np.any(np.abs(np.exp(1j * turns)[:, None] - system.opened) < ON_CIRCLE, axis=1)
+    crossing = (factors > RESOLVED) & (factors < 1.0 / RESOLVED) & ~infinite
     return factors[crossing], turns[crossing]
 
 

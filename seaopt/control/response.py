@@ -42,6 +42,7 @@ SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
 SAME_ROOT = 1e-7
 NEAR = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction
 MAX_STEPS = 100
+LARGEST = 1e100  # entry of a loop's matrices: beyond, its eigenvalues cannot be computed
 
 Pencil = tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]
 Indices = Int[np.ndarray, " m"]
@@ -148,7 +149,10 @@ class ClosedLoop:
 
 
 def close(plant: StateSpace, reference: TransferFunction, measurement: TransferFunction) -> ClosedLoop:
-    """Return the loop of a plant (with its delay) and the law u = C_r r - C_y m."""
+    """Return the loop of a plant (with its delay) and the law u = C_r r - C_y m.
+
+    A plant that is not finite, of absurd parameters, has every pole at infinity: its loop is not stable.
+    """
     from scipy.linalg import matrix_balance, schur
 
     ap, bp, cp, dp = plant
@@ -167,10 +171,17 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     b[:n], b[n:] = np.outer(bp, d_u), -np.outer(bk[:, 1], d_m)
     b[n:, 1] += bk[:, 0]
     c, d = np.stack([c_m, c_u]), np.stack([d_m, d_u])
+    opened = np.full(n + m, np.inf + 0j)
     whole = np.block([[a, b], [c, np.zeros((2, 2))]])
-    scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
-    scale = scale[: n + m] / np.sqrt(scale[-2] * scale[-1])
-    a, b, c = a * scale / scale[:, None], b / scale[:, None], c * scale
+    if not np.max(np.abs(whole)) < LARGEST:
+        gone = np.diag(opened)
+        return ClosedLoop(a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened)
+    with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
+        scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
+        scale = scale[: n + m] / np.sqrt(scale[-2] * scale[-1])
+        balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
+    if all(np.all(np.isfinite(item)) for item in balanced):
+        a, b, c = balanced
     triangle, basis = (np.asarray(item) for item in schur(a, output="complex")[:2])
     opened = np.concatenate([np.linalg.eigvals(ap), np.linalg.eigvals(ak)]).astype(complex)
     return ClosedLoop(

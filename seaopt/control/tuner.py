@@ -305,7 +305,7 @@ def controller_of(
         robust_to=task.names[1:],
         design=design,
         observer=gains.observer,
-        blocked_by=explained(spec, task.names, figures, port),
+        blocked_by=explained(spec, task.names, figures, task.loop(x), port),
         largest_bandwidth_hz=largest,
     )
 

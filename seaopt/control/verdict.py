@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from seaopt.control.loop import LoopFigures
+import numpy as np
+
+from seaopt.control.loop import Loop, LoopFigures
+from seaopt.control.peaks import HALF_POWER
 from seaopt.control.spec import ControllerSpec
 
 BANDWIDTH_TOLERANCE = 0.005
@@ -69,21 +72,26 @@ def active(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigur
 
 
 def explained(
-    spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], port: Port = None
+    spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], loop: Loop, port: Port = None
 ) -> tuple[str, ...]:
-    """Return what blocks, each limit with the figure that the best compromise reaches."""
+    """Return what blocks, each limit with the figure that the best compromise reaches; `loop` is the design plant's."""
     known = {use.label: f"{use.label} {use.value:.4g} of {use.allowed:g}" for use in uses(spec, names, figures)}
     design = figures[0]
     known["bandwidth_hz"] = (
         "bandwidth_hz, of which there is none" if design.bandwidth_hz is None
         else f"bandwidth_hz {design.bandwidth_hz:.4g} of {spec.bandwidth_hz:g}"
     )  # fmt: skip
-    known["min_sensitivity_bandwidth_hz"] = (
-        f"min_sensitivity_bandwidth_hz {design.sensitivity_bandwidth_hz:.4g} of {spec.sensitivity_bandwidth_limit_hz:g}"
-    )
+    known["min_sensitivity_bandwidth_hz"] = _sensitivity_told(spec.sensitivity_bandwidth_limit_hz, loop)
     if port is not None and spec.passive_band_hz is not None:
         low, high = spec.passive_band_hz
         known["passive_band_hz"] = (
             f"passive_band_hz = [{low:g}, {high:g}], Re Z/|Z| {port[0]:.3g} of 0 at {port[1]:.4g} Hz"
         )
     return tuple(known.get(label, label) for label in broken(spec, names, figures, port))
+
+
+def _sensitivity_told(limit_hz: float, loop: Loop) -> str:
+    """Return by how much abs(S) exceeds -3 dB: where it first does says little when it lies along it."""
+    f = loop.grid()
+    reached = float(np.max(np.abs(loop.sensitivity(np.append(f[f < limit_hz], limit_hz)))))
+    return f"min_sensitivity_bandwidth_hz, |S| reaches {reached:.4f} below {limit_hz:g} Hz, {HALF_POWER:.4f} allowed"

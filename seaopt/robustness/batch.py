@@ -21,7 +21,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.control.digital import DELAY, Linear, conditions, hold, linearised
 from seaopt.control.loop import STABLE
-from seaopt.control.response import law_state_space
+from seaopt.control.response import LARGEST, law_state_space
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
@@ -37,7 +37,10 @@ Progress = Callable[[int], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BatchFigures:
-    """Spectral radius, Ms and Mt of every draw (infinite where unstable), arrays of shape (n,)."""
+    """Spectral radius, Ms and Mt of every draw (infinite where unstable), arrays of shape (n,).
+
+    A draw so far off that the sampled plant is not finite is unstable, with an infinite spectral radius.
+    """
 
     spectral_radius: Float[np.ndarray, " n"]
     ms: Float[np.ndarray, " n"]
@@ -133,8 +136,12 @@ def _chunk(
     controller: Controller, continuous: Linear, delay: Float[np.ndarray, " k"], peaks: bool
 ) -> tuple[Float[np.ndarray, " k"], ...]:
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
+    count = d.size
+    whole = np.concatenate([a.reshape(count, -1), b, c, d[:, None]], axis=1)
+    finite = np.max(np.abs(whole), axis=1) < LARGEST  # not so of nan
+    a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (item.ndim - 1)), item, 0.0) for item in (a, b, c, d))
     products = _products(controller, a, b, c, d)
-    radius = np.max(np.abs(products.closed), axis=1)
+    radius = np.where(finite, np.max(np.abs(products.closed), axis=1), np.inf)
     ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
     stable = np.flatnonzero(radius < STABLE)
     if stable.size:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -164,9 +165,12 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
     extra = conditions(tuple(plants.values()))
     parameters = {name: plant.defaults.get(name) for plant in plants.values() for name in plant.parameters}
     known = [*parameters, *extra, *([SCREW_MODE] if SCREW_MASS in parameters else [])]
-    for name, (low, high) in ranges.items():
+    if not isinstance(ranges, Mapping):
+        raise ControlError(f"ranges is a {type(ranges).__name__}; give a mapping of name to (low, high)")
+    for name, given in ranges.items():
         if name not in known:
-            raise ControlError(f'range of "{name}": no plant has it; {suggestion(name, known)}')
+            raise ControlError(f'range of "{name}": no plant has it; {suggestion(str(name), known)}')
+        low, high = _ends(name, given)
         if not (np.isfinite(low) and np.isfinite(high)):
             raise ControlError(f"range of {name} = [{low:g}, {high:g}] is not finite; give [low, high]")
         if not low <= high:
@@ -179,6 +183,14 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
             )
     if SCREW_MODE in ranges and SCREW_MASS in ranges:
         raise ControlError(f"ranges of {SCREW_MODE} and {SCREW_MASS} say the same thing; keep one")
+
+
+def _ends(name: str, given: Any) -> tuple[float, float]:
+    """Return low and high of what should be two numbers."""
+    pair = list(given) if isinstance(given, (list, tuple, np.ndarray)) else []
+    if len(pair) != 2 or not all(isinstance(item, (int, float, np.number)) for item in pair):
+        raise ControlError(f"range of {name} = {' '.join(repr(given).split())} is not a range; give (low, high)")
+    return float(pair[0]), float(pair[1])
 
 
 def placed(

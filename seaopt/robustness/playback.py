@@ -109,6 +109,15 @@ class Trace:
     substeps: int
     wall_s: float
 
+    def __repr__(self) -> str:
+        peaks = ", ".join(f"{name} {np.max(value):.4g}" for name, value in self.peaks.items())
+        runs = self.current.shape[0]
+        return (
+            f"Trace of {runs} run{'' if runs == 1 else 's'} of {self.time.size} samples, {self.time[-1]:.4g} s: "
+            f"largest magnitudes {peaks}, current {np.max(np.abs(self.current)):.4g} A; {len(self.contacts)} contacts; "
+            f"integration error {self.error:.1g}"
+        )
+
     @property
     def last(self) -> slice:
         """The samples of the last phase."""

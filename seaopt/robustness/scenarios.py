@@ -173,6 +173,14 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     return tuple(item for item in found if item.obstacle(plant, plant) is None)
 
 
+def left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
+    """Return the names of the default scenarios that need a current limit, where the controller has none."""
+    if controller.spec.current_limit_A is not None:
+        return ()
+    saturating = _doublet(1.0, 1.0, 1.0), _hold(1.0, 1.0, 1.0)
+    return tuple(item.name for item in saturating if item.obstacle(plant, plant) is None)
+
+
 def step_limit(controller: Controller) -> float | None:
     """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit.
 

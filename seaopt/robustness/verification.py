@@ -16,7 +16,7 @@ from seaopt.plants import Plant
 from seaopt.plants.impacts import is_pair
 from seaopt.robustness.judgement import NOMINAL, Outcome, judged
 from seaopt.robustness.playback import Stage, Trace, play
-from seaopt.robustness.scenarios import Scenario, default_scenarios
+from seaopt.robustness.scenarios import Scenario, default_scenarios, left_out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -178,6 +178,10 @@ def verify(
         chosen = default_scenarios(controller, stage.plant) if scenarios is None else tuple(scenarios)
         found = [(item, item.obstacle(stage.plant, stage.partner)) for item in chosen]
         played[name] = tuple(item for item, obstacle in found if obstacle is None)
+        if scenarios is None:
+            skipped += [
+                (item, name, "nothing saturates without current_limit_A") for item in left_out(controller, stage.plant)
+            ]
         skipped += [(item.name, name, obstacle) for item, obstacle in found if obstacle is not None]
         simulated = wall = 0.0
         for item in played[name]:

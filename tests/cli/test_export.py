@@ -77,7 +77,7 @@ def one_line(done):
     [
         (("nowhere", "--c", "out"), "give the folder of results"),
         (("knee.toml", "--c", "out"), "give the folder of results"),
-        (("results", "--c", "knee.toml"), "cannot be written"),
+        (("results", "--c", "knee.toml"), "is a file; give a folder"),
         (("results", "--c", "out", "--precision", "half"), 'use "double" or "float"'),
         (("results", "--c", "out", "--name", "7"), "cannot begin a name in C"),
         (("results", "--c", "out", "--current-limit", "0"), "is not positive"),
@@ -96,8 +96,9 @@ def test_without_a_target_it_is_a_usage_error(seaopt):
     ("old", "new", "words"),
     [
         ("seaopt/controller/1", "seaopt/controller/0", "schema is"),
-        ('"den": [', '"den": [2.0,', "not 1"),
-        ('"reference"', '"referense"', "missing or malformed"),
+        ('"den": [', '"den": [2.0,', "begins with 2, not 1"),
+        ('"reference"', '"referense"', "reference is missing"),
+        ('"made_from": {', '"made_from": {}, "before": {', "made_from does not say of which problem file"),
         ("{", "", "not valid JSON"),
     ],
 )

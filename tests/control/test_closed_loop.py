@@ -10,6 +10,7 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import TransferFunction
 from seaopt.control.closed_loop import LoopState, SampledLoop, run_loop
+from seaopt.control.force_run import close_loop
 from seaopt.control.realisation import realise
 from seaopt.errors import SimulationError
 from seaopt.simulation import compiler
@@ -181,6 +182,16 @@ def test_a_batch_is_its_runs_one_by_one(swing, thor):
     for k, params in enumerate(sets):
         alone = run_loop(loop, [params], np.full(200, 60.0))
         np.testing.assert_allclose(together.outputs["F1"][k], alone.outputs["F1"][0], rtol=1e-9)
+
+
+def test_runs_are_printed_short(stand, thor):
+    run = close_loop(lambda state, r, y: (0.01 * (r - y), state), None, stand, thor, np.full(50, 10.0))
+    assert repr(run).startswith("ForceRun of 50 samples, 0.049 s: reference to 10 N, force up to")
+    loop = SampledLoop(plant=stand, law=law(), measured="F1", delay_samples=1)
+    whole = run_loop(loop, [thor, thor], np.full(50, 10.0))
+    assert repr(whole).startswith("LoopRun of 2 runs of 50 samples, from 0 to 0.049 s: largest magnitudes F1 ")
+    for text in (repr(run), repr(whole)):
+        assert len(text) < 400 and "\n" not in text and "array" not in text
 
 
 def test_a_run_goes_on_where_another_ended(swing, thor):

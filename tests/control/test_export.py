@@ -40,7 +40,7 @@ def compiler():
 
 
 def with_law(controller, c_r, c_y):
-    return replace(controller, reference=c_r, measurement=c_y)
+    return replace(controller, reference=c_r, measurement=c_y, design=None)
 
 
 def high_order(controller):
@@ -247,7 +247,8 @@ def test_the_header_of_gains_has_the_law(compiler, tuned, tmp_path):
 def test_a_controller_json_gives_the_same_files(tuned, tmp_path):
     written = export(tuned, tmp_path / "a"), export(json.loads(to_json(tuned.to_dict())), tmp_path / "b")
     for one, other in zip(*written, strict=True):
-        assert one.read_bytes() == other.read_bytes()
+        again = "As stated by controller.json, not computed again", "Achieved on the design plant"
+        assert one.read_text() == other.read_text().replace(*again)
         assert one.stat().st_size > 300
 
 
@@ -262,8 +263,8 @@ def test_an_infeasible_controller_is_refused_unless_asked(tuned, tmp_path):
 
 def test_text_cannot_leave_its_comment(tuned, tmp_path):
     content = json.loads(to_json(tuned.to_dict()))
-    content["structure"] = "pid */ int main(void)\n{"
-    for path in export(content, tmp_path, name="a/../b"):
+    content |= {"feasible": False, "active_constraints": ["x */ int main(void)\n{"]}
+    for path in export(content, tmp_path, name="a/../b", allow_infeasible=True):
         assert path.parent == tmp_path
         assert path.name.startswith("a_b")
         assert path.read_text().count("*/ int") == 0
@@ -274,6 +275,9 @@ def test_text_cannot_leave_its_comment(tuned, tmp_path):
     [
         ({"precision": "half"}, 'precision = "half" is not known'),
         ({"name": "../.."}, "cannot begin a name in C"),
+        ({"name": "stdio"}, 'name = "stdio" is a keyword or a header of C; give another, such as stdio_law'),
+        ({"name": "Math"}, "header of C"),
+        ({"name": "volatile"}, "keyword"),
         ({"name": "a" * 26}, "cannot begin a name in C"),
         ({"current_limit_A": 0.0}, "current_limit_A = 0 is not positive"),
         ({"tracking_time_s": float("nan")}, "tracking_time_s = nan is not positive"),
@@ -293,6 +297,59 @@ def test_a_malformed_controller_json_is_refused(field, value, tuned, tmp_path):
     content = json.loads(to_json(tuned.to_dict())) | {field: value}
     with pytest.raises(FileError, match=r"controller\.json"):
         export(content, tmp_path)
+
+
+EDITS = [
+    (("measurement", "num", 0), 99.0, "measurement.num is not what gains, observer and spec give"),
+    (("reference", "den", 1), -1.9, "reference.den is not what"),
+    (("gains", "k_p"), 1.0, "num is not what"),
+    (("gains", "k_x"), 1.0, "gains has T_f, k_d, k_ff, k_i, k_p, k_x where"),
+    (("delay_samples",), 2.5, "delay_samples is 2.5 and spec.delay_samples 1"),
+    (("sample_time_s",), 0.002, "sample_time_s is 0.002, which is not 1/spec.sample_rate_hz"),
+    (("sample_time_s",), "x", "sample_time_s is 'x', not a number"),
+    (("feasible",), "yes", "feasible is 'yes'"),
+    (("spec", "structure"), "foo", 'structure = "foo" is not known'),
+    (("spec", "bandwidth_range_hz"), ["a", 2.0], r"spec.bandwidth_range_hz\[0\] is 'a', not a number"),
+    (("current_per_force_A_per_N",), "1", "current_per_force_A_per_N is '1', not a number"),
+    (("measurement", "den"), [], "measurement.den is .., not a list of numbers"),
+    (("active_constraints",), "ms", "active_constraints is 'ms', not a list of names"),
+    (("observer",), {"T_q": 1.0}, "observer.inverse is missing"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "words"), EDITS)
+def test_an_edited_controller_json_is_refused_by_export_and_by_reading(place, value, words, tuned, tmp_path):
+    content = json.loads(to_json(tuned.to_dict()))
+    table = content
+    for name in place[:-1]:
+        table = table[name]
+    table[place[-1]] = value
+    for read in (lambda: export(content, tmp_path), lambda: so.Controller.from_dict(content, *tuned.design)):
+        with pytest.raises(FileError, match=words) as raised:
+            read()
+        assert str(raised.value).startswith("controller.json: ")
+        assert "malformed" not in str(raised.value)
+        assert "\n" not in str(raised.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_figures_are_computed_again_where_the_design_plant_is_known(tuned, tmp_path):
+    lying = replace(tuned, achieved=replace(tuned.achieved, ms=1.01))
+    header = export(lying, tmp_path)[0].read_text()
+    assert f"Achieved on the design plant: bandwidth 30 Hz, Ms {tuned.achieved.ms:.4g}" in header
+    content = json.loads(to_json(lying.to_dict()))
+    assert "As stated by controller.json, not computed again: bandwidth 30 Hz, Ms 1.01" in (
+        export(content, tmp_path)[0].read_text()
+    )
+    unstable = TransferFunction(num=99.0 * tuned.measurement.num, den=tuned.measurement.den)
+    with pytest.raises(ControlError, match="not stable on its design plant"):
+        export(replace(tuned, measurement=unstable), tmp_path)
+
+
+def test_a_target_that_is_a_file_is_told(tuned, tmp_path):
+    (tmp_path / "ctest.c").write_text("")
+    with pytest.raises(FileError, match=r"ctest\.c: is a file; give a folder"):
+        export(tuned, tmp_path / "ctest.c")
 
 
 def test_a_pid_whose_integral_is_slow_is_coarse_in_float(compiler, tuned, tmp_path):

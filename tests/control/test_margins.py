@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
+import seaopt as so
 from seaopt.control import DigitalPlant, Loop, TransferFunction
 from seaopt.control.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from tests.control.test_loop import loop_of
 
+INTEGRATING = [("pid", 22, 1.6), ("pid_dob", 22, 1.6), ("pid_dob", 30, 2.0)]
 ONE = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
 
 
@@ -118,6 +120,36 @@ def test_a_gain_margin_downwards():
         assert np.max(np.abs(poles_of(loop, 10 ** (db / 20)))) == pytest.approx(1.0, abs=1e-9)
     assert found.gain_down_db < 0 < found.gain_up_db
     assert loop.figures().gain_margin_db == pytest.approx(min(found.gain_up_db, -found.gain_down_db))
+
+
+@pytest.mark.parametrize(("structure", "bandwidth_hz", "ms"), INTEGRATING)
+@pytest.mark.parametrize("name", ["stand", "swing"])
+def test_an_integrator_is_no_crossing(structure, bandwidth_hz, ms, name, request, thor):
+    """-1/L at 0 Hz was rounding over infinity: 1.5e-7 to 1.5e-8 of pid_dob on the stand, up to 1.6e-4 on the swing."""
+    spec = so.ControllerSpec(bandwidth_hz=bandwidth_hz, max_sensitivity=ms, structure=structure)
+    loop = so.tune(so.plants.high_impedance(), thor, spec).close(request.getfixturevalue(name), thor)
+    if not loop.figures().stable:
+        pytest.skip("the free output hides the integrator: the loop has a pole at 1")
+    found = margins(loop)
+    assert found.gain_down_db is None
+    assert found.gain_up_db == pytest.approx(loop.figures().gain_margin_db)
+    top = 10 ** (found.gain_up_db / 20)
+    for factor in (1e-4, 1e-2, 0.1, 0.5, 1.0, 0.999 * top):
+        assert np.max(np.abs(poles_of(loop, factor))) < 1.0
+    for factor in (1e-9, 1e-6):  # a double integrator is known to the root of rounding
+        assert np.max(np.abs(poles_of(loop, factor))) < 1.0 + (1e-5 if structure == "pid_dob" else 0.0)
+    assert np.max(np.abs(poles_of(loop, 1.001 * top))) > 1.0
+
+
+@pytest.mark.parametrize("num", [[1.0, -1.0], [1.0, 1.0], [1.0, 0.0, -1.0]])
+def test_a_zero_on_the_circle_is_no_crossing(num):
+    """At z = 1, at z = -1 and at both; python-control's factors are the others."""
+    for gain in np.linspace(-0.3, 0.3, 13):
+        loop = modal([(20, 0.7, 1.0)], law=TransferFunction(num=gain * np.array(num), den=np.array([1.0])))
+        for hz, factor in margins(loop).gain_crossings:
+            value = independent(loop, np.array([hz]))[0]
+            assert value == pytest.approx(-1.0 / factor, rel=1e-6)
+            assert abs(value) > 1e-6
 
 
 def test_an_unstable_loop_that_python_control_calls_comfortable(stand, thor):

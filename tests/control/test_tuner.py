@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,6 +110,26 @@ def test_efficiency_changes_the_loop_gain(stand, thor):
     f = np.array([1.0, 10.0, 100.0])
     strong, weak = (controller.close(stand, thor.update(eta=eta)).open_loop(f) for eta in (1.0, 0.8))
     np.testing.assert_allclose(weak, 0.8 * strong)
+
+
+def test_a_sensitivity_over_its_limit_is_told_by_how_much(stand, thor):
+    """abs(S) may lie along -3 dB: where it first exceeds it says nothing of how nearly it is kept."""
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.2, min_sensitivity_bandwidth_hz=20)
+    controller = so.tune(stand, thor, spec)
+    loop = controller.close(stand, thor)
+    reached = np.max(np.abs(loop.sensitivity(np.linspace(0.01, 20.0, 20000))))
+    told = next(item for item in controller.blocked_by if item.startswith("min_sensitivity"))
+    assert told == (f"min_sensitivity_bandwidth_hz, |S| reaches {reached:.4f} below 20 Hz, 0.7071 allowed")
+    assert told in controller.explanation
+
+
+@pytest.mark.parametrize(("depth", "told"), [(0.4, False), (1.0, True)])
+def test_a_notch_without_effect_is_told(depth, told, stand, thor):
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    gains = {**controller.gains, "notch_frequency_hz": 100.0, "notch_width": 0.2, "notch_depth": depth}
+    assert (
+        f"gain at its centre {depth:g}: of no use, tune without it" in repr(replace(controller, gains=gains))
+    ) is told
 
 
 def test_json_round_trip(stand, swing, thor, tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import control
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from scipy.stats import beta
 import seaopt as so
 from seaopt.errors import ControlError
 from seaopt.robustness import batch_figures, failure_bound
+from seaopt.robustness.draws import check_ranges
 
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25
@@ -121,6 +124,23 @@ def test_fit_covariance_drives_the_draws(controller, stand, swing, short_log, th
 def test_bad_input(controller, swing, thor, options, words):
     with pytest.raises(ControlError, match=words):
         so.certify(controller, {"swing": swing}, thor, **options)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({"I_p": 0.3}, "range of I_p = 0.3 is not a range; give (low, high)"),
+        ({"I_p": (0.2,)}, "range of I_p = (0.2,) is not a range; give (low, high)"),
+        ({"I_p": (0.2, "0.3")}, "range of I_p = (0.2, '0.3') is not a range; give (low, high)"),
+        ({"I_p": None}, "range of I_p = None is not a range; give (low, high)"),
+        (["I_p"], "ranges is a list; give a mapping of name to (low, high)"),
+    ],
+)
+def test_what_is_no_range_is_told_in_one_line(swing, ranges, words):
+    """As without the type checks of the tests."""
+    with pytest.raises(ControlError) as raised:
+        inspect.unwrap(check_ranges)(ranges, {"swing": swing})
+    assert str(raised.value) == words
 
 
 def test_an_unidentifiable_fit_is_not_certified(controller, stand, short_log, thor):

@@ -191,6 +191,21 @@ def test_bad_input(controller, thor, attempt, words):
         attempt(controller, thor)
 
 
+def test_what_a_missing_current_limit_leaves_out_is_said(controller, stand, swing, thor):
+    free = replace(controller, spec=replace(controller.spec, current_limit_A=None))
+    found = verify(free, {"stand": stand, "swing": swing}, thor)
+    reason = "nothing saturates without current_limit_A"
+    expected = (("saturating doublet", "stand"), ("saturating hold", "stand"), ("saturating doublet", "swing"))
+    assert tuple(item[:2] for item in found.skipped) == expected
+    assert f"not played: saturating hold on stand, {reason}" in repr(found)
+
+
+def test_a_trace_is_printed_short(verification):
+    text = repr(verification.replay(verification.rows[0]))
+    assert text.startswith("Trace of 1 run of ")
+    assert len(text) < 400 and "\n" not in text and "array" not in text
+
+
 def test_scenarios_of_other_plants(controller, thor):
     """A mass and the numbered pendulum of two_link, behind a load cell: blows, payloads, falls and contacts too."""
     for link, payload, parts in (("mass", "m_2", ("load_cell",)), ("pendulum", "I_p2", ())):

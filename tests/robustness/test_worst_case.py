@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
 import seaopt as so
+from seaopt.control import Loop
+from seaopt.control.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
-from seaopt.robustness import batch_figures, plant_margins
+from seaopt.robustness import batch, batch_figures, plant_margins
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
 
@@ -39,9 +43,36 @@ def test_a_batch_with_conditions_is_the_one_by_one_path(controller, swing, thor)
         assert found.mt[k] == pytest.approx(figures.mt, rel=1e-9)
 
 
-def test_whole_samples_of_delay_are_the_controllers_own(controller, stand, thor):
-    from dataclasses import replace
+@pytest.mark.parametrize("b_r", [1e12, 1e160, 1e300])
+def test_draws_beyond_computing_are_failures(b_r, controller, stand, thor):
+    """A hopeless fit's: entries that overflow were a LinAlgError."""
+    found = batch_figures(controller, stand, thor, {"b_r": np.array([1.31e-4, b_r])})
+    assert found.spectral_radius[0] == pytest.approx(controller.close(stand, thor).figures().spectral_radius, rel=1e-9)
+    assert found.spectral_radius[1] >= 1.0 - 1e-9
+    for options in ({"ranges": {"b_r": (0.0, b_r)}}, {}):
+        values = thor if options else thor.with_parameters(replace(thor["b_r"], value=b_r, prior_std=min(b_r, 1e150)))
+        certificate = so.certify(controller, {"stand": stand}, values, samples=50, **options)
+        assert not certificate.passed
+        assert certificate.monte_carlo.failures >= 49
 
+
+@pytest.mark.parametrize("value", [np.inf, np.nan])
+def test_a_plant_that_is_not_finite_is_not_stable(value, controller, stand, thor, monkeypatch):
+    plant = controller.plant(stand, thor)
+    a = np.where(np.eye(len(plant.a)) > 0, value, plant.a)
+    loop = Loop(plant=replace(plant, a=a), reference=controller.reference, measurement=controller.measurement)
+    figures = loop.figures()
+    assert (figures.stable, figures.spectral_radius, figures.ms) == (False, np.inf, np.inf)
+    assert margins(loop).disks == {}
+    assert nu_gap(controller.close(stand, thor), loop) == (1.0, None)
+    held = batch.hold
+    monkeypatch.setattr(batch, "hold", lambda *given: (np.full_like(held(*given)[0], value), *held(*given)[1:]))
+    found = batch_figures(controller, stand, thor, {"b_r": np.full(3, 1.31e-4)})
+    assert np.all(found.spectral_radius == np.inf)
+    assert np.all(found.ms == np.inf)
+
+
+def test_whole_samples_of_delay_are_the_controllers_own(controller, stand, thor):
     late = controller.close(stand, with_(thor, "delay_s", 2e-3, "s")).figures()
     own = replace(controller, delay_samples=controller.delay_samples + 2).close(stand, thor).figures()
     assert late.ms == pytest.approx(own.ms, rel=1e-10)
