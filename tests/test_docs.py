@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import Gains
 from seaopt.control.export import export
 from seaopt.simulation.compiler import find_compiler
 
@@ -58,14 +57,8 @@ def test_the_c_of_the_docs_compiles(tmp_path):
     compiler = find_compiler()
     if compiler is None:
         pytest.skip("no C compiler on this machine")
-    pair = Gains(k_p=3.0, k_i=1.0, k_d=0.03, T_f=1e-3, k_ff=1.0).transfer_functions("pid", 1e-3)
-    reference, measurement = ({"num": tf.num, "den": tf.den} for tf in pair)
-    content = {
-        "structure": "pid", "gains": {}, "sample_time_s": 1e-3, "delay_samples": 1, "reference": reference,
-        "measurement": measurement, "current_per_force_A_per_N": 0.004, "spec": {"measured": "F1"}, "achieved": {},
-        "feasible": True, "active_constraints": [],
-    }  # fmt: skip
-    export(content, tmp_path, name="knee")
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    export(so.tune(so.plants.high_impedance(), so.plants.thor(), spec), tmp_path, name="knee")
     (tmp_path / "main.c").write_text(blocks("export.md", "c")[0], encoding="utf-8")
     subprocess.run(
         [*compiler, "-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic", "-c", "main.c"], cwd=tmp_path, check=True

@@ -122,14 +122,15 @@ def test_a_gain_margin_downwards():
     assert loop.figures().gain_margin_db == pytest.approx(min(found.gain_up_db, -found.gain_down_db))
 
 
-@pytest.mark.parametrize(("structure", "bandwidth_hz", "ms"), INTEGRATING)
-@pytest.mark.parametrize("name", ["stand", "swing"])
+@pytest.mark.parametrize(
+    ("name", "structure", "bandwidth_hz", "ms"),
+    [("stand", *law) for law in INTEGRATING]
+    + [("swing", *law) for law in INTEGRATING if law[0] == "pid_dob"],  # that pid, not made for the swing, is unstable
+)
 def test_an_integrator_is_no_crossing(structure, bandwidth_hz, ms, name, request, thor):
     """-1/L at 0 Hz was rounding over infinity: 1.5e-7 to 1.5e-8 of pid_dob on the stand, up to 1.6e-4 on the swing."""
     spec = so.ControllerSpec(bandwidth_hz=bandwidth_hz, max_sensitivity=ms, structure=structure)
     loop = so.tune(so.plants.high_impedance(), thor, spec).close(request.getfixturevalue(name), thor)
-    if not loop.figures().stable:
-        pytest.skip("the free output hides the integrator: the loop has a pole at 1")
     found = margins(loop)
     assert found.gain_down_db is None
     assert found.gain_up_db == pytest.approx(loop.figures().gain_margin_db)
