@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.files import write_bytes
 from seaopt.logs import Log, Quality, Table
 from seaopt.logs.channel import ChannelQuality
 from seaopt.logs.clock import ClockQuality
 from seaopt.logs.faults import Runs
 from seaopt.logs.quality import jitter
 from seaopt.reporting.figures import envelope, panels
-from seaopt.reporting.report import rendered
+from seaopt.reporting.report import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,8 +88,7 @@ def write_quality_figure(data: Log | Table, found: Quality, path: Path | str) ->
         The folder cannot be written.
 
     """
-    figure = quality_figure(data, found)
-    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
+    return write_figure(quality_figure(data, found), path)
 
 
 def _steps(axis: Axes, time: Float[np.ndarray, " n"], found: Quality) -> None:

@@ -157,8 +157,7 @@ def write_frequency_figure(
         The folder cannot be written.
 
     """
-    figure = survey_figure(surveys, given, fitted)
-    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
+    return write_figure(survey_figure(surveys, given, fitted), path)
 
 
 def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
@@ -179,8 +178,7 @@ def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
     """
     from seaopt.reporting.frontier import frontier_figure
 
-    figure = frontier_figure(frontier)
-    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
+    return write_figure(frontier_figure(frontier), path)
 
 
 def _only(results: Sequence[Result], kind: type) -> Any:
@@ -198,6 +196,11 @@ def _plants(controller: Controller | None, certificate: Certificate | None) -> d
     if controller is not None and controller.design is not None:
         return {"design plant": controller.design}
     return {}
+
+
+def write_figure(figure: Any, path: Path | str) -> list[Path]:
+    """Write a figure as SVG and PNG, whose suffixes are added to the path."""
+    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
 
 
 def rendered(figure: Any, kind: str) -> bytes:
