@@ -28,7 +28,7 @@ from seaopt.control.estimates import augmented, disturbances_of, estimates
 from seaopt.control.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
-from seaopt.estimation.correlation import autocorrelation
+from seaopt.estimation.correlation import autocorrelation, ljung_box
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -210,7 +210,8 @@ class Estimator:
             std=self.std,
             innovations=dict(zip(self.outputs, innovations.T.copy(), strict=True)),
             whiteness_p={
-                name: ljung_box(channel) for name, channel in zip(self.outputs, innovations[settled:].T, strict=True)
+                name: ljung_box(autocorrelation(channel, LAGS)[1:], channel.size)
+                for name, channel in zip(self.outputs, innovations[settled:].T, strict=True)
             },
             settled=settled,
         )
@@ -376,12 +377,3 @@ def recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> Float
         x = np.vstack([x[:reach], x[reach:] + x[:-reach] @ power.T])
         power, reach = power @ power, 2 * reach
     return x
-
-
-def ljung_box(r: Float[np.ndarray, " n"], lags: int = LAGS) -> float:
-    """Return the p-value of the test that r is white (Ljung and Box, Biometrika 65, 1978)."""
-    from scipy.special import gammaincc  # deferred: scipy is slow to load
-
-    n = r.size
-    rho = autocorrelation(r, lags)[1:]
-    return float(gammaincc(lags / 2, n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1)))) / 2))

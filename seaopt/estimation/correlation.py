@@ -138,3 +138,11 @@ def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int)
     size = next_fast_len(len(a) + lags + 1, real=True)
     whole = np.asarray(irfft(np.asarray(rfft(a, size)) * np.conj(np.asarray(rfft(b, size))), size))
     return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]
+
+
+def ljung_box(rho: Float[np.ndarray, " lags"], n: float) -> float:
+    """Return the p-value of the Ljung-Box test (1978) that correlations at lags 1, 2, ... of n samples are chance."""
+    from scipy.special import gammaincc  # deferred: scipy.stats takes a second
+
+    statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, rho.size + 1))))
+    return float(gammaincc(rho.size / 2, statistic / 2))

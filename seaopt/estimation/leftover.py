@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.correlation import lagged_products, lagged_size, transforms
+from seaopt.estimation.correlation import lagged_products, lagged_size, ljung_box, transforms
 from seaopt.estimation.losses import pull_of
 from seaopt.estimation.residuals import CHUNK, Residuals
 from seaopt.simulation import Point, Segment, stream
@@ -142,16 +142,13 @@ class Leftover:
 
     def whiteness(self, o: int, lags: int = 20) -> float:
         """Return the p-value of the Ljung-Box test that r is white (Biometrika 65, 1978)."""
-        from scipy.special import gammaincc  # deferred: scipy.stats takes a second
-
         n = float(self.count[o])
         lags = min(lags, len(self.correlation) - 1, int(n / 5))
         power = self.correlation[0, o, o] - n * self.mean[o] ** 2
         if lags < 1 or power <= 0.0:
             return 1.0
         rho = (self.correlation[1 : lags + 1, o, o] - n * self.mean[o] ** 2) / power
-        statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-        return float(gammaincc(lags / 2, statistic / 2))
+        return ljung_box(rho, n)
 
 
 def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover:
