@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.control import Controller, DigitalPlant
+from seaopt.control import Controller
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant, jacobians
+from seaopt.plants import Plant
+from seaopt.robustness.batch import batch_figures
 
 MASSES_KG = (0.1, 1000.0)
 STIFFNESSES_N_PER_M = (1e1, 1e8)
@@ -252,45 +253,9 @@ def _radii(
     controller: Controller, coupled: Plant, parameters: ParameterSet, m: Float[np.ndarray, " n"],
     k: Float[np.ndarray, " n"], d: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:  # fmt: skip
-    """Return the spectral radii against n environments: plants in a batch, law and delay one system after them."""
-    values = np.repeat(np.array(coupled.parameter_values(parameters))[:, None], m.size, axis=1)
-    for name, drawn in (("m_2", m), ("k_e", k), ("d_e", d)):
-        values[list(coupled.parameters).index(name)] = drawn
-    a, b, c, through = _sampled(controller, coupled, values)
-    la, lb, lc, ld = controller.measurement.state_space()
-    late = DigitalPlant(
-        a=la, b=lb, c=lc, d=ld, sample_time_s=controller.sample_time_s, delay_samples=controller.delay_samples,
-        static_gain=math.inf,
-    )  # fmt: skip
-    ak, bk, ck, dk = late.delayed()
-    share = 1.0 / (1.0 + dk * through)
-    n, size = b.shape[1], b.shape[1] + bk.size
-    closed = np.zeros((m.size, size, size))
-    closed[:, :n, :n] = a - (dk * share)[:, None, None] * b[:, :, None] * c[:, None, :]
-    closed[:, :n, n:] = -share[:, None, None] * b[:, :, None] * ck
-    closed[:, n:, :n] = share[:, None, None] * bk[:, None] * c[:, None, :]
-    closed[:, n:, n:] = ak - (share * through)[:, None, None] * np.outer(bk, ck)
-    return np.max(np.abs(np.linalg.eigvals(closed)), axis=1)
-
-
-def _sampled(
-    controller: Controller, plant: Plant, p: Float[np.ndarray, "np n"]
-) -> tuple[Float[np.ndarray, "n x x"], Float[np.ndarray, "n x"], Float[np.ndarray, "n x"], Float[np.ndarray, " n"]]:
-    """Return plants with one input, from motor force to the measured force, behind an exact zero-order hold."""
-    from scipy.linalg import expm
-
-    count, nx, ny = p.shape[1], len(plant.states), len(plant.outputs)
-    found = jacobians(plant).map(count)(np.zeros((nx, count)), np.zeros((1, count)), p)
-    shapes = ((nx, nx), (nx, 1), (ny, nx), (ny, 1))
-    a, b, c, d = (
-        np.array(item).reshape(rows, count, columns).transpose(1, 0, 2)
-        for item, (rows, columns) in zip(found, shapes, strict=True)
-    )
-    row, gain = list(plant.outputs).index(controller.spec.measured), controller.current_per_force_A_per_N
-    block = np.zeros((count, nx + 1, nx + 1))
-    block[:, :nx, :nx], block[:, :nx, nx] = a, gain * b[:, :, 0]
-    whole = np.asarray(expm(block * controller.sample_time_s))
-    return whole[:, :nx, :nx], whole[:, :nx, nx], c[:, row], gain * d[:, row, 0]
+    """Return the spectral radii against n environments."""
+    draws = {"m_2": m, "k_e": k, "d_e": d}
+    return batch_figures(controller, coupled, coupled.complete(parameters), draws, peaks=False).spectral_radius
 
 
 def _fixed(controller: Controller, coupled: Plant, parameters: ParameterSet) -> bool:
