@@ -14,13 +14,13 @@ a state of the plant (``phi``)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact
 
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
@@ -31,7 +31,7 @@ Linear = tuple[
     Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k n"], Float[np.ndarray, " k"]
 ]  # fmt: skip
 Held = tuple[
-    Float[np.ndarray, "k m m"], Float[np.ndarray, "k m"], Float[np.ndarray, "k m"], Float[np.ndarray, " k"]
+    Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, " k"]
 ]  # fmt: skip
 
 DELAY = "delay_s"
@@ -186,25 +186,50 @@ def _rest(
     raise ControlError(f"plant {plant.name} cannot rest at {given}, so it cannot be linearised there; give another")
 
 
+def linearised_along(
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]],
+    dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
+) -> tuple[Linear, Linear]:  # fmt: skip
+    """Return what `linearised` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
+    row, names = list(plant.outputs).index(measured), list(plant.states)
+    x, u = _rest(plant, p, at)
+    a, b, c, d = _jacobians(plant, x, u, p)
+    dx, du = np.zeros_like(x), np.zeros_like(u)
+    fixed = [names.index(name) for name in at if name in names]
+    if fixed:  # f(x, u, p) = 0 along the direction: linear in the loose states and the first input
+        loose = [i for i in range(len(names)) if i not in fixed]
+        for i in fixed:
+            dx[i] = dat[names[i]]
+        (drift,) = _mapped(plant, "drift", x, u, p, dp)
+        moved = drift.T[:, :, None] + a[:, :, fixed] @ dx[fixed].T[:, :, None]
+        step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), -moved)[..., 0].T
+        dx[loose], du[0] = step[:-1], step[-1]
+    da, db, dc, dd = _blocks(plant, _mapped(plant, "turn", x, u, p, dx, du, dp))
+    return (
+        (a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain),
+        (da, db[:, :, 0] * gain, dc[:, row], dd[:, row, 0] * gain),
+    )
+
+
 def _jacobians(
     plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
 ) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return A, B, C and D of k plants."""
-    nx, nu, ny, count = len(plant.states), len(plant.inputs), len(plant.outputs), p.shape[1]
-    found = _mapped(plant, "jacobians", x, u, p)
+    return _blocks(plant, _mapped(plant, "jacobians", x, u, p))
+
+
+def _blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:
+    """Return matrices as CasADi maps them, side by side, as stacks."""
+    nx, nu, ny = len(plant.states), len(plant.inputs), len(plant.outputs)
     shapes = ((nx, nx), (nx, nu), (ny, nx), (ny, nu))
     return tuple(
-        item.reshape(rows, count, columns).transpose(1, 0, 2)
-        for item, (rows, columns) in zip(found, shapes, strict=True)
+        item.reshape(rows, -1, width).transpose(1, 0, 2) for item, (rows, width) in zip(columns, shapes, strict=True)
     )
 
 
 def _mapped(plant: Plant, what: str, *arguments: Float[np.ndarray, "_ k"]) -> list[Float[np.ndarray, "_ _"]]:
-    """Return the plant's Jacobians or dynamics at every column, in blocks that CasADi maps over."""
-    if what == "dynamics" and what not in plant.cache:
-        dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
-        plant.cache[what] = ca.Function(what, [plant.x, plant.u, plant.p], [dynamics])
-    function = jacobians(plant) if what == "jacobians" else plant.cache[what]
+    """Return a function of `_function` at every column, in blocks that CasADi maps over."""
+    function = jacobians(plant) if what == "jacobians" else _function(plant, what)
     count = arguments[0].shape[1]
     block = 1 if count == 1 else MAPPED
     key = f"{what} of {block}"
@@ -220,25 +245,52 @@ def _mapped(plant: Plant, what: str, *arguments: Float[np.ndarray, "_ k"]) -> li
     return [np.concatenate(items, axis=1) for items in zip(*parts, strict=True)]
 
 
+def _function(plant: Plant, what: str) -> Any:
+    """Return a CasADi function, made once a plant.
+
+    dynamics: (x, u, p) to f; drift: f's derivative along dp; turn: that of A, B, C and D along (dx, du, dp).
+    """
+    if what not in plant.cache:
+        given = [plant.x, plant.u, plant.p]
+        x, u, p = (ca.SX.sym("along", item.shape[0]) for item in given)
+        dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
+        if what == "dynamics":
+            found, wanted = given, [dynamics]
+        elif what == "drift":
+            found, wanted = [*given, p], [ca.jtimes(dynamics, plant.p, p)]
+        else:
+            along = ca.vertcat(x, u, p)
+            wanted = [ca.densify(ca.jtimes(item, ca.vertcat(*given), along)) for item in jacobians(plant).call(given)]
+            found = [*given, x, u, p]
+        plant.cache[what] = ca.Function(what, found, wanted)
+    return plant.cache[what]
+
+
 def hold(
-    a: Float[np.ndarray, "k n n"], b: Float[np.ndarray, "k n"], c: Float[np.ndarray, "k n"], d: Float[np.ndarray, " k"],
-    sample_time_s: float, delay_s: Float[np.ndarray, " k"],
+    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], c: Inexact[np.ndarray, "k n"],
+    d: Inexact[np.ndarray, " k"], sample_time_s: float, delay_s: Inexact[np.ndarray, " k"],
 ) -> Held:  # fmt: skip
-    """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's."""
+    """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's.
+
+    Imaginary parts come through as derivatives do: with 1e-20 of a
+    direction added as one, those of the result are 1e-20 of its derivative (complex step).
+    """
     whole_period, gamma = _exponential(a, b, np.full(delay_s.size, sample_time_s))
     if not np.any(delay_s):
         return whole_period, gamma, c, d
-    whole = np.floor(delay_s / sample_time_s + 1e-9).astype(int)
-    rest = np.maximum(delay_s - whole * sample_time_s, 0.0)
+    whole = np.floor(np.real(delay_s) / sample_time_s + 1e-9).astype(int)
+    rest = delay_s - whole * sample_time_s
+    rest = rest - np.minimum(np.real(rest), 0.0)
     newer = _exponential(a, b, sample_time_s - rest)[1]
     count, n, chain = a.shape[0], a.shape[1], int(whole.max()) + 1
     rows = np.arange(count)
-    drive = np.zeros((count, n, chain + 1))  # column i: the command i samples ago
-    through = np.zeros((count, chain + 1))
+    drive = np.zeros((count, n, chain + 1), dtype=newer.dtype)  # column i: the command i samples ago
+    through = np.zeros((count, chain + 1), dtype=d.dtype)
     drive[rows, :, whole] = newer
     drive[rows, :, whole + 1] += gamma - newer
-    through[rows, np.where(rest > 0.0, whole + 1, whole)] = d  # the output is read before the command changes
-    big, late = np.zeros((count, n + chain, n + chain)), np.zeros((count, n + chain))
+    through[rows, np.where(np.real(rest) > 0.0, whole + 1, whole)] = d  # the output is read before the command changes
+    big = np.zeros((count, n + chain, n + chain), dtype=drive.dtype)
+    late = np.zeros((count, n + chain), dtype=drive.dtype)
     big[:, :n, :n], big[:, :n, n:] = whole_period, drive[:, :, 1:]
     late[:, :n], late[:, n] = drive[:, :, 0], 1.0
     for i in range(1, chain):
@@ -248,11 +300,11 @@ def hold(
 
 @np.errstate(over="ignore", invalid="ignore")  # a plant far off may overflow: the loop is then not stable
 def _exponential(
-    a: Float[np.ndarray, "k n n"], b: Float[np.ndarray, "k n"], t: Float[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"]]:
+    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], t: Inexact[np.ndarray, " k"]
+) -> tuple[Inexact[np.ndarray, "k n n"], Inexact[np.ndarray, "k n"]]:
     """Return exp(a t) and the integral of exp(a s) b from 0 to t: Taylor's polynomial, scaled and squared."""
     n = a.shape[1]
-    block = np.zeros((a.shape[0], n + 1, n + 1))
+    block = np.zeros((a.shape[0], n + 1, n + 1), dtype=np.result_type(a, b, t))
     block[:, :n, :n], block[:, :n, n] = a, b
     block *= t[:, None, None]
     norm = np.max(np.sum(np.abs(block), axis=2), axis=1, initial=0.0)

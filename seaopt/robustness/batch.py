@@ -32,7 +32,10 @@ FAN = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # about a pole, in dista
 MAXIMA = 3  # local maxima refined
 NEWTON_STEPS = 40
 
+NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
+
 Progress = Callable[[int], None]
+Peak = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,16 +72,8 @@ def batch_figures(
         Whether Ms and Mt are wanted; if not, they are nan where stable.
 
     """
-    count = len(next(iter(draws.values()))) if draws else 1
-    values = np.repeat(np.array(plant.parameter_values(nominal))[:, None], count, axis=1)
-    for row, name in enumerate(plant.parameters):
-        if name in draws:
-            values[row] = draws[name]
-    extra = {
-        name: draws[name] if name in draws else np.full(count, nominal[name].value)
-        for name in conditions((plant,))
-        if name in draws or name in nominal
-    }
+    values, extra = columns(plant, nominal, draws)
+    count = values.shape[1]
     chain = float(np.max(extra.get(DELAY, np.zeros(1))))
     parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
     with ThreadPoolExecutor(threads) as pool:
@@ -102,8 +97,25 @@ def batch_figures(
     return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
 
 
+def columns(
+    plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]]
+) -> tuple[Float[np.ndarray, "np n"], dict[str, Float[np.ndarray, " n"]]]:
+    """Return a plant's parameters, one column a draw, and its conditions."""
+    count = len(next(iter(draws.values()))) if draws else 1
+    values = np.repeat(np.array(plant.parameter_values(nominal))[:, None], count, axis=1)
+    for row, name in enumerate(plant.parameters):
+        if name in draws:
+            values[row] = draws[name]
+    extra = {
+        name: draws[name] if name in draws else np.full(count, nominal[name].value)
+        for name in conditions((plant,))
+        if name in draws or name in nominal
+    }
+    return values, extra
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Products:
+class Products:
     """S of every draw as a product over poles, open and closed."""
 
     opened: Complex[np.ndarray, "n k"]
@@ -111,6 +123,7 @@ class _Products:
     scale: Float[np.ndarray, " n"]
 
     def sensitivity(self, z: Complex[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
+        """Return S at points of each row's own."""
         above, below = np.ones_like(z), np.ones_like(z)
         for k in range(self.opened.shape[1]):
             above *= z - self.opened[:, k, None]
@@ -128,8 +141,9 @@ class _Products:
             second += below**2 - above**2
         return first, second
 
-    def rows(self, index: Int[np.ndarray, " r"]) -> _Products:
-        return _Products(opened=self.opened[index], closed=self.closed[index], scale=self.scale[index])
+    def rows(self, index: Int[np.ndarray, " r"]) -> Products:
+        """Return the loops of some rows."""
+        return Products(opened=self.opened[index], closed=self.closed[index], scale=self.scale[index])
 
 
 def _chunk(
@@ -140,19 +154,19 @@ def _chunk(
     whole = np.concatenate([a.reshape(count, -1), b, c, d[:, None]], axis=1)
     finite = np.max(np.abs(whole), axis=1) < LARGEST  # not so of nan
     a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (item.ndim - 1)), item, 0.0) for item in (a, b, c, d))
-    products = _products(controller, a, b, c, d)
+    products = closed_products(controller, a, b, c, d)
     radius = np.where(finite, np.max(np.abs(products.closed), axis=1), np.inf)
     ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
     stable = np.flatnonzero(radius < STABLE)
     if stable.size:
-        ms[stable], mt[stable] = _peaks(products.rows(stable)) if peaks else (np.nan, np.nan)
+        (ms[stable], _), (mt[stable], _) = find_peaks(products.rows(stable)) if peaks else NO_PEAKS
     return radius, ms, mt
 
 
-def _products(
+def closed_products(
     controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n x"],
     d: Float[np.ndarray, " n"],
-) -> _Products:  # fmt: skip
+) -> Products:  # fmt: skip
     """Return the eigenvalues of the open and of the closed loop."""
     ac, bc, cc, dc = law_state_space(controller.reference, controller.measurement)
     count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
@@ -175,11 +189,11 @@ def _products(
     closed[:, n:, n:] = ac - (scale * through)[:, None, None] * np.outer(bc[:, 1], cc)
     fixed = np.concatenate([np.linalg.eigvals(ac), np.zeros(k)])
     opened = np.concatenate([np.linalg.eigvals(a), np.broadcast_to(fixed, (count, m + k))], axis=1)
-    return _Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
+    return Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
 
 
-def _peaks(loop: _Products) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the largest abs(S) and abs(T) of every row."""
+def find_peaks(loop: Products) -> tuple[Peak, Peak]:
+    """Return the largest abs(S) and abs(T) of every row, and at which angles they are."""
     angle, distance = np.abs(np.angle(loop.closed)), np.abs(1.0 - np.abs(loop.closed))
     own = (angle[:, :, None] + distance[:, :, None] * FAN).reshape(angle.shape[0], -1)
     base = np.broadcast_to(BASE, (angle.shape[0], BASE.size))
@@ -189,11 +203,12 @@ def _peaks(loop: _Products) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, 
 
 
 def _highest(
-    loop: _Products, theta: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n m"], complement: bool
-) -> Float[np.ndarray, " n"]:
-    """Return the largest value of each row: the highest local maxima of its grid, refined by Newton's method."""
+    loop: Products, theta: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n m"], complement: bool
+) -> Peak:
+    """Return the largest value of each row and its angle: the highest local maxima of its grid, by Newton's method."""
     rows = np.arange(theta.shape[0])
-    top = np.max(values, axis=1)
+    at = np.argmax(values, axis=1)
+    top, where = values[rows, at], theta[rows, at]
     inner = values[:, 1:-1]
     local = np.where((inner >= values[:, :-2]) & (inner >= values[:, 2:]), inner, -np.inf)
     for _ in range(MAXIMA):
@@ -206,8 +221,10 @@ def _highest(
             local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
         own, point = loop.rows(worth), at[worth] + 1
         low, high = _around(theta[worth], point)
-        top[worth] = np.maximum(top[worth], _refined(own, low, theta[worth, point], high, complement))
-    return top
+        found, angle = _refined(own, low, theta[worth, point], high, complement)
+        higher = found > top[worth]
+        top[worth[higher]], where[worth[higher]] = found[higher], angle[higher]
+    return top, where
 
 
 def _around(
@@ -222,17 +239,18 @@ def _around(
 
 
 def _refined(
-    loop: _Products, low: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"],
+    loop: Products, low: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"],
     complement: bool,
-) -> Float[np.ndarray, " n"]:  # fmt: skip
-    """Return the curve's value at its maximum between `low` and `high`."""
-    best = np.zeros(x.size)
+) -> Peak:  # fmt: skip
+    """Return the curve's value at its maximum between `low` and `high`, and the angle."""
+    best, where = np.zeros(x.size), x.copy()
     live = np.arange(x.size)
     low, x, high = low.copy(), x.copy(), high.copy()
     small = 1e-6 * (high - low)
     for _ in range(NEWTON_STEPS):
         value, g, slope = _slopes(loop.rows(live), x[live], complement)
-        best[live] = np.maximum(best[live], value)
+        higher = value > best[live]
+        best[live[higher]], where[live[higher]] = value[higher], x[live[higher]]
         low[live] = np.where(g > 0.0, x[live], low[live])
         high[live] = np.where(g > 0.0, high[live], x[live])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -245,12 +263,12 @@ def _refined(
         live = live[moving]
         if not live.size:
             break
-    return best
+    return best, where
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
 def _slopes(
-    loop: _Products, x: Float[np.ndarray, " n"], complement: bool
+    loop: Products, x: Float[np.ndarray, " n"], complement: bool
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""
     z = np.exp(1j * x)[:, None]

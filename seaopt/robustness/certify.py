@@ -24,7 +24,8 @@ from seaopt.robustness.certificate import Certificate, MonteCarlo
 from seaopt.robustness.draws import Uncertainty, uncertainty
 from seaopt.robustness.nominal import plant_margins
 from seaopt.robustness.requirements import design_requirements, draw_requirements, plant_requirements
-from seaopt.robustness.worst import ROUNDING, find_worst, limits, severities
+from seaopt.robustness.severity import limits, severities
+from seaopt.robustness.worst import ROUNDING, find_worst
 
 CONFIDENCE = 1.0 - 1e-6
 BLOCK = 50_000

@@ -7,7 +7,7 @@ first plant that has the part; the other plants get that mass.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -96,10 +96,45 @@ class Uncertainty:
                 out[name] = value
         return out
 
+    def slopes(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, "n k"]]:
+        """Return the derivatives of `values` with respect to the coordinates, by name."""
+        count, width = coordinates.shape
+        out: dict[str, Float[np.ndarray, "n k"]] = {}
+        for name, row in zip(self.names, self._factor(), strict=True):
+            out[name] = np.zeros((count, width))
+            out[name][:, : row.size] = row
+        for i, (name, (low, high)) in enumerate(self.ranges.items(), start=len(self.names)):
+            slope = np.full(count, 0.5 * (high - low))
+            if name == SCREW_MODE:
+                steps = np.diff(self.screw[1]) / np.diff(self.screw[0])
+                value = 0.5 * (low + high) + slope * coordinates[:, i]
+                slope *= steps[np.clip(np.searchsorted(self.screw[0], value) - 1, 0, steps.size - 1)]
+            own = SCREW_MASS if name == SCREW_MODE else name
+            out[own] = np.zeros((count, width))
+            out[own][:, i] = slope
+        return out
+
+    def bounds(
+        self, coordinates: Float[np.ndarray, "n k"]
+    ) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " n"]]]:
+        """Give each finite bound of the Gaussian part: its outward normal, and each point's distance from it."""
+        values = self._gaussian(coordinates)
+        for j, (name, row) in enumerate(zip(self.names, self._factor(), strict=True)):
+            item, std = self.nominal[name], float(np.linalg.norm(row))
+            normal = np.concatenate([row, np.zeros(len(self.ranges))]) / std
+            if np.isfinite(item.max):
+                yield normal, (item.max - values[:, j]) / std
+            if np.isfinite(item.min):
+                yield -normal, (values[:, j] - item.min) / std
+
+    def _factor(self) -> Float[np.ndarray, "g g"]:
+        """Return the covariance's factor: standard deviations along principal axes to parameters."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
+
     def _gaussian(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
         mean = np.array(self.nominal.values_of(self.names))
-        values, vectors = np.linalg.eigh(self.covariance)
-        return mean + coordinates[:, : mean.size] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        return mean + coordinates[:, : mean.size] @ self._factor().T
 
 
 def uncertainty(

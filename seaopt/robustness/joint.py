@@ -26,7 +26,8 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.certificate import Certificate
 from seaopt.robustness.certify import CONFIDENCE, certify
-from seaopt.robustness.worst import UNSTABLE, Worst
+from seaopt.robustness.severity import UNSTABLE
+from seaopt.robustness.worst import Worst
 
 ROUNDS = 6
 SAME = 1e-6  # witnesses that differ by less than this share in every parameter are one

@@ -9,7 +9,8 @@ import numpy as np
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.tuner import BANDWIDTH_TOLERANCE
 from seaopt.robustness.certificate import MonteCarlo, Requirement
-from seaopt.robustness.worst import ROUNDING, UNSTABLE, Worst
+from seaopt.robustness.severity import UNSTABLE
+from seaopt.robustness.worst import ROUNDING, Worst
 
 REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 

@@ -1,39 +1,39 @@
 r"""The worst case: the parameters, of all that the fit and the ranges allow, with the largest Ms or spectral radius.
 
 The set is an ellipsoid of the fit's covariance that holds `LEVEL` of its probability, cut by the physical bounds, times
-the box of the ranges. From the worst draws, each round takes the gradient of how much of the limits a point uses (by
-central differences of the batch figures, which are exact to 1e-9) and tries points along it and towards the vertex of
-the set that it points to (Frank, Wolfe, Naval Research Logistics 3, 1956), all starts and plants of a round in one
-batch. What it finds is a lower bound on the true worst case: a witness, checked by `Worst.verify`, and no proof that
-there is none worse.
+the box of the ranges. From the worst draws, each round takes the exact gradient of how much of the limits a point uses
+(`seaopt.robustness.severity`) and tries points along it and towards the vertex of the set that it points to (Frank,
+Wolfe, Naval Research Logistics 3, 1956), all starts of a round in one batch. What it finds is a lower bound on the true
+worst case: a witness, checked by `Worst.verify`, and no proof that there is none worse.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.digital import conditions
-from seaopt.control.loop import STABLE
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.batch import BatchFigures, batch_figures
 from seaopt.robustness.draws import Uncertainty
+from seaopt.robustness.severity import limits, severities, severity_slopes
 
 LEVEL = 0.999
 STARTS = 8
 ROUNDS = 30
-STEP = 1e-4
 VERTEX_STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.01])
 GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
-UNSTABLE = 1e6
+ON_BOUND = 1e-8  # of a physical bound, in standard deviations
 MATCH = 1e-6
 ROUNDING = 1e-6
+
+Slopes = Float[np.ndarray, "s k"]
+Trials = Float[np.ndarray, "s t k"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,20 +101,6 @@ class Worst(tuple[Plant, ParameterSet]):
         )
 
 
-def severities(controller: Controller, found: BatchFigures) -> Float[np.ndarray, " n"]:
-    """Return how bad every draw is: instability first, then the fraction of the limits that it uses."""
-    ms, mt = limits(controller)
-    with np.errstate(invalid="ignore"):  # infinite over infinite, of unstable draws, which are ranked apart
-        used = np.maximum(found.ms / ms, found.mt / mt) if np.isfinite(min(ms, mt)) else found.ms
-    return np.where(found.spectral_radius >= STABLE, UNSTABLE + found.spectral_radius, used)
-
-
-def limits(controller: Controller) -> tuple[float, float]:
-    """Return the limits on Ms and Mt; infinite where none is imposed."""
-    given = (controller.spec.max_sensitivity, controller.spec.max_complementary)
-    return (np.inf if given[0] is None else given[0]), (np.inf if given[1] is None else given[1])
-
-
 def find_worst(
     controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"],
     severity: Float[np.ndarray, " n"],
@@ -169,7 +155,7 @@ def _search(
 
     value = score(x)
     for _ in range(ROUNDS):
-        slope = _gradient(score, x)
+        slope = _inward(unknown, x, severity_slopes(controller, plant, unknown, x))
         trials = _trials(unknown, x, slope)
         scores = score(trials.reshape(-1, x.shape[1])).reshape(trials.shape[:2])
         best = np.argmax(scores, axis=1)
@@ -182,18 +168,16 @@ def _search(
     return x, value
 
 
-def _gradient(score: Any, x: Float[np.ndarray, "s k"]) -> Float[np.ndarray, "s k"]:
-    """Return central differences, zero across a bound or between stable and unstable."""
-    count, size = x.shape
-    ends = [score((x[:, None] + sign * STEP * np.eye(size)).reshape(-1, size)).reshape(count, size) for sign in (1, -1)]
-    with np.errstate(invalid="ignore"):
-        slope = (ends[0] - ends[1]) / (2 * STEP)
-    return np.where(np.isfinite(slope) & (np.abs(ends[0] - ends[1]) < 0.5 * UNSTABLE), slope, 0.0)
+def _inward(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) -> Slopes:
+    """Return the slopes without what leads out of a physical bound that a point lies on."""
+    slope = slope.copy()
+    for normal, room in unknown.bounds(x):
+        pushing = np.maximum(slope @ normal, 0.0) * (room <= 2.0 * ON_BOUND)
+        slope -= pushing[:, None] * normal
+    return slope
 
 
-def _trials(
-    unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Float[np.ndarray, "s k"]
-) -> Float[np.ndarray, "s t k"]:
+def _trials(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) -> Trials:
     """Return points towards the set's vertex in the slope's direction, and along the slope."""
     g = len(unknown.names)
     size = np.linalg.norm(slope, axis=1, keepdims=True)
@@ -203,7 +187,17 @@ def _trials(
     towards = x[:, None] + VERTEX_STEPS[:, None] * (vertex - x)[:, None]
     along = x[:, None] + GRADIENT_STEPS[:, None] * unit[:, None]
     whole = np.concatenate([towards, along], axis=1)
-    return _into_set(unknown, whole.reshape(-1, x.shape[1])).reshape(whole.shape)
+    return _cut(unknown, x, _into_set(unknown, whole.reshape(-1, x.shape[1])).reshape(whole.shape))
+
+
+def _cut(unknown: Uncertainty, x: Float[np.ndarray, "s k"], trials: Float[np.ndarray, "s t k"]) -> Trials:
+    """Return the trials, those beyond a physical bound moved back along their way from x."""
+    share = np.ones(trials.shape[:2])
+    for normal, room in unknown.bounds(x):
+        way, free = (trials - x[:, None]) @ normal, np.maximum(room - ON_BOUND, 0.0)[:, None]
+        beyond = way > free
+        share = np.minimum(share, np.where(beyond, free / np.where(beyond, way, 1.0), 1.0))
+    return x[:, None] + share[:, :, None] * (trials - x[:, None])
 
 
 def _into_set(unknown: Uncertainty, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:

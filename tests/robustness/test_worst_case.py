@@ -113,6 +113,25 @@ def test_the_gaussian_part_stays_inside_its_ellipsoid(controller, swing, thor):
     assert size == pytest.approx(chi2.ppf(0.999, 2), rel=1e-3)
 
 
+def test_the_worst_case_on_a_physical_bound_is_a_dense_searchs(controller, swing, thor):
+    """The bound on b_r cuts the ellipse where the gradient leads: the best point lies along it."""
+    from scipy.stats import chi2
+
+    tight = thor.prior(J=2e-7, b_r=4e-5).with_parameters(
+        replace(thor["b_r"], prior_std=4e-5, min=1.25e-4), replace(thor["J"], prior_std=2e-7)
+    )
+    certificate = so.certify(controller, {"swing": swing}, tight, samples=200)
+    radius, angle = np.meshgrid(np.linspace(0.0, np.sqrt(chi2.ppf(0.999, 2)), 60), np.linspace(0.0, 2 * np.pi, 241))
+    b_r = np.maximum(1.31e-4 + 4e-5 * (radius * np.sin(angle)).ravel(), 1.25e-4)
+    found = batch_figures(
+        controller, swing, tight, {"J": 3.31e-6 + 2e-7 * (radius * np.cos(angle)).ravel(), "b_r": b_r}
+    )
+    worst = certificate.worst["swing"]
+    assert worst.parameters["b_r"] == pytest.approx(1.25e-4, rel=1e-6)
+    assert worst.ms >= found.ms.max() * (1 - 1e-6)
+    assert worst.ms <= found.ms.max() * 1.001
+
+
 def test_a_witness_verifies_itself_and_goes_back_to_the_tuner(controller, stand, swing, thor):
     certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.15, 0.6)}, samples=60)
     worst = certificate.worst["swing"]
