@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-
-from pydantic import BaseModel, ValidationError
 
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, Notch
@@ -29,7 +26,8 @@ from seaopt.estimation import (
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
-from seaopt.problem.columns import check_inside, column_of, log_files, rule_of
+from seaopt.problem.columns import column_of, log_files, rule_of
+from seaopt.problem.references import check_references
 from seaopt.problem.schema import (
     ColumnTable,
     ExperimentTable,
@@ -41,9 +39,8 @@ from seaopt.problem.schema import (
     UnknownTable,
     VirtualTable,
 )
-from seaopt.robustness import check_ranges, placed
-
-MAX_BYTES = 4 << 20
+from seaopt.problem.validation import validated
+from seaopt.robustness import placed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -271,11 +268,11 @@ def read_problem(path: Path | str) -> Problem:
 
     """
     source = Path(path)
-    table = _validated(source, _toml(source))
+    table = validated(source)
     try:
         plants = {name: _plant(name, item.kind, item.model_extra or {}) for name, item in table.plant.items()}
         parameters = _parameters(table.parameters, plants)
-        _check_references(table, plants)
+        check_references(table, plants)
         spec = _spec(table)
     except SeaoptError as error:
         raise type(error)(f"{source}: {error}") from error
@@ -283,73 +280,6 @@ def read_problem(path: Path | str) -> Problem:
         title=table.title, source=str(path), folder=source.parent, parameters=parameters, plants=plants, table=table,
         spec=spec,
     )  # fmt: skip
-
-
-def _toml(source: Path) -> dict[str, Any]:
-    try:
-        if source.is_dir():
-            raise ProblemError(f"{source}: is a folder; give a problem file (TOML)")
-        if source.stat().st_size > MAX_BYTES:
-            raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
-        return tomllib.loads(source.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ProblemError(f"{source}: no such file; check the path") from error
-    except OSError as error:
-        raise ProblemError(f"{source}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ProblemError(f"{source}: is not valid TOML ({error}); correct that place") from error
-
-
-def _validated(source: Path, content: dict[str, Any]) -> ProblemTable:
-    try:
-        return ProblemTable.model_validate(content)
-    except ValidationError as error:
-        found = error.errors(include_url=False)
-        # A misspelt key is also a missing one: the misspelling is the mistake.
-        first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
-        # Where a string or a table may stand, what is wrong inside the table is the mistake.
-        inside = [
-            item for item in found if item["loc"][:-1] != first["loc"][:-1] and _within(item["loc"], first["loc"])
-        ]
-        first = inside[0] if first["type"] == "string_type" and inside else first
-        place = _place(first["loc"])
-        if first["type"] == "extra_forbidden":
-            known = _known_keys(first["loc"])
-            raise ProblemError(f"{source}: unknown key {place}; {suggestion(str(first['loc'][-1]), known)}") from error
-        if first["type"] == "missing":
-            raise ProblemError(f"{source}: key {place} is missing; add it") from error
-        value = repr(first["input"])
-        shown = value if len(value) <= 60 else value[:57] + "..."
-        raise ProblemError(f"{source}: {place} = {shown}: {first['msg']}") from error
-
-
-def _within(loc: tuple[int | str, ...], other: tuple[int | str, ...]) -> bool:
-    return len(loc) > len(other) and loc[: len(other) - 1] == other[:-1]
-
-
-def _place(loc: tuple[int | str, ...]) -> str:
-    """Return where in the file an error lies: names of union branches are not keys and are left out."""
-    keys = [str(item + 1) if isinstance(item, int) else item for item in loc]
-    branches = ("Table", "float", "bool", "str", "literal", "dict", "tuple")
-    return ".".join(key for key in keys if not any(branch in key for branch in branches) or key in loc[:1])
-
-
-def _known_keys(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that are known where `loc` points."""
-    model: Any = ProblemTable
-    for item in loc[:-1]:
-        if isinstance(item, int):
-            continue
-        if isinstance(model, type) and issubclass(model, BaseModel) and item in model.model_fields:
-            found = _models_in(model.model_fields[item].annotation)
-            model = found[0] if found else model
-    return [field.alias or name for name, field in model.model_fields.items()]
-
-
-def _models_in(annotation: Any) -> list[Any]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for item in getattr(annotation, "__args__", ()) for model in _models_in(item)]
 
 
 def _plant(name: str, kind: str, options: Mapping[str, Any]) -> Plant:
@@ -387,77 +317,6 @@ def _parameter(default: Parameter, table: ParameterTable) -> Parameter:
     low = default.min if table.min is None else table.min * scale
     high = default.max if table.max is None else table.max * scale
     return replace(default, value=table.value * scale, free=free, min=low, max=high, prior_std=prior)
-
-
-def _check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    places = [(f"experiment.{item.name}.plant", item.plant) for item in table.experiment]
-    if table.controller:
-        places.append(("controller.plant", table.controller.plant))
-        places += [("controller.robust_to", name) for name in table.controller.robust_to]
-    if table.robustness:
-        places += [("robustness.plants", name) for name in table.robustness.plants]
-    for place, name in places:
-        if name not in plants:
-            raise ProblemError(f'{place} = "{name}" is no [plant] of this file; {suggestion(name, plants)}')
-    _check_measured(table, plants)
-    _check_ranges(table, plants)
-    _check_sensors(table, plants)
-    seen: set[str] = set()
-    for item in table.experiment:
-        if item.name in seen:
-            raise ProblemError(f'experiment.name = "{item.name}" is used twice; rename one')
-        seen.add(item.name)
-        _check_experiment(item, plants[item.plant])
-
-
-def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    if table.controller is None:
-        return
-    measured = table.controller.measured
-    for name in (
-        table.controller.plant,
-        *table.controller.robust_to,
-        *(table.robustness.plants if table.robustness else ()),
-    ):
-        if measured not in plants[name].outputs:
-            raise ProblemError(
-                f'controller.measured = "{measured}" is not an output of plant.{name}; '
-                f"{suggestion(measured, plants[name].outputs)}"
-            )
-
-
-def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    given = table.robustness.sensors if table.robustness else SensorsTable()
-    known = {name for plant in plants.values() for name in plant.outputs}
-    for kind in SensorsTable.model_fields:
-        for name in getattr(given, kind):
-            if name not in known:
-                raise ProblemError(f'robustness.sensors.{kind} names "{name}"; {suggestion(name, known)}')
-
-
-def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    try:
-        check_ranges(table.robustness.parameters if table.robustness else {}, plants)
-    except SeaoptError as error:
-        raise ProblemError(f"robustness.parameters: {error}") from error
-
-
-def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
-    place = f"experiment.{item.name}"
-    if (item.log is None) == (item.virtual is None):
-        raise ProblemError(f"{place}: give either log or virtual, and not both")
-    if item.log is not None:
-        driven = any(name not in plant.optional_inputs for name in plant.inputs)
-        if not item.outputs or (driven and not item.inputs):
-            raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
-        check_inside(place, item)
-    for kind, given, known in (
-        ("inputs", item.inputs, plant.inputs),
-        ("outputs", item.outputs, plant.outputs),
-    ):
-        for name in given:
-            if name not in known:
-                raise ProblemError(f'{place}.{kind} names "{name}"; {suggestion(name, known)}')
 
 
 def _spec(table: ProblemTable) -> ControllerSpec | None:
