@@ -6,8 +6,9 @@ from seaopt.plants.linear import jacobians, state_space
 from seaopt.plants.modes import Modes, Resonance, modes
 from seaopt.plants.parts import PARTS, wrapped
 from seaopt.plants.plant import Plant
+from seaopt.plants.published import thor
 from seaopt.plants.rotary import rotary
-from seaopt.plants.two_link import high_impedance, moving_output, thor, two_link
+from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
 __all__ = [
     "KINDS",

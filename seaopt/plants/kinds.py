@@ -11,8 +11,9 @@ from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants.parts import PARTS
 from seaopt.plants.plant import Plant
+from seaopt.plants.published import all_parameters
 from seaopt.plants.rotary import rotary, rotary_parameters
-from seaopt.plants.two_link import all_parameters, high_impedance, moving_output, two_link
+from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
 ENTRY_POINTS = "seaopt.plants"
 KINDS: dict[str, Callable[..., Plant]] = {

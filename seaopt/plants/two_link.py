@@ -46,62 +46,14 @@ from typing import Any, Literal
 import casadi as ca
 
 from seaopt.errors import PlantError
-from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import parts as part_laws
 from seaopt.plants.parts import Part
 from seaopt.plants.plant import Plant
+from seaopt.plants.published import ACTUATOR, GRAVITY, link_mass, pendulum
 
 Drive = Literal["unlumped", "lumped"]
 Spring = Literal["link1", "link2"]
 Link = Literal["fixed", "mass", "pendulum"]
-
-_ACTUATOR = (
-    Parameter(name="m_l", value=0.646, unit="kg", min=0.0, description="translational sprung mass"),
-    Parameter(name="k", value=655e3, unit="N/m", min=0.0, description="spring stiffness"),
-    Parameter(name="l", value=0.002, unit="m", min=1e-9, description="ball-screw lead"),
-    Parameter(name="N_p", value=3.0, unit="-", min=1e-9, description="pulley reduction"),
-    Parameter(name="K_tau", value=0.0255, unit="N m/A", min=0.0, description="motor torque constant"),
-    Parameter(name="J", value=3.31e-6, unit="kg m^2", min=0.0, description="motor and transmission inertia"),
-    Parameter(name="b_r", value=1.31e-4, unit="N m s", min=0.0, description="rotary viscous damping"),
-    Parameter(name="eta", value=1.0, unit="-", min=0.0, description="transmission efficiency"),
-    Parameter(name="f_c", value=0.0, unit="N", min=0.0, description="Coulomb friction at the screw"),
-    Parameter(name="v_s", value=1e-3, unit="m/s", min=1e-9, description="smoothing speed of f_c"),
-)
-_PENDULUM = (
-    Parameter(name="I_p", value=0.36, unit="kg m^2", min=1e-9, description="inertia about the pivot"),
-    Parameter(name="m", value=4.0, unit="kg", min=0.0, description="pendulum mass"),
-    Parameter(name="L", value=0.3, unit="m", min=0.0, description="centre of mass to pivot"),
-    Parameter(name="L_a", value=0.0725, unit="m", min=0.0, description="lever arm"),
-    Parameter(name="d", value=0.0, unit="N m s", min=0.0, description="pivot damping"),
-)
-_GRAVITY = Parameter(name="g", value=9.81, unit="m/s^2", description="gravity")
-
-
-def all_parameters() -> list[Parameter]:
-    """Return every parameter that some `two_link`, `high_impedance` or `moving_output` has."""
-    links = [item for suffix in ("", "1", "2") for item in _pendulum_parameters(suffix)]
-    masses = [_link_mass(number) for number in (1, 2)]
-    return [*_ACTUATOR, *links, *masses, _GRAVITY]
-
-
-def _link_mass(number: int) -> Parameter:
-    return Parameter(name=f"m_{number}", value=10.0, unit="kg", min=1e-9, description=f"mass of link {number}")
-
-
-def thor() -> ParameterSet:
-    """Return the published parameters of the THOR linear SEA (Orekhov et al. 2015, Table I), none free.
-
-    The pendulum's are those of the paper's second experiment with the 4 kg weight as a point mass at 0.300 m; the
-    paper gives neither the link's inertia nor its damping.
-
-    Examples
-    --------
-    >>> params = thor()
-    >>> params["k"].value, params["J"].value
-    (655000.0, 3.31e-06)
-
-    """
-    return ParameterSet((*_ACTUATOR, *_PENDULUM, _GRAVITY))
 
 
 def _drive_figures(p: Any) -> tuple[Any, Any, Any]:
@@ -240,10 +192,6 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     )  # fmt: skip
 
 
-def _pendulum_parameters(suffix: str) -> list[Parameter]:
-    return [replace(item, name=f"{item.name}{suffix}") for item in _PENDULUM]
-
-
 def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
     part_laws.check_parts(parts)
     return tuple(parts)
@@ -267,19 +215,19 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
     _checked(build)
     states = {"q": "m", "qd": "m/s"} | ({"s": "m", "sd": "m/s"} if "screw_mode" in build.parts else {})
     outputs = {"F1": "N", "F2": "N", "q": "m"}
-    parameters = [*_ACTUATOR, *part_laws.parameters(build.parts)]
+    parameters = [*ACTUATOR, *part_laws.parameters(build.parts)]
     for number, (link, suffix) in enumerate(zip(build.links, build.suffixes, strict=True), start=1):
         if link == "mass":
             states |= {f"x_{number}": "m", f"v_{number}": "m/s"}
-            parameters.append(_link_mass(number))
+            parameters.append(link_mass(number))
         if link == "pendulum":
             states |= {f"phi{suffix}": "rad", f"phid{suffix}": "rad/s"}
             outputs |= {f"phi{suffix}": "rad"}
-            parameters += _pendulum_parameters(suffix)
+            parameters += pendulum(suffix)
         if link != "fixed":
             outputs[f"x_{number}"] = "m"
     if "pendulum" in build.links:
-        parameters.append(_GRAVITY)
+        parameters.append(GRAVITY)
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
         flat = [item for pair in _motion(x, u, p, build).rates for item in pair]
