@@ -156,6 +156,29 @@ def linearised(
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
 
+def resting(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
+    """Return states and inputs at rest where the conditions among `params` are; zeros without any.
+
+    Raises
+    ------
+    ControlError
+        The plant cannot rest there.
+
+    Examples
+    --------
+    >>> import math, seaopt as so
+    >>> swing, thor = so.plants.moving_output(), so.plants.thor()
+    >>> x, u = resting(swing, thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad")))
+    >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
+    >>> print(f"{force:.4f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.4f} N")
+    -88.7046 N, -88.7046 N
+
+    """
+    at = {name: np.array([params[name].value]) for name in plant.states if name in params}
+    x, u = _rest(plant, np.array(plant.parameter_values(params))[:, None], at)
+    return x[:, 0], u[:, 0]
+
+
 def _rest(
     plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]]
 ) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
