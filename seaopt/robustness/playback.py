@@ -11,6 +11,7 @@ from jaxtyping import Float
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
 from seaopt.control.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop
+from seaopt.control.digital import conditions_of
 from seaopt.control.equilibrium import Equilibrium, equilibrium
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
@@ -157,8 +158,10 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
+    if not params:
+        raise ControlError("play got no parameters; give one ParameterSet a run")
     delays = [[item[DELAY]] if DELAY in item else [] for item in params]
-    longest = max((delay.value for found in delays for delay in found), default=0.0)
+    longest = max(conditions_of(stage.plant, item).get(DELAY, 0.0) for item in params)
     values = [stage.plant.complete(item).with_parameters(*d) for item, d in zip(params, delays, strict=True)]
     rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), params)
     now, grip = _start(stage, scenario, values, longest) if rest is None else rest.state, None

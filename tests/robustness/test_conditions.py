@@ -12,8 +12,10 @@ from scipy.integrate import solve_ivp
 import seaopt as so
 from seaopt.control import Gains
 from seaopt.control.equilibrium import equilibrium
+from seaopt.control.port import port_of
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
+from seaopt.robustness import batch_figures
 from seaopt.robustness.playback import Stage, play
 from seaopt.robustness.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification import verify
@@ -106,6 +108,24 @@ def test_a_draw_is_played_where_it_rests_and_as_late_as_it_is(request, swing, th
     np.testing.assert_allclose(trace.outputs["F1"][1], forces, atol=1e-4)
     np.testing.assert_allclose(trace.outputs["phi"][1], states[:, 2], atol=1e-6)
     assert np.ptp(states[:, 2]) > 0.005
+
+
+def test_conditions_have_units(controller, stand, swing, thor):
+    """0.4 ms and 40 degrees, in the linear loop, at the port, in the batch and in the simulation."""
+    small = at(thor, phi=math.radians(40), delay_s=0.4e-3)
+    given = thor.with_parameters(
+        so.Parameter(name="delay_s", value=0.4, unit="ms"), so.Parameter(name="phi", value=40.0, unit="deg")
+    )
+    figures = [controller.close(swing, params).figures() for params in (given, small)]
+    assert figures[0].ms == pytest.approx(figures[1].ms, rel=1e-9)
+    assert batch_figures(controller, swing, given, {"I_p": np.array([0.36])}).ms[0] == pytest.approx(figures[1].ms)
+    assert [port_of(stand, params, "F1", 1.0).delay_s for params in (given, small)] == pytest.approx([4e-4, 4e-4])
+    traces = [play(Stage(controller=controller, plant=swing), STEP, [params]) for params in (given, small)]
+    np.testing.assert_allclose(traces[0].outputs["F1"], traces[1].outputs["F1"], rtol=1e-9)
+    for value, unit, words in ((-1e-4, "s", "negative"), (1.0, "m", "dimension")):
+        wrong = thor.with_parameters(so.Parameter(name="delay_s", value=value, unit=unit))
+        with pytest.raises(ControlError, match=words):
+            controller.close(swing, wrong)
 
 
 def test_nothing_moves_until_something_happens(controller, proportional, swing, thor):
