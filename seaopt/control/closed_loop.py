@@ -184,8 +184,8 @@ def run_loop(
                 f"plant {loop.plant.name}: {2 * substeps} steps a sample leave an error of {error:.1e} of a state "
                 f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
                 if told
-                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not tell whether the loop runs away or "
-                "its steps are too long; check the parameters"
+                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not tell whether the loop runs away "
+                "or they are too long; check the parameters"
             )
         substeps, before = 2 * substeps, found
 

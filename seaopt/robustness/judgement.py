@@ -210,11 +210,11 @@ def _ending(scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray,
         found.faults.append(f"the force ends {error:.4g} N off, {scenario.final_error:.4g} N are allowed")
 
 
-def _error(
-    scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _error(scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return reference minus force, each counted from rest: a law without integrator rests at another reference."""
-    at_rest = 0.0 if trace.rest is None or not scenario.about_rest else trace.rest.reference[run] - trace.rest.force[run]
+    at_rest = (
+        0.0 if trace.rest is None or not scenario.about_rest else trace.rest.reference[run] - trace.rest.force[run]
+    )
     return trace.reference[run] - force - at_rest
 
 

@@ -233,9 +233,7 @@ def _let_go(
     return LoopState(x=np.stack(rows), z=now.z)
 
 
-def _joined(
-    stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]
-) -> Trace:
+def _joined(stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]) -> Trace:
     names = stage.loop(held=False).watched
     count = runs[0].current.shape[0]
 

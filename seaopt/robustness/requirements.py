@@ -44,9 +44,7 @@ def _passive(controller: Controller, values: ParameterSet) -> list[Requirement]:
     if band is None or controller.design is None:
         return []
     port = port_of(controller.design[0], values, spec.measured, controller.current_per_force_A_per_N)
-    cosine, at_hz = least_cosine(
-        port, controller.measurement, controller.sample_time_s, controller.delay_samples, band
-    )
+    cosine, at_hz = least_cosine(port, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
     met = cosine >= PASSIVE
     mend = "" if met else "; tune with this band, or narrow it"
     where = f"design, Re Z/|Z| at {at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz{mend}"

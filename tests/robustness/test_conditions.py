@@ -1,4 +1,4 @@
-"""Runs of a draw with conditions: at rest at an angle, late, against scipy's DOP853 and the law's difference equation."""
+"""Runs of a draw with conditions: at rest at an angle, late, against DOP853 and the law's difference equation."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_small_steps_there_are_the_linear_loops(controller, swing, thor):
 
 
 def test_the_fall_is_dop853s_and_its_energy_is_the_work_done(controller, swing, thor):
-    """It starts where the scenario says, whatever the draw; E = T + V by hand, W = int of (F_m - b q' - f_c tanh) q'."""
+    """It starts where the scenario says, whatever the draw; E by hand, W the integral of (F_m - b q' - f_c tanh) q'."""
     drawn = thor.update(f_c=20.0, d=0.05)
     (fall,) = [item for item in default_scenarios(controller, swing) if item.name == "fall through 90 deg"]
     short = replace(fall, phases=(Phase(duration_s=1.5),))
