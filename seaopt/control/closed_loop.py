@@ -43,6 +43,7 @@ __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", 
 
 MAX_SUBSTEPS = 512
 RTOL = 1e-6
+RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
 Rows = Float[np.ndarray, "runs n"]
 
 
@@ -191,8 +192,12 @@ def run_loop(
 
 
 def _errors(found: Trace) -> Float[np.ndarray, " runs"]:
-    """Return the largest error of a sample, over the state's largest value."""
-    scale = np.where(found.size > 0.0, found.size, 1.0)
+    """Return the largest error of a sample, over the state's largest value.
+
+    A state that rests has rounding for a value: it is measured by the largest of the others.
+    """
+    size = np.maximum(found.size, RESTS * np.max(found.size, axis=1, keepdims=True))
+    scale = np.where(size > 0.0, size, 1.0)
     with np.errstate(invalid="ignore"):
         return np.nan_to_num(np.max(found.error / scale, axis=1) / 15.0, nan=np.inf)
 

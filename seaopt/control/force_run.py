@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.closed_loop import MAX_SUBSTEPS, RTOL
+from seaopt.control.closed_loop import MAX_SUBSTEPS, RESTS, RTOL
 from seaopt.control.digital import DELAY, conditions_of
 from seaopt.control.loop_kernel import EXPANDED, runge_kutta
 from seaopt.control.sampled_loop import whole_samples
@@ -198,8 +198,9 @@ class _Held:
         while True:
             coarse, fine = (np.array(end).ravel() for end in _ends(self.plant, self.substeps)(t, x, u, p, lasting))
             size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
+            scale = np.maximum(size, RESTS * np.max(size))
             with np.errstate(invalid="ignore"):
-                error = float(np.max(np.abs(fine - coarse) / np.where(size > 0.0, size, 1.0))) / 15.0
+                error = float(np.max(np.abs(fine - coarse) / np.where(scale > 0.0, scale, 1.0))) / 15.0
             if error <= self.rtol:
                 self.error, self.size = max(self.error, error), size
                 return fine

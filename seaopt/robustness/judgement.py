@@ -7,8 +7,8 @@ What every run is judged by:
   fifth of settling) is no more than that of the first, with 5 % and a thousandth of the whole run's to spare. With the
   force held, the loop works on the link like a constant force, which is conservative: over a swing the energy of link
   and actuator comes back to where it was, unless the loop feeds it. Where a plant declares no energy, the square of the
-  force's error stands for it. This sees growth within seconds; a mode that takes minutes is seen by the eigenvalues;
-  A run that started at rest elsewhere is judged by the energy above or below the one it had there;
+  force's error stands for it. What counts is the energy above or below that of the rest where the run started. This
+  sees growth within seconds; a mode that takes minutes is seen by the eigenvalues;
 - no oscillation sustains itself in the last phase (`oscillation`), above what noise and quantisation make, faster than
   a tenth of the bandwidth: an undamped link that swings is the link's own business;
 - the limits of the scenario.

@@ -130,6 +130,10 @@ def test_conditions_have_units(controller, stand, swing, thor):
 
 def test_nothing_moves_until_something_happens(controller, proportional, swing, thor):
     still = Scenario(name="still", phases=(Phase(duration_s=2.0),))
+    for phi in np.linspace(-1.2, 1.2, 13):  # speeds are rounding then, which no number of steps makes smaller
+        trace = play(Stage(controller=controller, plant=swing), still, [at(thor, phi=phi, delay_s=0.2e-3)])
+        assert np.ptp(trace.outputs["phi"][0]) < 1e-9
+        assert trace.substeps == 2
     for law in (controller, proportional):
         trace = play(Stage(controller=law, plant=swing), still, [at(thor, phi=0.9, delay_s=0.2e-3), thor])
         assert np.ptp(trace.outputs["phi"][0]) < 1e-9
@@ -252,3 +256,36 @@ def test_a_law_whose_reference_does_nothing_is_refused(controller, swing, thor):
     assert runnable(deaf).integrators
     with pytest.raises(ControlError, match="blocked at 0 Hz"):
         equilibrium(loop, [at(thor, phi=0.3)])
+
+
+def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(controller, swing, thor):
+    """1 + N(A) L = 0 with L of the drawn angle and delay, N(A) = 2/pi (asin s + s sqrt(1 - s^2)), s = limit/A."""
+    drawn = at(thor, phi=0.7, delay_s=0.4e-3)
+    law = Gains(k_p=27.0, k_i=0.0, k_d=0.27, T_f=1e-3, k_ff=1.0)
+    reference, measurement = law.transfer_functions("pd", TS)
+    wild = replace(controller, reference=reference, measurement=measurement)
+    loop = wild.close(swing, drawn)
+    assert not loop.figures().stable
+    f = np.linspace(20, 200, 200_001)
+    gain = loop.open_loop(f)
+    k = np.flatnonzero((gain.imag[:-1] * gain.imag[1:] < 0) & (gain.real[:-1] < -1))[0]
+    needed, s = -1 / gain.real[k], np.linspace(1e-4, 1, 100_001)
+    motor = (
+        9.0 / wild.current_per_force_A_per_N / np.interp(needed, 2 / np.pi * (np.arcsin(s) + s * np.sqrt(1 - s**2)), s)
+    )
+    force = np.abs(loop.plant.response(f[k : k + 1]))[0] * needed * motor
+    kick = Scenario(name="kick", phases=(Phase(duration_s=0.1, force_N=200.0), Phase(duration_s=3.0)))
+    found = verify(wild, {"swing": swing}, thor, scenarios=[kick], draws={"swing": [drawn]})
+    row = found.rows[1]
+    assert "sustains itself" in row.reason
+    assert row.limit_cycle_hz == pytest.approx(f[k], rel=0.015)
+    assert row.limit_cycle_N == pytest.approx(force, rel=0.05)
+
+
+def test_conditions_of_the_nominal_values_are_in_the_worst_case(controller, swing, thor):
+    there = at(thor, phi=0.9)
+    certificate = so.certify(controller, {"swing": swing}, there, ranges={"I_p": (0.3, 0.4)}, samples=20)
+    worst = certificate.worst["swing"]
+    assert worst.ms >= certificate.plants["swing"].ms
+    again = controller.close(swing, at(thor.update(**worst.parameters), phi=0.9)).figures()
+    assert worst.ms == pytest.approx(again.ms, rel=1e-9)
