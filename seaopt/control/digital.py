@@ -200,8 +200,8 @@ def resting(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " nx"
     >>> swing, thor = so.plants.moving_output(), so.plants.thor()
     >>> x, u = resting(swing, thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad")))
     >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
-    >>> print(f"{force:.4f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.4f} N")
-    -88.7046 N, -88.7046 N
+    >>> print(f"{force:.2f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.2f} N")
+    -88.70 N, -88.70 N
 
     """
     at = {name: np.array([value]) for name, value in conditions_of(plant, params).items() if name != DELAY}
