@@ -10,7 +10,9 @@ law `RunnableLaw` makes of it and of the reference a motor force, limited, with 
 is integrated by Runge-Kutta's method of order four in fixed steps. Every sample is integrated twice, with n and with 2n
 steps; the finer result goes on, a fifteenth of the difference estimates its error (order four), and n is doubled until
 that is below `rtol` of each state's largest value in every sample. It is the error of one sample from the same start:
-a quantiser would turn any difference into a whole step, so that two whole runs cannot be compared.
+a quantiser would turn any difference into a whole step, so that two whole runs cannot be compared. A run that
+leaves what floats can hold has no error to look at: it is taken for the loop's doing, and not for that of steps too
+long for the plant, where half as long ones lose it in the same sample or the next, after states as large.
 
 Peaks are of every fine step, not of the samples alone: a mode at 160 Hz has six samples a period at 1 kHz, whose
 largest can be 13 % below the top.
@@ -28,8 +30,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
+from seaopt.control.digital import conditions_of
 from seaopt.control.loop_kernel import Job, Trace, kernel
 from seaopt.control.sampled_loop import DELAY, ENERGY, LoopState, SampledLoop, at_rest, whole_samples
 from seaopt.errors import SimulationError, suggestion
@@ -40,6 +43,7 @@ __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", 
 
 MAX_SUBSTEPS = 512
 RTOL = 1e-6
+RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
 Rows = Float[np.ndarray, "runs n"]
 
 
@@ -68,7 +72,7 @@ class LoopRun:
     substeps : int
         Integration steps a sample.
     wall_s : float
-        Time the simulation took, compilation not included.
+        Time the simulation took, with steps that were too long, but not compilation.
 
     """
 
@@ -165,25 +169,53 @@ def run_loop(
     )
     if job.start.x.shape != (runs, len(loop.plant.states)):
         raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state a run")
-    substeps = _first_guess(loop, params, rtol)
+    substeps, before, wall_s = _first_guess(loop, params, rtol), None, 0.0
     execute = kernel(loop)
     while True:
         begin = time.perf_counter()
         found = execute(job, substeps)
-        wall_s = time.perf_counter() - begin
-        scale = np.where(found.size > 0.0, found.size, 1.0)
-        with np.errstate(invalid="ignore"):
-            errors = np.max(found.error / scale, axis=1) / 15.0
-        errors = errors[np.isfinite(errors)]
-        error = float(np.max(errors)) if errors.size else 0.0
-        if error <= rtol:
+        wall_s += time.perf_counter() - begin
+        kept = _lost(found) == n
+        error = float(np.max(_errors(found)[kept], initial=0.0))
+        told = bool(np.all(kept)) or (before is not None and bool(np.all(kept | _alike(before, found))))
+        if error <= rtol and told:
             return _result(loop, job, found, error, substeps, wall_s)
         if 2 * substeps > MAX_SUBSTEPS:
             raise SimulationError(
                 f"plant {loop.plant.name}: {2 * substeps} steps a sample leave an error of {error:.1e} of a state "
                 f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
+                if told
+                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not tell whether the loop runs away "
+                "or they are too long; check the parameters"
             )
-        substeps *= 2
+        substeps, before = 2 * substeps, found
+
+
+def _errors(found: Trace) -> Float[np.ndarray, " runs"]:
+    """Return the largest error of a sample, over the state's largest value.
+
+    A state that rests has rounding for a value: it is measured by the largest of the others.
+    """
+    size = np.maximum(found.size, RESTS * np.max(found.size, axis=1, keepdims=True))
+    scale = np.where(size > 0.0, size, 1.0)
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.max(found.error / scale, axis=1) / 15.0, nan=np.inf)
+
+
+def _lost(found: Trace) -> Int[np.ndarray, " runs"]:
+    """Return each run's first sample that is not finite; the number of samples where all are."""
+    finite = np.all(np.isfinite(found.states), axis=2) & np.all(np.isfinite(found.y), axis=2)
+    finite[:, -1] &= np.all(np.isfinite(found.x), axis=1)
+    return np.where(np.all(finite, axis=1), finite.shape[1], np.argmin(finite, axis=1))
+
+
+def _alike(before: Trace, found: Trace) -> Bool[np.ndarray, " runs"]:
+    """Tell which runs two numbers of steps lose in the same way: about the same sample, states as large before it."""
+    lost = np.stack([_lost(before), _lost(found)])
+    last, rows = np.maximum(np.min(lost, axis=0) - 1, 0), np.arange(lost.shape[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.log([np.max(np.abs(item.states[rows, last]), axis=1) for item in (before, found)])
+        return (np.abs(lost[1] - lost[0]) <= 1) & (np.abs(size[1] - size[0]) <= 1.0)
 
 
 def _result(loop: SampledLoop, job: Job, found: Trace, error: float, substeps: int, wall_s: float) -> LoopRun:
@@ -225,7 +257,7 @@ def _lags(loop: SampledLoop, params: Sequence[ParameterSet]) -> dict[str, Any]:
     queue = loop.waiting
     lag, late = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
     for run, item in enumerate(params):
-        delay = item[DELAY].value if DELAY in item else 0.0
+        delay = conditions_of(loop.plant, item).get(DELAY, 0.0)
         if not 0.0 <= delay <= loop.longest_delay_s:
             raise SimulationError(
                 f"{DELAY} = {delay:g} is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "

@@ -22,9 +22,10 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
-from seaopt.errors import ControlError, suggestion
+from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, jacobians
+from seaopt.units import factor
 
 StateSpace = tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]
 Linear = tuple[
@@ -119,7 +120,7 @@ def sample(
 
     """
     values = np.array(plant.parameter_values(params))[:, None]
-    given = {name: np.array([params[name].value]) for name in conditions((plant,)) if name in params}
+    given = {name: np.array([value]) for name, value in conditions_of(plant, params).items()}
     a, b, c, d = linearised(plant, values, given, measured, gain)
     held = hold(a, b, c, d, sample_time_s, given.get(DELAY, np.zeros(1)))
     return DigitalPlant(
@@ -133,6 +134,35 @@ def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
     found = {DELAY: Parameter(name=DELAY, value=0.0, unit="s", min=0.0, description="delay besides the controller's")}
     for plant in plants:
         found |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
+    return found
+
+
+def conditions_of(plant: Plant, params: ParameterSet) -> dict[str, float]:
+    """Return the conditions that parameters hold, in SI units, by name.
+
+    Raises
+    ------
+    ControlError
+        One is not finite, a delay is negative, or a unit is of another dimension.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> late = so.plants.thor().with_parameters(so.Parameter(name="delay_s", value=0.2, unit="ms"))
+    >>> conditions_of(so.plants.high_impedance(), late)
+    {'delay_s': 0.0002}
+
+    """
+    found: dict[str, float] = {}
+    for name, item in conditions((plant,)).items():
+        if name not in params:
+            continue
+        try:
+            found[name] = params[name].value * factor(params[name].unit, item.unit)
+        except UnitError as error:
+            raise ControlError(f"{name} = {params[name].value:g} {params[name].unit}: {error}") from error
+        if not (np.isfinite(found[name]) and found[name] >= item.min):
+            raise ControlError(f"{name} = {found[name]:g} {item.unit} is not finite or negative; give another")
     return found
 
 
@@ -154,6 +184,29 @@ def linearised(
     row = list(plant.outputs).index(measured)
     a, b, c, d = _jacobians(plant, *_rest(plant, p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
+
+
+def resting(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
+    """Return states and inputs at rest where the conditions among `params` are; zeros without any.
+
+    Raises
+    ------
+    ControlError
+        The plant cannot rest there.
+
+    Examples
+    --------
+    >>> import math, seaopt as so
+    >>> swing, thor = so.plants.moving_output(), so.plants.thor()
+    >>> x, u = resting(swing, thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad")))
+    >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
+    >>> print(f"{force:.2f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.2f} N")
+    -88.70 N, -88.70 N
+
+    """
+    at = {name: np.array([value]) for name, value in conditions_of(plant, params).items() if name != DELAY}
+    x, u = _rest(plant, np.array(plant.parameter_values(params))[:, None], at)
+    return x[:, 0], u[:, 0]
 
 
 def _rest(

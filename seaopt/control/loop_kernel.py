@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.sampled_loop import LoopState, SampledLoop
+from seaopt.plants import Plant
 from seaopt.simulation.compiled import threads, workers
 from seaopt.simulation.compiler import load_library
 
@@ -114,19 +115,25 @@ def _observe(loop: SampledLoop) -> Any:
     return ca.Function("observe", [plant.t, plant.x, plant.u, plant.p], [ca.densify(ca.vertcat(*rows))])
 
 
-def _advance_function(loop: SampledLoop) -> Any:
-    """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one Runge-Kutta step, and the largest |y|."""
-    plant = loop.plant
+def runge_kutta(plant: Plant) -> Any:
+    """Return the CasADi function (t, x, u, p, h) -> x+: a step of Runge's and Kutta's fourth order, u held."""
     rate = ca.Function("rate", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
     t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
-    peak = ca.SX.sym("peak", len(loop.watched))
     k1 = rate(t, x, u, p)
     k2 = rate(t + h / 2, x + h / 2 * k1, u, p)
     k3 = rate(t + h / 2, x + h / 2 * k2, u, p)
     k4 = rate(t + h, x + h * k3, u, p)
-    after = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return ca.Function("step", [t, x, u, p, h], [ca.densify(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))])
+
+
+def _advance_function(loop: SampledLoop) -> Any:
+    """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one Runge-Kutta step, and the largest |y|."""
+    plant = loop.plant
+    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    peak = ca.SX.sym("peak", len(loop.watched))
+    after = runge_kutta(plant)(t, x, u, p, h)
     top = ca.fmax(peak, ca.fabs(_observe(loop)(t + h, after, u, p)))
-    return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([ca.densify(after), ca.densify(top)]))
+    return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
 
 
 def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.digital import DELAY
+from seaopt.control.digital import DELAY, conditions_of
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -117,7 +117,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, current_per_force
         feedback=np.concatenate([c[row], [current_per_force_A_per_N * d[row, motor], d[row, external]]]),
         speed=list(port.states).index("v_2"),
         mass=port.complete(params)["m_2"].value,
-        delay_s=params[DELAY].value if DELAY in params else 0.0,
+        delay_s=conditions_of(plant, params).get(DELAY, 0.0),
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control import Controller
-from seaopt.control.digital import DELAY, Linear, conditions, hold, linearised
+from seaopt.control.digital import DELAY, Linear, conditions, conditions_of, hold, linearised
 from seaopt.control.loop import STABLE
 from seaopt.control.response import LARGEST, law_state_space
 from seaopt.parameters import ParameterSet
@@ -106,10 +106,11 @@ def columns(
     for row, name in enumerate(plant.parameters):
         if name in draws:
             values[row] = draws[name]
+    known = conditions_of(plant, nominal)
     extra = {
-        name: draws[name] if name in draws else np.full(count, nominal[name].value)
+        name: draws[name] if name in draws else np.full(count, known[name])
         for name in conditions((plant,))
-        if name in draws or name in nominal
+        if name in draws or name in known
     }
     return values, extra
 

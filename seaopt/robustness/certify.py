@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control import Controller, LoopFigures
+from seaopt.control import Controller
 from seaopt.control.loop import STABLE
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.batch import batch_figures
-from seaopt.robustness.certificate import Certificate, MonteCarlo
+from seaopt.robustness.certificate import Certificate, MonteCarlo, Requirement
 from seaopt.robustness.draws import Uncertainty, uncertainty
 from seaopt.robustness.nominal import plant_margins
 from seaopt.robustness.requirements import design_requirements, draw_requirements, plant_requirements
@@ -118,7 +118,7 @@ def certify(
         failure_probability_bound=failure_bound(samples, failures, confidence),
     )  # fmt: skip
     requirements = (
-        *design_requirements(controller, _design_figures(controller, nominal)),
+        *_design_requirements(controller, nominal),
         *(item for name in plants for item in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst),
     )
@@ -186,9 +186,9 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     return float(betaincinv(failures + 1, samples - failures, confidence))
 
 
-def _design_figures(controller: Controller, nominal: ParameterSet) -> LoopFigures:
-    """Return the figures of the design plant at the nominal parameters, computed from the law again."""
+def _design_requirements(controller: Controller, nominal: ParameterSet) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal parameters, computed from the law again."""
     assert controller.design is not None
     plant, values = controller.design
     named = values.with_parameters(*(nominal[name] for name in nominal if name in plant.parameters))
-    return controller.close(plant, named).figures()
+    return design_requirements(controller, controller.close(plant, named).figures(), named)

@@ -7,7 +7,8 @@ What every run is judged by:
   fifth of settling) is no more than that of the first, with 5 % and a thousandth of the whole run's to spare. With the
   force held, the loop works on the link like a constant force, which is conservative: over a swing the energy of link
   and actuator comes back to where it was, unless the loop feeds it. Where a plant declares no energy, the square of the
-  force's error stands for it. This sees growth within seconds; a mode that takes minutes is seen by the eigenvalues;
+  force's error stands for it. What counts is the energy above or below that of the rest where the run started. This
+  sees growth within seconds; a mode that takes minutes is seen by the eigenvalues;
 - no oscillation sustains itself in the last phase (`oscillation`), above what noise and quantisation make, faster than
   a tenth of the bandwidth: an undamped link that swings is the link's own business;
 - the limits of the scenario.
@@ -99,8 +100,9 @@ def judged(
     measured = stage.controller.spec.measured
     force, current = trace.outputs[measured][run], trace.current[run]
     _extremes(stage, scenario, trace, run, found)
+    _resting(stage, trace, run, sets[run], found)
     if np.all(np.isfinite(force)) and np.all(np.isfinite(current)):
-        _growth(stage, trace, run, found)
+        _growth(stage, scenario, trace, run, found)
         _ringing(stage, scenario, trace, run, found)
         _ending(scenario, trace, run, force, found)
     else:
@@ -142,12 +144,24 @@ def _extremes(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _
             found.faults.append(f"{name} never passes {value:g}, so that the scenario shows nothing")
 
 
-def _growth(stage: Stage, trace: Trace, run: int, found: _Findings) -> None:
+def _resting(stage: Stage, trace: Trace, run: int, drawn: ParameterSet, found: _Findings) -> None:
+    """Find whether the motor can hold the plant where the draw wants it to rest."""
+    limit = stage.controller.spec.current_limit_A
+    if trace.rest is None or limit is None or abs(trace.rest.current_A[run]) <= limit * (1 + 1e-9):
+        return
+    where = ", ".join(f"{name} = {drawn[name].value:.4g}" for name in stage.plant.states if name in drawn)
+    found.faults.append(
+        f"to rest at {where} takes {trace.rest.current_A[run]:.4g} A, above the limit of {limit:g} A; narrow its range"
+    )
+
+
+def _growth(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Findings) -> None:
     if ENERGY in trace.outputs:
-        level, what = trace.outputs[ENERGY][run], "the energy"
+        base = 0.0 if trace.rest is None or not scenario.about_rest else trace.rest.energy_J[run]
+        level, what = trace.outputs[ENERGY][run] - base, "the energy"
     else:
         name = stage.controller.spec.measured
-        level, what = (trace.outputs[name][run] - trace.reference[run]) ** 2, f"the square of the error of {name}"
+        level, what = _error(scenario, trace, run, trace.outputs[name][run]) ** 2, f"the square of the error of {name}"
     level = np.abs(level[np.isfinite(level)])
     last = level[-(trace.edges[-1] - trace.edges[-2]) :]
     last = last[int(SETTLE * last.size) :]
@@ -190,10 +204,18 @@ def _floor(stage: Stage, trace: Trace, run: int) -> float:
 def _ending(scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray, " n"], found: _Findings) -> None:
     last = trace.last
     end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
-    error = float(np.mean(trace.reference[run][end] - force[end]))
+    error = float(np.mean(_error(scenario, trace, run, force)[end]))
     found.figures["final_error_N"] = error
     if scenario.final_error is not None and not abs(error) <= scenario.final_error:
         found.faults.append(f"the force ends {error:.4g} N off, {scenario.final_error:.4g} N are allowed")
+
+
+def _error(scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return reference minus force, each counted from rest: a law without integrator rests at another reference."""
+    at_rest = (
+        0.0 if trace.rest is None or not scenario.about_rest else trace.rest.reference[run] - trace.rest.force[run]
+    )
+    return trace.reference[run] - force - at_rest
 
 
 def _difference(nominal: ParameterSet, drawn: ParameterSet) -> dict[str, float]:

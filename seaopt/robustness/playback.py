@@ -11,6 +11,8 @@ from jaxtyping import Float
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
 from seaopt.control.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop
+from seaopt.control.digital import conditions_of
+from seaopt.control.equilibrium import Equilibrium, equilibrium
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
@@ -86,6 +88,8 @@ class Trace:
         Of `plant`, and "energy" where it declares it; NaN while the link is held and there is no such output.
     peaks : mapping of name to array, shape (runs,)
         Largest magnitudes, between samples too.
+    rest : Equilibrium or None
+        Where runs started; None where the scenario says where.
     edges : tuple of int
         First samples of the phases, and one past the last.
     contacts : tuple of Contact
@@ -103,6 +107,7 @@ class Trace:
     current: Rows
     outputs: Mapping[str, Rows]
     peaks: Mapping[str, Float[np.ndarray, " runs"]]
+    rest: Equilibrium | None
     edges: tuple[int, ...]
     contacts: tuple[Contact, ...]
     error: float
@@ -127,6 +132,10 @@ class Trace:
 def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Trace:
     """Play a scenario, once for each set of parameters.
 
+    A run starts at rest: at zero, or where a condition among its parameters (an angle such as phi) puts the plant, with
+    the law and the commands that wait at rest too, and the scenario's forces counted from the one that keeps it there.
+    A scenario with an `initial_state` starts in that, whatever the conditions.
+
     Parameters
     ----------
     stage : Stage
@@ -134,14 +143,14 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     scenario : Scenario
         What happens.
     params : sequence of ParameterSet
-        One a run; `delay_s` among them is delay besides the controller's.
+        One a run; conditions may be among them: where it rests, and `delay_s`, delay besides the controller's.
     seed : int
         Of the sensor noise and of random excitations.
 
     Raises
     ------
     ControlError
-        The scenario cannot be played on this plant.
+        The scenario cannot be played on this plant, or the plant cannot rest where it is to start.
     SimulationError
         The plant cannot be simulated well enough.
 
@@ -149,10 +158,14 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
+    if not params:
+        raise ControlError("play got no parameters; give one ParameterSet a run")
     delays = [[item[DELAY]] if DELAY in item else [] for item in params]
-    longest = max((delay.value for found in delays for delay in found), default=0.0)
+    longest = max(conditions_of(stage.plant, item).get(DELAY, 0.0) for item in params)
     values = [stage.plant.complete(item).with_parameters(*d) for item, d in zip(params, delays, strict=True)]
-    now, grip = _start(stage, scenario, values, longest), None
+    rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), params)
+    now, grip = _start(stage, scenario, values, longest) if rest is None else rest.state, None
+    offset = rest.reference[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
     runs: list[LoopRun] = []
     contacts: list[Contact] = []
     begin_s = 0.0
@@ -167,18 +180,18 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             blows = [struck(stage.plant, p, x, LINK, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
         loop = stage.loop(phase.held, longest)
-        reference = _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
+        reference = offset + _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
         run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
-        now, begin_s = run.end, begin_s + reference.size * loop.law.sample_time_s
+        now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s
         runs.append(run)
-    return _joined(stage, runs, tuple(contacts))
+    return _joined(stage, runs, rest, tuple(contacts))
 
 
 def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
-    """Return the first states of the plant with its link free: the given ones, the spring relaxed."""
+    """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
     plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
     start = at_rest(loop, len(values), point("state", plant.states, scenario.initial_state))
-    if scenario.initial_state and "q" in plant.states and LINK in plant.outputs:
+    if "q" in plant.states and LINK in plant.outputs:
         place = list(plant.states).index("q")
         for row, p in zip(start.x, values, strict=True):
             row[place] -= position(plant, p, row, LINK)
@@ -220,7 +233,7 @@ def _let_go(
     return LoopState(x=np.stack(rows), z=now.z)
 
 
-def _joined(stage: Stage, runs: Sequence[LoopRun], contacts: tuple[Contact, ...]) -> Trace:
+def _joined(stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]) -> Trace:
     names = stage.loop(held=False).watched
     count = runs[0].current.shape[0]
 
@@ -236,6 +249,7 @@ def _joined(stage: Stage, runs: Sequence[LoopRun], contacts: tuple[Contact, ...]
             name: np.max([run.peaks[name] for run in runs if name in run.peaks], axis=0)
             for name in names
         },
+        rest=rest,
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
         error=max(run.error for run in runs),

@@ -7,7 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.tuner import BANDWIDTH_TOLERANCE
+from seaopt.control.passivity import least_cosine
+from seaopt.control.port import port_of
+from seaopt.control.verdict import BANDWIDTH_TOLERANCE, PASSIVE
+from seaopt.parameters import ParameterSet
 from seaopt.robustness.certificate import MonteCarlo, Requirement
 from seaopt.robustness.severity import UNSTABLE
 from seaopt.robustness.worst import ROUNDING, Worst
@@ -15,8 +18,8 @@ from seaopt.robustness.worst import ROUNDING, Worst
 REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
 
-def design_requirements(controller: Controller, achieved: LoopFigures) -> list[Requirement]:
-    """Return what is required of the design plant at the nominal parameters."""
+def design_requirements(controller: Controller, achieved: LoopFigures, values: ParameterSet) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal parameters `values`; `achieved` is its loop there."""
     spec = controller.spec
     reached = achieved.bandwidth_hz if achieved.bandwidth_hz is not None else np.inf
     rows = [
@@ -32,7 +35,20 @@ def design_requirements(controller: Controller, achieved: LoopFigures) -> list[R
     ]  # fmt: skip
     peaks = (("max_reference_peak", achieved.reference_peak), ("max_noise_gain", achieved.noise_gain))
     rows += [item for name, value in peaks for item in _upper(name, getattr(spec, name), value, "design")]
-    return rows
+    return rows + _passive(controller, values)
+
+
+def _passive(controller: Controller, values: ParameterSet) -> list[Requirement]:
+    """Return that Re Z >= 0 of the design plant's port in the passive band, as the least Re Z/abs(Z)."""
+    spec, band = controller.spec, controller.spec.passive_band_hz
+    if band is None or controller.design is None:
+        return []
+    port = port_of(controller.design[0], values, spec.measured, controller.current_per_force_A_per_N)
+    cosine, at_hz = least_cosine(port, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
+    met = cosine >= PASSIVE
+    mend = "" if met else "; tune with this band, or narrow it"
+    where = f"design, Re Z/|Z| at {at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz{mend}"
+    return [Requirement(name="passive_band_hz", limit=0.0, value=cosine, met=met, where=where)]
 
 
 def plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
@@ -42,6 +58,7 @@ def plant_requirements(controller: Controller, name: str, figures: LoopFigures) 
         Requirement(name="spectral_radius", limit=1.0, value=figures.spectral_radius, met=figures.stable, where=name),
         *_upper("max_sensitivity", spec.max_sensitivity, figures.ms, name),
         *_upper("max_complementary", spec.max_complementary, figures.mt, name),
+        *_lower("min_disk_margin", spec.min_disk_margin, figures.disk_margin, name),
     ]
 
 
@@ -49,6 +66,12 @@ def _upper(name: str, limit: float | None, value: float, where: str) -> list[Req
     if limit is None:
         return []
     return [Requirement(name=name, limit=limit, value=value, met=bool(value <= limit * (1 + ROUNDING)), where=where)]
+
+
+def _lower(name: str, limit: float | None, value: float, where: str) -> list[Requirement]:
+    if limit is None:
+        return []
+    return [Requirement(name=name, limit=limit, value=value, met=bool(value >= limit * (1 - ROUNDING)), where=where)]
 
 
 def draw_requirements(result: MonteCarlo, worst: Mapping[str, Worst]) -> list[Requirement]:

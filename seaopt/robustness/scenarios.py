@@ -74,7 +74,10 @@ class Scenario:
     name : str
     phases : tuple of Phase
     initial_state : mapping of state name to float
-        Zero where left out; q is then moved so that the spring is relaxed.
+        Where every run starts, zero where left out; q is then moved so that the spring is relaxed. Without it a run
+        starts at rest where its parameters say (phi), zero if they do not.
+    about_rest : bool
+        Forces are counted from the one that keeps a run where it starts; False: from zero.
     quiet : bool
         The last phase ends without an oscillation that sustains itself.
     final_error : float or None
@@ -91,6 +94,7 @@ class Scenario:
     name: str
     phases: tuple[Phase, ...]
     initial_state: Mapping[str, float] = field(default_factory=dict[str, float])
+    about_rest: bool = True
     quiet: bool = True
     final_error: float | None = None
     max_force_N: float | None = None
@@ -269,9 +273,12 @@ def _doublet(force: float, half: float, tail: float) -> Scenario:
 
 
 def _hold(rest: float, lasting: float, tail: float) -> Scenario:
-    """Ask for more than the limit holds, then for a quarter: an integrator that has wound up overshoots."""
+    """Ask for more than the limit holds, then for a quarter: an integrator that has wound up overshoots.
+
+    What the limit holds does not depend on where the plant rests.
+    """
     phases = (Phase(duration_s=2 * lasting, force_N=1.2 * rest), Phase(duration_s=tail, force_N=0.25 * rest))
-    return Scenario(name="saturating hold", phases=phases, final_error=0.005 * rest, on="held")
+    return Scenario(name="saturating hold", phases=phases, about_rest=False, final_error=0.005 * rest, on="held")
 
 
 def _chirp(controller: Controller, small: float, tail: float) -> Scenario:

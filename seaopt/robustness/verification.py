@@ -126,7 +126,8 @@ def verify(
     scenarios : sequence of Scenario, optional
         The same for every plant; `default_scenarios` of each if left out.
     draws : mapping of plant name to sequence of ParameterSet, optional
-        Played besides the nominal values, such as a certificate's worst draws.
+        Played besides the nominal values, such as a certificate's worst draws; a condition among them (phi, delay_s) is
+        where, and how late, those runs start (`seaopt.robustness.playback.play`).
     sensors : Sensors, optional
         Noise, offset, range and quantisation of the measured output; ideal if left out.
     current_step_A : float

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.digital import conditions
+from seaopt.control.digital import conditions, conditions_of
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.batch import BatchFigures, batch_figures
@@ -132,7 +132,8 @@ def witnessed(controller: Controller, plant: Plant, nominal: ParameterSet, at: M
     values = plant.complete(nominal)
     own = {name: value for name, value in at.items() if name in values}
     given = {name: value for name, value in at.items() if name in extra}
-    values = values.update(**own).with_parameters(*(replace(extra[name], value=given[name]) for name in given))
+    known = conditions_of(plant, nominal) | given
+    values = values.update(**own).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
     figures = controller.close(plant, values).figures()
     single = BatchFigures(
         spectral_radius=np.array([figures.spectral_radius]), ms=np.array([figures.ms]), mt=np.array([figures.mt])

@@ -226,6 +226,45 @@ def test_stiff_friction_takes_smaller_steps_or_is_refused(stand, thor):
         run_loop(loop, [thor.update(f_c=500.0, v_s=1e-9)], np.full(100, 80.0))
 
 
+@pytest.mark.parametrize("damping", [0.1, 0.5])
+def test_a_stiff_draw_beside_a_soft_one_does_not_run_away(stand, thor, damping):
+    """Steps that do for the first plant leave the numbers on the second: b/J = 3e4 and 1.5e5 per second."""
+    loop = SampledLoop(plant=stand, law=law(None), measured="F1", delay_samples=1)
+    stiff = thor.update(b_r=damping)
+    run = run_loop(loop, [thor, stiff], np.full(300, 80.0))
+    model = stand.linearize(stiff)
+    a, b, c, _, _ = cont2discrete((model.A, model.B, model.C[:1], np.zeros((1, 1))), TS, "zoh")
+    x, memory, waiting, forces = np.zeros(2), loop.law.reset(), 0.0, []
+    for _ in range(300):
+        forces.append((c @ x)[0])
+        current, memory = loop.law.step(memory, 80.0, forces[-1])
+        x, waiting = a @ x + b[:, 0] * waiting, current
+    np.testing.assert_allclose(run.outputs["F1"][1], forces, rtol=1e-4, atol=1e-4)
+
+
+def test_a_loop_that_runs_away_is_left_where_it_does(stand, thor):
+    """An unstable loop without limit: the largest eigenvalue says when the largest float is passed, or its 1e-7th."""
+    wild = realise(
+        *(TransferFunction(num=100.0 * tf.num, den=tf.den) for tf in LAW.values()), sample_time_s=TS,
+        current_per_force_A_per_N=GAIN,
+    )  # fmt: skip
+    loop = SampledLoop(plant=stand, law=wild, measured="F1", delay_samples=1)
+    run = run_loop(loop, [thor, thor.update(J=3.4e-6)], np.full(2000, 50.0))
+    model = stand.linearize(thor)
+    a, b, c, _, _ = cont2discrete((model.A, model.B * GAIN, model.C[:1], np.zeros((1, 1))), TS, "zoh")
+    n = wild.c.size
+    whole = np.block([
+        [a, b, np.zeros((2, n))], [-wild.d_measurement * c, np.zeros((1, 1)), wild.c[None]],
+        [-np.outer(wild.b_measurement, c), np.zeros((n, 1)), wild.a],
+    ])  # fmt: skip
+    rate = np.log(np.max(np.abs(np.linalg.eigvals(whole))))
+    force = run.outputs["F1"][0]
+    lost = np.flatnonzero(~np.isfinite(force))[0]
+    left = np.log(np.finfo(float).max) - np.log(np.abs(force[lost // 2]))
+    assert left - 16 < rate * (lost - lost // 2) < left + 1
+    assert run.substeps < 64
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
