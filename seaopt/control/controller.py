@@ -14,6 +14,7 @@ from seaopt.control.law import Observer, TransferFunction
 from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.spec import ControllerSpec
 from seaopt.control.stored import stored
+from seaopt.estimation import resting_on
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
@@ -97,6 +98,15 @@ class Controller:
         return f"{asked:g} Hz is blocked by {blocked}; {remedy}"
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know besides the limits, one sentence each."""
+        if self.design is None:
+            return ()
+        plant, values = self.design
+        # What the plants of robust_to need is in the same set.
+        return resting_on(values, None if self.robust_to else plant.parameters)
+
+    @property
     def engineering(self) -> dict[str, float]:
         """The gains in the units that a drive is set in: A per N of force error, its integral and its rate."""
         scale = self.current_per_force_A_per_N
@@ -150,6 +160,7 @@ class Controller:
             "observer": self._observer_dict(),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
+            "notes": list(self.notes),
         }
 
     def _observer_dict(self) -> dict[str, Any] | None:
@@ -202,6 +213,7 @@ class Controller:
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
                 else f"  {self.explanation}",
+                *(f"  note: {note}" for note in self.notes),
             ]
         ).rstrip()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -52,15 +53,20 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         seen = replace(seen, structural_rank=structural_rank(problem, z))
     std, variance = np.sqrt(np.diag(robust)), np.diag(inverse(found.hessian)[0])
     fitted = params.with_parameters(
-        *(replace(params[name], value=float(z[i]), std=float(std[i])) for i, name in enumerate(names))
+        *(
+            replace(params[name], value=float(z[i]), std=float(std[i]), identified=bool(np.isfinite(std[i])))
+            for i, name in enumerate(names)
+        )
     )
     covariance = Covariance(names=names, matrix=robust)
     status, message = _status(solution, seen, found.hessian, names, solved.step_error)
     if status == "converged":
-        status, message = _open(fitted, params, message)
+        fitted, message = _open(fitted, params, message)
+        status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
     outputs = _outputs(problem, z, left) if left is not None else {}
     if left is not None and not _explained(problem, outputs, left):
         status = "not_identifiable"
+        fitted = _marked(fitted, names)
         message = (
             f"the model explains nothing of any output; check the input's sign, the channels and units ({message})"
         )
@@ -167,16 +173,22 @@ def _log_likelihood(problem: Residuals, found: Evaluation) -> float:
     return total
 
 
-def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[str, str]:
-    """Call a fit not identifiable whose parameters are less certain than their size: the log hardly shows them."""
-    vague = [
-        f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
+def _marked(fitted: ParameterSet, names: Sequence[str]) -> ParameterSet:
+    """Return the parameters with `names` marked as not identified."""
+    return fitted.with_parameters(*(replace(fitted[name], identified=False) for name in names))
+
+
+def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[ParameterSet, str]:
+    """Call those parameters not identified that are less certain than their size: the log hardly shows them."""
+    vague = {
+        name: f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
         for name, item in fitted.items()
         if item.free and item.std is not None and item.std > VAGUE * max(abs(item.value), abs(given[name].value))
-    ]
+    }
     if not vague:
-        return "converged", message
-    return "not_identifiable", f"the logs hardly show {', '.join(vague)}: excite more, fix it, or give it a prior"
+        return fitted, message
+    message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
+    return _marked(fitted, [*vague]), message
 
 
 def _status(

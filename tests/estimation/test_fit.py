@@ -14,6 +14,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation import Linear
+from seaopt.files import to_json
 
 FREE = ("J", "b_r", "eta")
 
@@ -179,6 +180,10 @@ def test_what_cannot_be_told_is_named(stand, short_log, thor):
     (direction,) = fit.identifiability.unidentifiable
     assert direction["K_tau"] == pytest.approx(-direction["eta"])
     assert np.isinf(fit.parameters["eta"].std)
+    assert set(fit.parameters.unidentified_names) == {"K_tau", "eta"}
+    again = so.Fit.from_dict(json.loads(to_json(fit.to_dict())))
+    assert again.parameters.unidentified_names == fit.parameters.unidentified_names
+    assert fit.parameters.update(eta=0.95).unidentified_names == ("K_tau",)
     assert fit.parameters["J"].value == pytest.approx(3.31e-6, rel=1e-3)
 
 
