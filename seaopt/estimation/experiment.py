@@ -301,7 +301,7 @@ def check_shots(experiment: Experiment, longest: int, shots: int, given: str) ->
     possible = longest // least
     remedy = f"give {possible} or fewer" if possible > 1 else "leave it out, and use a longer log or OutputError()"
     raise EstimationError(
-        f"experiment {experiment.name}: {given} leaves {longest / shots:.3g} samples a shot, of {longest} in the longest "
-        f"stretch; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least {least} "
-        f"samples: {remedy}"
+        f"experiment {experiment.name}: {given} leaves {longest / shots:.3g} samples a shot, of {longest} in the "
+        f"longest stretch; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least "
+        f"{least} samples: {remedy}"
     )

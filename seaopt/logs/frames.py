@@ -60,9 +60,7 @@ def to_pandas(log: Log) -> pd.DataFrame:
     return pandas.DataFrame({name: values.copy() for name, values in headed(log).items()})
 
 
-def from_frame(
-    frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str
-) -> Log:
+def from_frame(frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str) -> Log:
     """Build a log from a frame: see `Log.from_frame`."""
     columns = [str(name) for name in getattr(frame, "columns", ())]
     if not columns:
@@ -80,9 +78,7 @@ def from_frame(
             raise LogError(f'{source}: no column "{column}" for {name}; {suggestion(column, columns)}')
     brackets = {name: header_unit(column) for name, column in wanted.items()}
     given = {name: unit for name, unit in brackets.items() if unit is not None} | dict(units)
-    notes = check_apart(
-        {name: ((source, column), si_unit(given.get(name, ""))) for name, column in channels.items()}
-    )
+    notes = check_apart({name: ((source, column), si_unit(given.get(name, ""))) for name, column in channels.items()})
     arrays = {name: _column(frame, column, source) for name, column in wanted.items()}
     return replace(Log.from_arrays(units=given, source=source, **arrays), notes=tuple(notes))
 

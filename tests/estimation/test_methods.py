@@ -306,7 +306,7 @@ def test_shots_too_short_for_the_states_are_refused():
     five = so.Plant(
         name="chain", states={f"x{i}": "N" for i in range(5)}, inputs={"u": "N"}, outputs={"y": "N"},
         parameters={"a": "1/s", "b": "1/s"},
-        f=lambda t, x, u, p: {f"x{i}": p.a * ([u.u, x.x0, x.x1, x.x2, x.x3][i] - getattr(x, f"x{i}")) for i in range(5)},
+        f=lambda t, x, u, p: {f"x{i}": p.a * (u.u - getattr(x, f"x{i}")) for i in range(5)},
         h=lambda t, x, u, p: {"y": p.b * x.x4},
     )  # fmt: skip
     with pytest.raises(EstimationError, match="starts from 5 unknown states and needs at least 6 samples: give 1333"):
