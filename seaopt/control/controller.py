@@ -22,6 +22,7 @@ SCHEMA = "seaopt/controller/1"
 UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
 CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
+UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
@@ -104,7 +105,17 @@ class Controller:
             return ()
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
-        return resting_on(values, None if self.robust_to else plant.parameters)
+        return (*resting_on(values, None if self.robust_to else plant.parameters), *self._noise_notes())
+
+    def _noise_notes(self) -> tuple[str, ...]:
+        """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
+        k_d, T_f = self.gains["k_d"], self.gains["T_f"]
+        if self.spec.max_noise_gain is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
+            return ()
+        return (
+            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 N of noise on "
+            f"{self.spec.measured} makes up to {self.achieved.noise_gain:.3g} N of motor force; give max_noise_gain",
+        )
 
     @property
     def engineering(self) -> dict[str, float]:
