@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import Covariance, coloured, robust_bread, with_infinities
+from seaopt.estimation.covariance import Covariance, coloured, robust_bread, robust_meat, with_infinities
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.findings import Derived, Nuisance, OutputFit
 from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
@@ -135,17 +135,20 @@ def _covariances(
     problem: Residuals, found: Evaluation, left: list[Leftover] | None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
-    p, prior = problem.unknowns.shared, problem.unknowns.precision
-    bread = found.hessian
-    if left is not None and not isinstance(problem.loss, Linear):
-        bread = robust_bread(problem, found.z) + np.diag(prior)
+    p, prior, z = problem.unknowns.shared, problem.unknowns.precision, found.z
+    squares = isinstance(problem.loss, Linear)
+    bread = found.hessian if squares else robust_bread(problem, z) + np.diag(prior)
     back, unseen = inverse(bread)
-    white = with_infinities(back[:p, :p], unseen[:p])
+    columns = back[:, :p]
+    known = (columns.T * prior) @ columns
+    white = back[:p, :p]
+    if not squares:
+        sums = left if left is not None else [leftover(problem, e, z) for e in range(len(problem.experiments))]
+        white = columns.T @ robust_meat(problem, z, sums) @ columns + known
+    white = with_infinities(white, unseen[:p])
     if left is None:
         return white, white
-    columns = back[:, :p]
-    meat = coloured(problem, found.z, columns, left) + (columns.T * prior) @ columns
-    return white, with_infinities(meat, unseen[:p])
+    return white, with_infinities(coloured(problem, z, columns, left) + known, unseen[:p])
 
 
 def _own_std(experiment: Experiment, places: Locals, variance: Float[np.ndarray, " n"]) -> dict[str, float]:
