@@ -86,9 +86,9 @@ def coloured(
     p = inverse.shape[1]
     total = np.zeros((p, p))
     for e, sums in enumerate(left):
-        r = correlations(sums)
+        r, last = correlations(sums)
         found = _summed(problem, e, z, inverse, r)
-        if np.max(sums.count) < FEW and not _last_told(*_normalised(sums)):
+        if np.max(sums.count) < FEW and not last:
             found = _at_least(found, _summed(problem, e, z, inverse, r[:1]))
         total += found
     return total
@@ -176,22 +176,17 @@ class _Form:
         return found
 
 
-def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
-    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window.
+def correlations(left: Leftover) -> tuple[Float[np.ndarray, "lags1 ny ny"], int]:
+    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window, and the last lag.
 
-    The window reaches three times as far as correlation can be told from chance (after Politis, J. Nonparametric
-    Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
+    The last lag is that at which correlation can be told from chance. The window reaches three times as far (after
+    Politis, J. Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
-    found, count = _normalised(left)
-    reach = min(max(LEAST, int(WIDER * _last_told(found, count))), found.shape[2] - 1)
-    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1)
-
-
-def _normalised(left: Leftover) -> tuple[Float[np.ndarray, "ny ny lags1"], float]:
-    """Return the correlations before the window, and how many samples they are of."""
     count = np.maximum(left.count, 1.0)
     found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
-    return found, float(np.max(count))
+    last = _last_told(found, float(np.max(count)))
+    reach = min(max(LEAST, int(WIDER * last)), found.shape[2] - 1)
+    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1), last
 
 
 def _last_told(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
