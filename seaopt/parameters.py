@@ -33,6 +33,8 @@ class Parameter:
         Posterior standard deviation, where a fit gave one.
     description : str
         A few words.
+    identified : bool
+        False where a fit gave the value and its data do not tell it: others would have done as well.
 
     """
 
@@ -45,6 +47,7 @@ class Parameter:
     prior_std: float | None = None
     std: float | None = None
     description: str = ""
+    identified: bool = True
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.value):
@@ -131,6 +134,11 @@ class ParameterSet(Mapping[str, Parameter]):
         """Names of the free parameters, in order."""
         return tuple(name for name, parameter in self._items.items() if parameter.free)
 
+    @property
+    def unidentified_names(self) -> tuple[str, ...]:
+        """Names of the parameters whose values come from a fit that cannot tell them, in order."""
+        return tuple(name for name, parameter in self._items.items() if not parameter.identified)
+
     def values_of(self, names: Iterable[str]) -> list[float]:
         """Return the values of `names`, in their order and in SI."""
         return [self[name].value for name in names]
@@ -154,7 +162,7 @@ class ParameterSet(Mapping[str, Parameter]):
         for name, given in values.items():
             old = self[name]
             value, unit = given if isinstance(given, tuple) else (given, old.unit)
-            changed.append(replace(old, value=float(value) * factor(unit, old.unit), std=None))
+            changed.append(replace(old, value=float(value) * factor(unit, old.unit), std=None, identified=True))
         return self.with_parameters(*changed)
 
     def free(self, *names: str) -> ParameterSet:
@@ -186,6 +194,7 @@ class ParameterSet(Mapping[str, Parameter]):
         for name, item in self._items.items():
             std = "" if item.std is None else f"± {item.std:.2g}"
             note = "at bound" if item.at_bound else ("free" if item.free else "")
+            note = note if item.identified else f"{note}, not identified".removeprefix(", ")
             rows.append((name, f"{item.value:.6g}", std, item.unit, note))
         return rows
 

@@ -150,3 +150,12 @@ def test_the_tuner_of_the_docs_works():
     exec(re.sub(r"(?m)^print\(.*", "", blocks("tuning.md", "python")[0]), space)
     assert space["controller"].feasible
     assert [round(row.bandwidth_hz) for row in space["frontier"].rows] == [20, 30, 40]
+
+
+def test_the_integrals_that_the_tuning_page_states_are_those_of_its_code(capsys):
+    first, second = blocks("tuning.md", "python")
+    text = (DOCS / "tuning.md").read_text(encoding="utf-8")
+    lines = [line for line in first.splitlines() if line.startswith(("import", "from", "stand"))]
+    exec("\n".join(lines) + "\n" + second, {})
+    assert capsys.readouterr().out.split() == ["pid_dob", "0.96", "pid", "1.4"]
+    assert "is 0.96 with it and 1.40 without:" in text

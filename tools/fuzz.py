@@ -87,7 +87,13 @@ def seeds(target: str) -> list[bytes]:
         content = {"time": np.arange(4.0), "run": {"F": np.ones((4, 2)), "t": "ab"}, "c": np.array([[1, "a"]], object)}
         scipy.io.savemat(stream, content, do_compression=packed)
         out.append(stream.getvalue())
-    return out
+    # "Structure with time" and a timeseries saved as a struct, and what has no numbers or no clock of its length.
+    t = np.arange(4.0)
+    signals = {"values": np.ones((4, 2)), "label": "F1", "dimensions": 2}
+    scopes = {"out": {"time": t, "signals": signals}, "ts": {"Time": t, "Data": t}, "odd": {"Time": t, "Data": t[:2]}}
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, scopes | {"z": 1j * t, "s": np.eye(4, dtype=np.int8) > 0, "e": np.empty((0, 3))})
+    return [*out, stream.getvalue()]
 
 
 if __name__ == "__main__":

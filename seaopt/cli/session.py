@@ -19,10 +19,11 @@ from seaopt.cli.frontier import show_frontier
 from seaopt.cli.responses import responses
 from seaopt.control import Controller, sweep, tune
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, fit
+from seaopt.estimation import Experiment, Fit, fit, resting_on
 from seaopt.files import read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
 from seaopt.problem import Problem, read_problem
 from seaopt.reporting import verdict, write_frontier_figure, write_report
 from seaopt.robustness import Certificate, certify, tune_certified
@@ -78,6 +79,7 @@ class Session:
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
+        self._warned: set[str] = set()
         self._console = Console(stderr=True)
 
     def planned(self) -> list[str]:
@@ -147,6 +149,15 @@ class Session:
         if isinstance(found, ParameterSet):
             return found
         return self.problem.parameters.with_parameters(*found.parameters.values())
+
+    def _design_values(self, *plants: Plant) -> ParameterSet:
+        """Return the values to design with; those that the fit cannot tell, of these plants, are named on stderr."""
+        values = self.values()
+        for note in resting_on(values, {name for plant in plants for name in plant.parameters}):
+            if note not in self._warned:
+                self._console.print(f"warning: {note}", highlight=False, markup=False, soft_wrap=True)
+            self._warned.add(note)
+        return values
 
     def controller(self) -> Controller:
         """Return the controller of this run or of the folder."""
@@ -254,11 +265,12 @@ class Session:
             return None
 
     def _tune(self, tell: Callable[[str], None]) -> None:
-        design, values = self.problem.design_plant, self.values()
+        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
+        values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
         spec = self.problem.spec
         assert spec is not None
         tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
-        draws, robust_to = self.problem.draws(self.parameters()), self.problem.robust_to(values)
+        draws = self.problem.draws(self.parameters())
         table = self.problem.robustness
         if table.retune:
             joint = tune_certified(
@@ -274,12 +286,13 @@ class Session:
         self._write("tune", result.to_dict())
 
     def _sweep(self, tell: Callable[[str], None]) -> None:
-        design, values = self.problem.design_plant, self.values()
+        design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
+        values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
         spec = self.problem.spec
         assert spec is not None
         tell(f"{spec.structure}, {len(self.bandwidths_hz)} bandwidths")
         result = sweep(
-            design, values, spec, self.bandwidths_hz, self.problem.robust_to(values),
+            design, values, spec, self.bandwidths_hz, robust_to,
             draws=self.problem.draws(self.parameters()),
         )  # fmt: skip
         self.results["sweep"] = result
@@ -291,6 +304,7 @@ class Session:
         table = self.problem.robustness
         tell(f"{table.samples} draws")
         plants = self.problem.certified_plants()
+        self._design_values(*plants.values())
         result = certify(
             controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
             others=self.problem.parameters,

@@ -88,13 +88,21 @@ class LoopRun:
     wall_s: float
 
     def __repr__(self) -> str:
-        peaks = ", ".join(f"{name} {np.max(value):.4g}" for name, value in self.peaks.items())
-        runs = self.current.shape[0]
-        return (
-            f"LoopRun of {runs} run{'' if runs == 1 else 's'} of {self.time.size} samples, from {self.time[0]:.4g} to "
-            f"{self.time[-1]:.4g} s: largest magnitudes {peaks}, current {np.max(np.abs(self.current)):.4g} A; "
-            f"integration error {self.error:.1g}"
+        return told(
+            "LoopRun", f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s", self.current, self.peaks, self.error
         )
+
+
+def told(
+    kind: str, span: str, current: Rows, peaks: Mapping[str, Float[np.ndarray, " runs"]], error: float, more: str = ""
+) -> str:
+    """Say in a line what simulated runs came to: how many, of how many samples, and the largest magnitudes."""
+    runs, samples = current.shape
+    largest = ", ".join(f"{name} {np.max(value):.4g}" for name, value in peaks.items())
+    return (
+        f"{kind} of {runs} run{'' if runs == 1 else 's'} of {samples} samples, {span}: largest magnitudes {largest}, "
+        f"current {np.max(np.abs(current)):.4g} A; {more}integration error {error:.1g}"
+    )
 
 
 def run_loop(

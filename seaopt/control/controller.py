@@ -14,6 +14,7 @@ from seaopt.control.law import Observer, TransferFunction
 from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.spec import ControllerSpec
 from seaopt.control.stored import stored
+from seaopt.estimation import resting_on
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
@@ -21,6 +22,7 @@ SCHEMA = "seaopt/controller/1"
 UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
 CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
+UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
@@ -97,6 +99,25 @@ class Controller:
         return f"{asked:g} Hz is blocked by {blocked}; {remedy}"
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know besides the limits, one sentence each."""
+        if self.design is None:
+            return ()
+        plant, values = self.design
+        # What the plants of robust_to need is in the same set.
+        return (*resting_on(values, None if self.robust_to else plant.parameters), *self._noise_notes())
+
+    def _noise_notes(self) -> tuple[str, ...]:
+        """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
+        k_d, T_f = self.gains["k_d"], self.gains["T_f"]
+        if self.spec.max_noise_gain is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
+            return ()
+        return (
+            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 N of noise on "
+            f"{self.spec.measured} makes up to {self.achieved.noise_gain:.3g} N of motor force; give max_noise_gain",
+        )
+
+    @property
     def engineering(self) -> dict[str, float]:
         """The gains in the units that a drive is set in: A per N of force error, its integral and its rate."""
         scale = self.current_per_force_A_per_N
@@ -150,6 +171,7 @@ class Controller:
             "observer": self._observer_dict(),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
+            "notes": list(self.notes),
         }
 
     def _observer_dict(self) -> dict[str, Any] | None:
@@ -202,6 +224,7 @@ class Controller:
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
                 else f"  {self.explanation}",
+                *(f"  note: {note}" for note in self.notes),
             ]
         ).rstrip()
 

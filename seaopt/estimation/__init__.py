@@ -16,7 +16,7 @@ from seaopt.estimation.diagnostics import Diagnostics, diagnose
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.findings import Derived, Nuisance, OutputFit, Prediction
 from seaopt.estimation.fit import fit
-from seaopt.estimation.identifiability import Identifiability
+from seaopt.estimation.identifiability import Identifiability, resting_on
 from seaopt.estimation.losses import Huber, Linear, SoftL1
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
 from seaopt.estimation.profile import Profile, profile
@@ -28,4 +28,5 @@ __all__ = [
     "Huber", "Identifiability", "Limits", "Linear", "Method", "MultipleShooting", "Multisines", "Nuisance",
     "OutputError", "OutputFit", "Prediction", "PredictionError", "Profile", "Ranking", "SoftL1", "bootstrap",
     "compare", "design_experiment", "diagnose", "expected_covariance", "fit", "profile",
+    "resting_on",
 ]  # fmt: skip

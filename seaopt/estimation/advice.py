@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from seaopt.estimation.correlation import LAGS, CrossCorrelation
 from seaopt.estimation.forecasts import Percent, in_band, used_and_held_out
+from seaopt.estimation.held import CHANCE, Culprit
 from seaopt.estimation.least_squares import minimise
 from seaopt.estimation.leftover import Errors
 from seaopt.estimation.leverage import PRIORS, Leverage
@@ -18,7 +19,6 @@ from seaopt.estimation.result import Fit
 from seaopt.estimation.unknowns import collect
 from seaopt.parameters import Parameter
 
-CHANCE = 0.01  # a test that fails with less than this probability by chance is told in words
 LARGE = 0.05  # of an output's rms: a residual that is worth words for its colour alone
 HALF = 0.5  # of a residual's power: a delay that leaves less is taken for its cause
 WORSE = 1.5  # times the rms: a held-out residual that is worth words
@@ -55,24 +55,50 @@ class OutputDiagnostics:
 
 def sentences(
     fit: Fit, outputs: dict[str, dict[str, OutputDiagnostics]], leverage: dict[str, Leverage],
-    at_bound: tuple[str, ...], left: list[list[Errors]], free: list[list[Errors]],
+    at_bound: tuple[str, ...], left: list[list[Errors]], free: list[list[Errors]], culprit: Culprit | None,
 ) -> tuple[str, ...]:  # fmt: skip
     """Return what is wrong and what to do about it; nothing where nothing is seen."""
     problem = fit.at_minimum("diagnose").problem
     told: list[str] = [] if fit.ok else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
     told += [f"{name} lies on its bound: widen the bound, or fix it there and say why" for name in at_bound]
+    trials = [
+        _Later.of(fit, e) if any(_follows(item) for item in outputs[experiment.name].values()) else None
+        for e, experiment in enumerate(problem.experiments)
+    ]
+    culprit = culprit if culprit is not None and _blamed(culprit, fit, outputs, trials) else None
+    told += [] if culprit is None else [culprit.sentence]
     for e, experiment in enumerate(problem.experiments):
-        trial = _Later.of(fit, e) if any(_follows(item) for item in outputs[experiment.name].values()) else None
         for o, name in enumerate(experiment.outputs):
             item, label = outputs[experiment.name][name], f"{experiment.name}.{name}"
-            found = _about_inputs(problem, e, o, item, label, left, trial)
-            told += found or _about_colour(item, label, problem.observers is not None)
+            found = _about_inputs(problem, e, o, item, label, left, trials[e], culprit)
+            whitened = culprit is not None and bool(culprit.white[e][o])
+            told += found or ([] if whitened else _about_colour(item, label, problem.observers is not None))
             told += _about_held_out(problem, e, o, item, label, free)
     return (*told, *_about_leverage(leverage))
 
 
 def _follows(item: OutputDiagnostics) -> bool:
     return any(found.p < CHANCE and found.worst_lag >= 0 for found in item.inputs.values())
+
+
+def _blamed(
+    culprit: Culprit, fit: Fit, outputs: dict[str, dict[str, OutputDiagnostics]], trials: list[_Later | None]
+) -> bool:
+    """Tell whether a held parameter explains whatever goes with an input, and does so better than a delay.
+
+    Where nothing does, it must leave white residuals: of what else moves the plant the test knows nothing.
+    """
+    related = False
+    for e, (experiment, trial) in enumerate(zip(fit.experiments, trials, strict=True)):
+        for o, name in enumerate(experiment.outputs):
+            if all(found.p >= CHANCE for found in outputs[experiment.name][name].inputs.values()):
+                continue
+            related = True
+            if trial is not None and trial.left[o] < min(HALF, float(culprit.left[e][o])):
+                return False
+            if not culprit.explains(e, o):
+                return False
+    return related or all(bool(np.all(row)) for row in culprit.white)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,7 +137,7 @@ class _Later:
 
 def _about_inputs(
     problem: Residuals, e: int, o: int, item: OutputDiagnostics, label: str, left: list[list[Errors]],
-    trial: _Later | None,
+    trial: _Later | None, culprit: Culprit | None,
 ) -> list[str]:  # fmt: skip
     """Say which input the residual follows and what that means."""
     told: list[str] = []
@@ -129,13 +155,20 @@ def _about_inputs(
         late = f" = {1e3 * lag * period:.3g} ms" if lag else ""
         told.append(
             f"{label}: the residual follows {name}, most around lag {lag}{late} {size}: "
-            f"{_remedy(problem, e, o, left, trial)}"
+            f"{_remedy(problem, e, o, left, trial, culprit)}"
         )
     return told
 
 
-def _remedy(problem: Residuals, e: int, o: int, left: list[list[Errors]], trial: _Later | None) -> str:
-    """Say whether a delay would explain the residual; a missing pole or resonance otherwise."""
+def _remedy(
+    problem: Residuals, e: int, o: int, left: list[list[Errors]], trial: _Later | None, culprit: Culprit | None
+) -> str:
+    """Say whether a held parameter or a delay would explain the residual; a missing pole or resonance otherwise."""
+    if culprit is not None:
+        rest = (
+            "nothing follows it" if culprit.clean[e][o] else f"{100.0 * culprit.left[e][o]:.2g} % of its power is left"
+        )
+        return f"with {culprit.first} {rest}"
     if trial is not None and trial.left[o] < HALF:
         gone = 100.0 * (1.0 - float(trial.left[o]))
         return f"with a delay of {1e3 * trial.delay_s:.3g} ms {gone:.0f} % of its power is gone; free delay_s"

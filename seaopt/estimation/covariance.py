@@ -10,7 +10,8 @@ Newey and West 1987). R is estimated from the residuals under a Parzen window, w
 indefinite. A fit takes out of a short log's residuals what its parameters can follow, which leaves them anticorrelated
 and would make B too small: where no lag of a short log can be told from chance, lags may widen the covariance but not
 narrow it. With a robust loss the residuals in B are what the loss makes of them, and J^T J counts each sample with the
-loss's second derivative (Huber, Robust Statistics, 1981, ch. 7).
+loss's second derivative; for white residuals B is then E[psi^2] J^T J, psi the loss's derivative (Huber, Robust
+Statistics, 1981, ch. 7).
 
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
 them, :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter,
@@ -20,6 +21,7 @@ Long sums are NumPy's own, or cut short: threads of the linear-algebra library c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,13 +54,27 @@ class Covariance:
 
 def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
+    return _weighted(problem, z, lambda e, o, r: curvature_of(problem.loss, r))
+
+
+def robust_meat(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover]) -> Float[np.ndarray, "n n"]:
+    """Return B for white residuals: J^T J with the mean square of what the loss makes of each output's residuals."""
+    power = [np.diagonal(sums.correlation[0]) / np.maximum(sums.count, 1.0) for sums in left]
+    return _weighted(problem, z, lambda e, o, r: np.full(r.size, power[e][o]))
+
+
+def _weighted(
+    problem: Residuals, z: Float[np.ndarray, " n"],
+    weigh: Callable[[int, int, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
+) -> Float[np.ndarray, "n n"]:  # fmt: skip
+    """Return J^T J with weights that come of the residuals, in sigma, of an experiment's output."""
     normal = np.zeros((1 + z.size, 1 + z.size))
     for e, pieces in enumerate(problem.segments):
         for s in range(len(pieces)):
             for _, columns, used in column_chunks(problem, e, s, z):
                 for o, places in enumerate(problem.columns(e, s)):
                     v = columns[:, o] / problem.sigma[e][o]
-                    weight = used[:, o] * curvature_of(problem.loss, v[:, 0])
+                    weight = used[:, o] * weigh(e, o, v[:, 0])
                     add_gram(normal, (v * weight[:, None]).T @ v, places)
     return normal[1:, 1:]
 
@@ -70,9 +86,9 @@ def coloured(
     p = inverse.shape[1]
     total = np.zeros((p, p))
     for e, sums in enumerate(left):
-        r = correlations(sums)
+        r, last = correlations(sums)
         found = _summed(problem, e, z, inverse, r)
-        if np.max(sums.count) < FEW and not _last_told(*_normalised(sums)):
+        if np.max(sums.count) < FEW and not last:
             found = _at_least(found, _summed(problem, e, z, inverse, r[:1]))
         total += found
     return total
@@ -160,22 +176,17 @@ class _Form:
         return found
 
 
-def correlations(left: Leftover) -> Float[np.ndarray, "lags1 ny ny"]:
-    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window.
+def correlations(left: Leftover) -> tuple[Float[np.ndarray, "lags1 ny ny"], int]:
+    """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window, and the last lag.
 
-    The window reaches three times as far as correlation can be told from chance (after Politis, J. Nonparametric
-    Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
+    The last lag is that at which correlation can be told from chance. The window reaches three times as far (after
+    Politis, J. Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
-    found, count = _normalised(left)
-    reach = min(max(LEAST, int(WIDER * _last_told(found, count))), found.shape[2] - 1)
-    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1)
-
-
-def _normalised(left: Leftover) -> tuple[Float[np.ndarray, "ny ny lags1"], float]:
-    """Return the correlations before the window, and how many samples they are of."""
     count = np.maximum(left.count, 1.0)
     found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
-    return found, float(np.max(count))
+    last = _last_told(found, float(np.max(count)))
+    reach = min(max(LEAST, int(WIDER * last)), found.shape[2] - 1)
+    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1), last
 
 
 def _last_told(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:

@@ -1,13 +1,14 @@
 """What is wrong with a fit, and what to do about it: tests of its residuals, of its predictions, and of its data.
 
-The tests have modules of their own: `correlation` of residuals, `forecasts`, `leverage`, and `advice` for what is said.
+The tests have modules of their own: `correlation` of residuals, `forecasts`, `leverage`, `held` for parameters that
+were held fixed, and `advice` for what is said.
 """
 
 from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from seaopt.estimation.advice import OutputDiagnostics, sentences
 from seaopt.estimation.correlation import LAGS, QUANTILE, CrossCorrelation, autocorrelation, cross_correlation
 from seaopt.estimation.forecasts import Percent, fit_percent, free_run, one_step
+from seaopt.estimation.held import CHANCE, Held, culprit
 from seaopt.estimation.leftover import Errors, leftover
 from seaopt.estimation.leverage import Leverage, leverage
 from seaopt.estimation.residuals import Residuals
@@ -32,6 +34,9 @@ class Diagnostics:
         With "priors", where there are some.
     at_bound : tuple of str
         Unknowns that lie on a bound.
+    held : mapping of name to Held
+        The test of each parameter that was held fixed, that which would lower the cost most first; without those that
+        the free ones stand for, or that would make a linear plant nonlinear.
     aic, bic : float
         Of the fit.
     sentences : tuple of str
@@ -44,6 +49,7 @@ class Diagnostics:
     outputs: Mapping[str, Mapping[str, OutputDiagnostics]]
     leverage: Mapping[str, Leverage]
     at_bound: tuple[str, ...]
+    held: Mapping[str, Held]
     aic: float
     bic: float
     sentences: tuple[str, ...]
@@ -63,7 +69,8 @@ class Diagnostics:
             "leverage": {
                 name: {"parameters": dict(item.parameters), "whole": item.whole} for name, item in self.leverage.items()
             },
-            "at_bound": list(self.at_bound), "aic": self.aic, "bic": self.bic, "sentences": list(self.sentences),
+            "at_bound": list(self.at_bound), "held": {name: asdict(item) for name, item in self.held.items()},
+            "aic": self.aic, "bic": self.bic, "sentences": list(self.sentences),
         }  # fmt: skip
 
     def __repr__(self) -> str:
@@ -76,6 +83,12 @@ class Diagnostics:
                     f"    against {u}: {found.worst:.2g} of the 99 % bound, at lag {found.worst_lag}"
                     for u, found in item.inputs.items()
                 ]
+        lines += [
+            f"  {name} = {item.value:.6g} {item.unit} held fixed: chi-square {item.chi2:.3g}, one step with it free "
+            f"goes to {item.preferred:.4g}"
+            for name, item in self.held.items()
+            if item.p < CHANCE
+        ]
         for name, item in self.leverage.items():
             shares = ", ".join(f"{parameter} {100 * share:.3g} %" for parameter, share in item.parameters.items())
             lines.append(f"  {name} brings {100 * item.whole:.3g} % of what is known: {shares}")
@@ -157,9 +170,10 @@ def diagnose(fit: Fit) -> Diagnostics:
         for e, experiment in enumerate(problem.experiments)
     }  # fmt: skip
     shares, at_bound = leverage(minimum), _at_bound(minimum)
+    held, blamed = culprit(minimum, fit, left)
     return Diagnostics(
-        outputs=outputs, leverage=shares, at_bound=at_bound, aic=fit.aic, bic=fit.bic,
-        sentences=sentences(fit, outputs, shares, at_bound, left, free), residuals=left,
+        outputs=outputs, leverage=shares, at_bound=at_bound, held=held, aic=fit.aic, bic=fit.bic,
+        sentences=sentences(fit, outputs, shares, at_bound, left, free, blamed), residuals=left,
     )  # fmt: skip
 
 

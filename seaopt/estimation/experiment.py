@@ -22,6 +22,7 @@ from seaopt.units import same_dimension
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
+SHORTEST = 4  # samples of a shot
 Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
@@ -277,4 +278,30 @@ def is_constant(values: Float[np.ndarray, " n"]) -> bool:
 
 def shot_edges(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
     """Return the first rows of shots of about equal length, and one past the last; no shot is under four samples."""
-    return np.linspace(0, n, max(1, min(shots, n // 4)) + 1).astype(int)
+    return np.linspace(0, n, max(1, min(shots, n // SHORTEST)) + 1).astype(int)
+
+
+def check_shots(experiment: Experiment, longest: int, shots: int, given: str) -> None:
+    """Refuse shots too short for the states they start from.
+
+    So many samples of one output as there are states tell the state at a shot's start, where they tell it at all; with
+    no more than that, a shot would follow its log whatever the parameters are. Stretches shorter than the longest are
+    cut into fewer.
+
+    Raises
+    ------
+    EstimationError
+        The longest stretch does not have a sample more than the plant has states, and at least four, for each shot.
+
+    """
+    states = len(experiment.plant.states)
+    least = max(SHORTEST, states + 1)
+    if longest >= shots * least or shots == 1:
+        return
+    possible = longest // least
+    remedy = f"give {possible} or fewer" if possible > 1 else "leave it out, and use a longer log or OutputError()"
+    raise EstimationError(
+        f"experiment {experiment.name}: {given} leaves {longest / shots:.3g} samples a shot, of {longest} in the "
+        f"longest stretch; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least "
+        f"{least} samples: {remedy}"
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.experiment import Experiment, is_constant
+from seaopt.estimation.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.least_squares import Callback
 from seaopt.estimation.leftover import counted
 from seaopt.estimation.losses import Huber, Linear, Loss, SoftL1
@@ -197,6 +197,8 @@ def _problem(
                     f"experiment {experiment.name}: output {name} has no sample that counts; "
                     "leave it out of outputs, or keep back less (holdout)"
                 )
+        whole = max(stretch.stop - stretch.start for stretch in experiment.stretches)
+        check_shots(experiment, whole, experiment.shots, f"shots = {experiment.shots}")
         longest = max(segment.n for segment in segments[e])
         if longest <= settle + 2:
             raise EstimationError(

@@ -9,6 +9,7 @@ the sensitivities to a rich made-up input. What that does not show, no log of th
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Float
 
 from seaopt.estimation.normal import RANK, eliminated
 from seaopt.estimation.residuals import Residuals
+from seaopt.parameters import ParameterSet
 from seaopt.simulation import Segment, run_passes
 
 WEAK = 1e-5  # eigenvalues below this part of the largest: standard deviations a few hundred times those of one alone
@@ -129,6 +131,28 @@ def told(direction: dict[str, float], alone_seen: bool) -> str:
         return f"{names[0]} and {names[1]} enter only together, as their {how}"
     changes = ", ".join(f"{name} {100 * direction[name]:+.3g} %" for name in names)
     return f"{listed(names)} enter only together: {changes} change no output"
+
+
+def resting_on(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
+    """Say which values come from a fit that cannot tell them; nothing where there are none.
+
+    Parameters
+    ----------
+    params : ParameterSet
+        What is computed with.
+    used : container of str, optional
+        The names that matter; all if left out.
+
+    """
+    names = [name for name in params.unidentified_names if used is None or name in used]
+    if not names:
+        return ()
+    values = ", ".join(f"{name} = {params[name].value:.4g} {params[name].unit}" for name in names)
+    return (
+        f"the fit does not identify {listed(names)}: {values} {'is' if len(names) == 1 else 'are'} one choice among "
+        "others that fit as well, and what follows at these values holds for no other; excite more, or give a value, a "
+        "prior, or a range to certify over",
+    )
 
 
 def listed(names: list[str]) -> str:

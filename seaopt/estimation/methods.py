@@ -40,7 +40,8 @@ class MultipleShooting:
     Parameters
     ----------
     segments : int
-        Shots a log segment.
+        Shots a log segment; a segment shorter than the longest may have fewer. Each shot needs a sample more than the
+        plant has states, and at least four.
     max_iterations : int
         Of least squares, each time the joints are made stiffer.
     search : bool

@@ -9,8 +9,8 @@ its Applications, 1988, sec. 6.1, as profile t). The 95 % interval is where the 
 Where residuals are affine in the parameters :math:`\tau` is a straight line, and the interval is the estimate ± 1.96
 std; where they are not, it may be lopsided, or open.
 
-s is 1 for white residuals. For coloured ones the least squares are not the likelihood, and the rise is scaled by how
-much more the parameter varies than they say, robust over white variance (Rotnitzky and Jewell, Biometrika 77, 1990;
+s is 1 for white residuals and squares as the loss. Otherwise the cost is not the likelihood, and its rise is scaled by
+how much more the parameter varies than its curvature says (Rotnitzky and Jewell, Biometrika 77, 1990;
 Pauli, Racugno and Ventura, Statistica Sinica 21, 2011, for adjusting the magnitude). Sigma stays as at the minimum.
 """
 
@@ -24,8 +24,10 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError, suggestion
+from seaopt.estimation.covariance import robust_bread
 from seaopt.estimation.least_squares import minimise
-from seaopt.estimation.normal import solved
+from seaopt.estimation.losses import Linear
+from seaopt.estimation.normal import inverse, solved
 from seaopt.estimation.result import Fit, Minimum
 
 CLOSE = 2e-3  # of tau: near enough for an end of the interval to be interpolated
@@ -158,7 +160,7 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
         raise EstimationError(f"profile: points = {points} is negative; give 0 or more")
     from scipy.special import erfinv  # deferred: scipy is slow to load
 
-    scale, std = _scale(fit, name) if coloured else (1.0, fit.white_covariance.std(name))
+    scale, std = _scale(fit, minimum, name, coloured)
     reach = float(np.sqrt(2.0) * erfinv(level))
     curve = _Curve(minimum, names.index(name), scale, std)
     (low, shut_low), (high, shut_high) = curve.end(-reach), curve.end(reach)
@@ -173,11 +175,15 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
     )  # fmt: skip
 
 
-def _scale(fit: Fit, name: str) -> tuple[float, float]:
-    """Return robust over white variance, and the robust std; 1 where the variance is not known."""
-    white, robust = fit.white_covariance.std(name), fit.covariance.std(name)
-    known = np.isfinite(white) and np.isfinite(robust) and white > 0.0 and robust > 0.0
-    return (robust / white) ** 2 if known else 1.0, robust
+def _scale(fit: Fit, minimum: Minimum, name: str, coloured: bool) -> tuple[float, float]:
+    """Return the variance over what the cost's curvature says, and the std; 1 where the variance is not known."""
+    std = (fit.covariance if coloured else fit.white_covariance).std(name)
+    curved, problem = fit.white_covariance.std(name), minimum.problem
+    if not isinstance(problem.loss, Linear):
+        bread = robust_bread(problem, minimum.z) + np.diag(problem.unknowns.precision)
+        curved = float(np.sqrt(inverse(bread)[0][(problem.unknowns.names.index(name),) * 2]))
+    known = np.isfinite(curved) and np.isfinite(std) and curved > 0.0 and std > 0.0
+    return (std / curved) ** 2 if known else 1.0, std
 
 
 class _Curve:

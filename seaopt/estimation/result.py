@@ -46,7 +46,8 @@ class Fit:
     status : str
         "converged", "max_iterations", "stalled" or "not_identifiable"; `message` says it in words.
     parameters : ParameterSet
-        Every parameter of the plants, free ones with their std (infinite where not identifiable).
+        Every parameter of the plants, free ones with their std (infinite where not identifiable); `identified` is False
+        of those that the data do not tell.
     covariance : Covariance
         Of the free parameters; posterior, and allowing for coloured residuals.
     white_covariance : Covariance
@@ -253,7 +254,7 @@ def _parameter_dict(item: Parameter) -> dict[str, Any]:
     return {
         "value": item.value, "unit": item.unit, "free": item.free, "std": item.std, "ci95": ci95,
         "at_bound": item.at_bound, "min": item.min, "max": item.max, "prior_std": item.prior_std,
-        "description": item.description,
+        "description": item.description, "identified": item.identified,
     }  # fmt: skip
 
 
@@ -282,6 +283,7 @@ def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) 
             name=name, value=float(item["value"]), unit=item["unit"], free=bool(item["free"]),
             min=_number(item.get("min"), -math.inf), max=_number(item.get("max"), math.inf),
             prior_std=item.get("prior_std"), description=item.get("description", ""), std=_std(item),
+            identified=bool(item.get("identified", _std(item) != math.inf)),
         )
         for name, item in content["parameters"].items()
     )  # fmt: skip

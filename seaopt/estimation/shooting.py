@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.experiment import Experiment, shot_edges
+from seaopt.estimation.experiment import Experiment, check_shots, shot_edges
 from seaopt.estimation.least_squares import Callback, minimise
 from seaopt.estimation.leftover import errors
 from seaopt.estimation.losses import Linear
@@ -208,6 +208,9 @@ def multiple_shooting(
     problem: Residuals, params: ParameterSet, method: MultipleShooting, callback: Callback | None
 ) -> Solved:
     """Join the shots step by step; then settle by single shooting, or on shots of their own if the plant runs away."""
+    for experiment, pieces in zip(problem.experiments, problem.segments, strict=True):
+        longest = max(piece.n for piece in pieces)
+        check_shots(experiment, longest, method.segments, f"MultipleShooting(segments={method.segments})")
     start, _ = best_start(problem, method)
     plain = replace(problem, band_hz=None, loss=Linear())
     z = start.z

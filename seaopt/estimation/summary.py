@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.covariance import Covariance, coloured, robust_bread, with_infinities
+from seaopt.estimation.covariance import Covariance, coloured, robust_bread, robust_meat, with_infinities
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.findings import Derived, Nuisance, OutputFit
 from seaopt.estimation.identifiability import Identifiability, identifiability, listed, structural_rank, told
@@ -52,15 +53,20 @@ def summarise(params: ParameterSet, solved: Solved, method: Method, diagnostics:
         seen = replace(seen, structural_rank=structural_rank(problem, z))
     std, variance = np.sqrt(np.diag(robust)), np.diag(inverse(found.hessian)[0])
     fitted = params.with_parameters(
-        *(replace(params[name], value=float(z[i]), std=float(std[i])) for i, name in enumerate(names))
+        *(
+            replace(params[name], value=float(z[i]), std=float(std[i]), identified=bool(np.isfinite(std[i])))
+            for i, name in enumerate(names)
+        )
     )
     covariance = Covariance(names=names, matrix=robust)
     status, message = _status(solution, seen, found.hessian, names, solved.step_error)
     if status == "converged":
-        status, message = _open(fitted, params, message)
+        fitted, message = _open(fitted, params, message)
+        status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
     outputs = _outputs(problem, z, left) if left is not None else {}
     if left is not None and not _explained(problem, outputs, left):
         status = "not_identifiable"
+        fitted = _marked(fitted, names)
         message = (
             f"the model explains nothing of any output; check the input's sign, the channels and units ({message})"
         )
@@ -129,17 +135,20 @@ def _covariances(
     problem: Residuals, found: Evaluation, left: list[Leftover] | None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
-    p, prior = problem.unknowns.shared, problem.unknowns.precision
-    bread = found.hessian
-    if left is not None and not isinstance(problem.loss, Linear):
-        bread = robust_bread(problem, found.z) + np.diag(prior)
+    p, prior, z = problem.unknowns.shared, problem.unknowns.precision, found.z
+    squares = isinstance(problem.loss, Linear)
+    bread = found.hessian if squares else robust_bread(problem, z) + np.diag(prior)
     back, unseen = inverse(bread)
-    white = with_infinities(back[:p, :p], unseen[:p])
+    columns = back[:, :p]
+    known = (columns.T * prior) @ columns
+    white = back[:p, :p]
+    if not squares:
+        sums = left if left is not None else [leftover(problem, e, z) for e in range(len(problem.experiments))]
+        white = columns.T @ robust_meat(problem, z, sums) @ columns + known
+    white = with_infinities(white, unseen[:p])
     if left is None:
         return white, white
-    columns = back[:, :p]
-    meat = coloured(problem, found.z, columns, left) + (columns.T * prior) @ columns
-    return white, with_infinities(meat, unseen[:p])
+    return white, with_infinities(coloured(problem, z, columns, left) + known, unseen[:p])
 
 
 def _own_std(experiment: Experiment, places: Locals, variance: Float[np.ndarray, " n"]) -> dict[str, float]:
@@ -167,16 +176,22 @@ def _log_likelihood(problem: Residuals, found: Evaluation) -> float:
     return total
 
 
-def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[str, str]:
-    """Call a fit not identifiable whose parameters are less certain than their size: the log hardly shows them."""
-    vague = [
-        f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
+def _marked(fitted: ParameterSet, names: Sequence[str]) -> ParameterSet:
+    """Return the parameters with `names` marked as not identified."""
+    return fitted.with_parameters(*(replace(fitted[name], identified=False) for name in names))
+
+
+def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[ParameterSet, str]:
+    """Call those parameters not identified that are less certain than their size: the log hardly shows them."""
+    vague = {
+        name: f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
         for name, item in fitted.items()
         if item.free and item.std is not None and item.std > VAGUE * max(abs(item.value), abs(given[name].value))
-    ]
+    }
     if not vague:
-        return "converged", message
-    return "not_identifiable", f"the logs hardly show {', '.join(vague)}: excite more, fix it, or give it a prior"
+        return fitted, message
+    message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
+    return _marked(fitted, [*vague]), message
 
 
 def _status(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from jaxtyping import Float
 from seaopt.errors import LogError, suggestion
 from seaopt.logs.column import bare_name, header_unit
 from seaopt.logs.log import Log
+from seaopt.logs.select import check_apart
+from seaopt.units import si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,44 +60,8 @@ def to_pandas(log: Log) -> pd.DataFrame:
     return pandas.DataFrame({name: values.copy() for name, values in headed(log).items()})
 
 
-def from_frame(
-    frame: Any,
-    *,
-    time: str = "time [s]",
-    channels: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    source: str = "frame",
-) -> Log:
-    """Build a log from a polars or pandas frame.
-
-    Parameters
-    ----------
-    frame : polars.DataFrame or pandas.DataFrame
-        Columns of numbers; nulls and NaN are missing samples.
-    time : str
-        Name of the time column.
-    channels : mapping of channel name to column name, optional
-        Every other column if left out, under its name without the brackets where that is clear.
-    units : mapping of channel name to unit, optional
-        Of columns without brackets; what has neither is SI already.
-    source : str
-        A name for messages.
-
-    Raises
-    ------
-    LogError
-        A column is missing or not numeric, or time does not increase.
-    UnitError
-        A unit is unknown.
-
-    Examples
-    --------
-    >>> import polars as pl
-    >>> log = from_frame(pl.DataFrame({"t [ms]": [0.0, 2.5], "cur [mA]": [100, None]}), time="t [ms]")
-    >>> log.time.tolist(), log["cur"].tolist(), log.signal("cur").unit
-    ([0.0, 0.0025], [0.1, nan], 'A')
-
-    """
+def from_frame(frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str) -> Log:
+    """Build a log from a frame: see `Log.from_frame`."""
     columns = [str(name) for name in getattr(frame, "columns", ())]
     if not columns:
         raise LogError(f"{type(frame).__name__} is no frame with columns; give a polars or pandas DataFrame")
@@ -110,9 +77,10 @@ def from_frame(
         if column not in columns:
             raise LogError(f'{source}: no column "{column}" for {name}; {suggestion(column, columns)}')
     brackets = {name: header_unit(column) for name, column in wanted.items()}
-    given = {name: unit for name, unit in brackets.items() if unit is not None} | dict(units or {})
+    given = {name: unit for name, unit in brackets.items() if unit is not None} | dict(units)
+    notes = check_apart({name: ((source, column), si_unit(given.get(name, ""))) for name, column in channels.items()})
     arrays = {name: _column(frame, column, source) for name, column in wanted.items()}
-    return Log.from_arrays(units=given, source=source, **arrays)
+    return replace(Log.from_arrays(units=given, source=source, **arrays), notes=tuple(notes))
 
 
 def _column(frame: Any, column: str, source: str) -> Float[np.ndarray, " n"]:

@@ -248,10 +248,39 @@ class Log:
         units: Mapping[str, str] | None = None,
         source: str = "frame",
     ) -> Log:
-        """Build a log from a polars or pandas frame: see `seaopt.logs.frames.from_frame`."""
+        """Build a log from a polars or pandas frame.
+
+        Parameters
+        ----------
+        frame : polars.DataFrame or pandas.DataFrame
+            Columns of numbers; nulls and NaN are missing samples.
+        time : str
+            Name of the time column.
+        channels : mapping of channel name to column name, optional
+            Every other column if left out, under its name without the brackets where that is clear.
+        units : mapping of channel name to unit, optional
+            Of columns without brackets; what has neither is SI already.
+        source : str
+            A name for messages.
+
+        Raises
+        ------
+        LogError
+            A column is missing, not numeric, or given for two channels of one unit; or time does not increase.
+        UnitError
+            A unit is unknown.
+
+        Examples
+        --------
+        >>> import polars as pl
+        >>> log = Log.from_frame(pl.DataFrame({"t [ms]": [0.0, 2.5], "cur [mA]": [100, None]}), time="t [ms]")
+        >>> log.time.tolist(), log["cur"].tolist(), log.signal("cur").unit
+        ([0.0, 0.0025], [0.1, nan], 'A')
+
+        """
         from seaopt.logs.frames import from_frame
 
-        return from_frame(frame, time=time, channels=channels, units=units, source=source)
+        return from_frame(frame, time, channels, units or {}, source)
 
     @property
     def _round_rate(self) -> float:

@@ -57,8 +57,8 @@ def read_table(
     Raises
     ------
     LogError
-        The file is missing or damaged, a column is missing or doubled, a cell is not a number, or a channel is on
-        another clock and no rule is given.
+        The file is missing or damaged, a column is missing or doubled, a cell is not a number, a channel is on another
+        clock and no rule is given, or two channels of one SI unit are one column.
     UnitError
         A unit is unknown or of the wrong dimension.
 

@@ -12,6 +12,7 @@ import numpy as np
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.errors import FileError, SeaoptError
+from seaopt.estimation import resting_on
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.nominal import PlantMargins, plant_margins
@@ -179,12 +180,18 @@ class Certificate:
                 for name, item in self.plants.items()
             },
             "monte_carlo": _fields(self.monte_carlo),
+            "notes": list(self.notes),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
         }
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know besides the requirements, one sentence each."""
+        return resting_on(self.parameters, {name for plant in self.models.values() for name in plant.parameters})
+
     def __repr__(self) -> str:
-        lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}"]
+        lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]
         for name in self.plants:
             lines += self._plant_lines(name)
         mc = self.monte_carlo

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
-from seaopt.control.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop
+from seaopt.control.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop, told
 from seaopt.control.digital import conditions_of
 from seaopt.control.equilibrium import Equilibrium, equilibrium
 from seaopt.control.realisation import runnable
@@ -115,13 +115,8 @@ class Trace:
     wall_s: float
 
     def __repr__(self) -> str:
-        peaks = ", ".join(f"{name} {np.max(value):.4g}" for name, value in self.peaks.items())
-        runs = self.current.shape[0]
-        return (
-            f"Trace of {runs} run{'' if runs == 1 else 's'} of {self.time.size} samples, {self.time[-1]:.4g} s: "
-            f"largest magnitudes {peaks}, current {np.max(np.abs(self.current)):.4g} A; {len(self.contacts)} contacts; "
-            f"integration error {self.error:.1g}"
-        )
+        contacts = f"{len(self.contacts)} contacts; "
+        return told("Trace", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
 
     @property
     def last(self) -> slice:

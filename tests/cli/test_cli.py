@@ -50,6 +50,7 @@ def test_run_leaves_everything(folder, done):
         assert (folder / "all" / name).stat().st_size > 500
     assert "Certificate: passed" in done.stdout
     assert "fitting the logs" in done.stderr
+    assert "warning" not in done.stderr and "not identif" not in done.stdout
     fit = json.loads((folder / "all" / "fit.json").read_text(encoding="utf-8"))
     assert fit["schema"] == "seaopt/fit/1"
     assert fit["status"] == "converged"
@@ -151,6 +152,19 @@ def test_an_unidentifiable_fit_exits_1_with_a_report(folder):
     assert "enter only together" in out.stdout
     assert (folder / "open" / "report.html").exists()
     assert not (folder / "open" / "controller.json").exists()
+
+
+def test_values_that_the_fit_does_not_identify_are_named_wherever_they_are_used(folder):
+    text = SHORT.replace("[plant.stand]", "K_tau = { value = 0.0255, free = true }\n[plant.stand]", 1)
+    text = text.replace("I_p = [0.2, 0.6]", "I_p = [0.2, 0.6], K_tau = [0.024, 0.027], eta = [0.9, 1.0]")
+    (folder / "ranged.toml").write_text(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.8"), "utf-8")
+    assert seaopt("fit", "ranged.toml", "-o", "ranged", cwd=folder).returncode == 1
+    for stage, file in (("tune", "controller.json"), ("certify", "robustness.json")):
+        out = seaopt(stage, "ranged.toml", "-o", "ranged", cwd=folder)
+        assert "warning: the fit does not identify K_tau and eta: K_tau = 0.0" in out.stderr
+        assert "note: the fit does not identify K_tau and eta: K_tau = 0.0" in out.stdout
+        (note,) = json.loads((folder / "ranged" / file).read_text(encoding="utf-8"))["notes"]
+        assert "K_tau" in note and " b_r" not in note
 
 
 def test_json_on_stdout_is_the_file(folder, done):

@@ -215,3 +215,15 @@ def test_a_damaged_controller_json_is_refused(stand, thor, changes):
     content = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).to_dict()
     with pytest.raises(FileError, match=r"controller\.json"):
         Controller.from_dict({**content, **changes}, stand, thor)
+
+
+def test_a_derivative_that_nothing_filters_is_said(stand, thor):
+    """The figure is the peak of |C_y S| over frequency, recomputed; a limit, or an objective, takes the note away."""
+    free = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    (note,) = free.notes
+    assert "1 N of noise on F1 makes up to " in note and "give max_noise_gain" in note
+    _, _, noise = independent(free.close(stand, thor), np.linspace(0.1, 499.9, 20_000))
+    assert float(note.split("up to ")[1].split(" N")[0]) == pytest.approx(np.abs(noise).max(), rel=5e-3)
+    assert f"note: {note}" in repr(free)
+    for spec in ({"max_noise_gain": 25}, {"objective": "noise"}):
+        assert so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, **spec)).notes == ()

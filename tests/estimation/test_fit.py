@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
-from seaopt.estimation import Linear
+from seaopt.estimation import Linear, profile
+from seaopt.files import to_json
 
 FREE = ("J", "b_r", "eta")
 
@@ -172,6 +173,39 @@ def test_hubers_intervals_mean_what_they_say(stand, thor):
     np.testing.assert_allclose(scatter(stand, thor, outliers, 60, loss=so.Huber()), 1.0, atol=0.25)
 
 
+def location(e, loss, **options):
+    """Return the fit of a in y = a u + e, sigma 1, a prior left out; u is -1 or 1, so that the design says nothing."""
+    u = np.random.default_rng(9).choice([-1.0, 1.0], size=e.size)
+    plant = so.Plant(
+        name="gain", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-"}, parameters={"a": "-"},
+        f=lambda t, x, u, p: {"z": u.u - x.z}, h=lambda t, x, u, p: {"y": p.a * u.u + 0 * x.z},
+    )  # fmt: skip
+    log = so.Log.from_arrays(time=np.arange(float(e.size)), u=u, y=3.0 * u + e)
+    bench = so.Experiment(plant=plant, log=log, sigma={"y": 1.0}, initial_state="rest", offset=False)
+    return so.fit([bench], so.ParameterSet.of(a=(3.0, "-")).free("a"), loss=loss, **options), u
+
+
+@pytest.mark.parametrize("diagnostics", [True, False])
+def test_the_white_std_of_a_robust_loss_has_hubers_factor(diagnostics):
+    """Var = E[psi^2] / (E[psi']^2 n) (Huber 1981, ch. 7): 1/0.95 of least squares' on Gaussian noise, at 1.345."""
+    e = np.random.default_rng(8).normal(size=40_000)
+    fit, u = location(e, so.Huber(), diagnostics=diagnostics)
+    residual = 3.0 * u + e - fit.parameters["a"].value * u
+    inside = np.abs(residual) <= 1.345
+    factor = np.mean(np.clip(residual, -1.345, 1.345) ** 2) / np.mean(inside) ** 2
+    assert fit.white_covariance.std("a") == pytest.approx(np.sqrt(factor / e.size), rel=1e-6)
+    assert factor == pytest.approx(1 / 0.95, rel=0.03)
+
+
+def test_the_profile_of_a_robust_loss_is_as_wide_as_its_std():
+    rng = np.random.default_rng(8)
+    e = rng.normal(size=4000) * np.where(rng.random(4000) < 0.1, 10.0, 1.0)
+    fit, _ = location(e, so.SoftL1())
+    found = profile(fit, "a", points=0, coloured=False)
+    half = 1.959964 * fit.white_covariance.std("a")
+    np.testing.assert_allclose(np.array(found.interval) - fit.parameters["a"].value, (-half, half), rtol=0.02)
+
+
 def test_what_cannot_be_told_is_named(stand, short_log, thor):
     fit = so.fit([experiment(stand, short_log)], thor.free("J", "b_r", "eta", "K_tau"))
     assert fit.status == "not_identifiable"
@@ -179,6 +213,10 @@ def test_what_cannot_be_told_is_named(stand, short_log, thor):
     (direction,) = fit.identifiability.unidentifiable
     assert direction["K_tau"] == pytest.approx(-direction["eta"])
     assert np.isinf(fit.parameters["eta"].std)
+    assert set(fit.parameters.unidentified_names) == {"K_tau", "eta"}
+    again = so.Fit.from_dict(json.loads(to_json(fit.to_dict())))
+    assert again.parameters.unidentified_names == fit.parameters.unidentified_names
+    assert fit.parameters.update(eta=0.95).unidentified_names == ("K_tau",)
     assert fit.parameters["J"].value == pytest.approx(3.31e-6, rel=1e-3)
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import seaopt as so
 from seaopt.errors import LogError, SeaoptError, UnitError
+from seaopt.logs import quality
 
 CHANNELS = {"I": so.Column(column="cur", unit="mA"), "F1": "F1 [N]"}
 
@@ -136,3 +137,21 @@ def test_no_file_is_left_when_writing_fails(tmp_path, monkeypatch):
     with pytest.raises(SeaoptError, match="No space"):
         seaopt.files.write_text(tmp_path / "a.json", "{}")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_column_for_two_forces_is_refused(csv):
+    file = csv("t [s],F1 [N],enc [rad]\n0,1,0.1\n0.1,2,0.2\n0.2,3,0.4\n")
+    with pytest.raises(LogError, match=r'log.csv: column "F1 \[N\]" is given for F1 and for F2; .*choose another'):
+        so.read_log(file, time="t [s]", channels={"F1": "F1 [N]", "F2": so.Column(column="F1 [N]", scale=-1.0)})
+    frame = so.read_log(file, time="t [s]").to_polars()
+    with pytest.raises(LogError, match=r'frame: column "F1 \[N\]" is given for a and for b'):
+        so.Log.from_frame(frame, channels={"a": "F1 [N]", "b": "F1 [N]"})
+
+
+def test_one_column_for_an_angle_and_a_length_is_noted(csv):
+    file = csv("t [s],enc [rad],I [A]\n0,0.1,1\n0.1,0.2,2\n0.2,0.4,1\n")
+    channels = {"theta": "enc [rad]", "q": so.Column(column="enc [rad]", unit="m", scale=5e-4), "I": "I [A]"}
+    log = so.read_log(file, time="t [s]", channels=channels)
+    np.testing.assert_allclose(log["q"], 5e-4 * log["theta"])
+    assert log.notes == ('theta and q are the same column "enc [rad]", in rad and in m',)
+    assert log.notes[0] in quality(log).notes
