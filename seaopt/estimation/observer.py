@@ -128,9 +128,10 @@ def kalman_gain(
 
     """
     with np.errstate(all="ignore"):
-        if not np.all(np.isfinite(a)) or not np.all(np.isfinite(c)):
+        told = c / np.sqrt(r)[:, None]
+        if not np.all(np.isfinite(a)) or not np.all(np.isfinite(told)):
             return np.full((len(a), a.shape[1], c.shape[1]), np.nan)
-        to, back = _seen(a, c / np.sqrt(r)[:, None])
+        to, back = _seen(a, told)
         noise = (to * q[:, None, :]) @ to.transpose(0, 2, 1)
         return back @ _observable_gain(to @ a @ back, c @ back, noise, r)
 
