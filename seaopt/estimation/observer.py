@@ -140,13 +140,15 @@ def _seen(
     a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
 ) -> tuple[Float[np.ndarray, "t m nx"], Float[np.ndarray, "t nx m"]]:
     """Return the map of each plant's states to those that the outputs show, and a map back; m is the first plant's."""
-    rows, power = c, a
+    growth = np.max(np.abs(np.linalg.eigvals(a)), axis=1)
+    rows, power = (
+        c,
+        a / np.maximum(growth, 1.0)[:, None, None],
+    )  # scaled, an unstable plant shows what it shows unscaled
     for _ in range(HORIZON):
-        after = np.concatenate([rows, rows @ power], axis=1)
-        after = np.linalg.qr(after, mode="r") if after.shape[1] > a.shape[1] else after
-        if not np.all(np.isfinite(after)) or not np.all(np.isfinite(power)):
-            break  # an unstable plant: it has shown itself
-        rows, power = after, power @ power
+        rows = np.concatenate([rows, rows @ power], axis=1)
+        rows = np.linalg.qr(rows, mode="r") if rows.shape[1] > a.shape[1] else rows
+        power = power @ power
     scale = np.linalg.norm(rows, axis=1)
     scale = np.where(scale > 0.0, scale, 1.0)
     _, values, vectors = np.linalg.svd(rows / scale[:, None, :])
