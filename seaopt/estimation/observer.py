@@ -140,24 +140,30 @@ def _seen(
     a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
 ) -> tuple[Float[np.ndarray, "t m nx"], Float[np.ndarray, "t nx m"]]:
     """Return the map of each plant's states to those that the outputs show, and a map back; m is the first plant's."""
-    growth = np.max(np.abs(np.linalg.eigvals(a)), axis=1)
-    rows, power = (
-        c,
-        a / np.maximum(growth, 1.0)[:, None, None],
-    )  # scaled, an unstable plant shows what it shows unscaled
-    for _ in range(HORIZON):
-        rows = np.concatenate([rows, rows @ power], axis=1)
-        rows = np.linalg.qr(rows, mode="r") if rows.shape[1] > a.shape[1] else rows
-        power = power @ power
-    scale = np.linalg.norm(rows, axis=1)
-    scale = np.where(scale > 0.0, scale, 1.0)
-    _, values, vectors = np.linalg.svd(rows / scale[:, None, :])
+    _, values, _ = _shown(a[:1], c[:1])
     rank = max(int(np.count_nonzero(values[0] > UNSEEN * values[0, 0])), 1)
     if rank == a.shape[1]:
         one = np.broadcast_to(np.eye(rank), a.shape)
         return one, one
+    scale, _, vectors = _shown(a, c)
     chosen = vectors[:, :rank]
     return chosen * scale[:, None, :], (chosen / scale[:, None, :]).transpose(0, 2, 1)
+
+
+def _shown(
+    a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
+) -> tuple[Float[np.ndarray, "t nx"], Float[np.ndarray, "t m"], Float[np.ndarray, "t nx nx"]]:
+    """Return how much the outputs of 2^HORIZON samples show of each state, and, of states so scaled, the directions."""
+    growth = np.max(np.abs(np.linalg.eigvals(a)), axis=1)
+    rows, power = c, a / np.maximum(growth, 1.0)[:, None, None]  # an unstable plant so scaled shows the same states
+    for number in range(1, HORIZON + 1):
+        rows, power = np.concatenate([rows, rows @ power], axis=1), power @ power
+        if number % 4 == 0:
+            rows = np.linalg.qr(rows, mode="r")
+    scale = np.linalg.norm(rows, axis=1)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, values, vectors = np.linalg.svd(rows / scale[:, None, :])
+    return scale, values, vectors
 
 
 def _observable_gain(
