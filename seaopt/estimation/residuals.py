@@ -12,9 +12,10 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
           c^* = c - \tfrac12 g_\nu^T H_{\nu\nu}^{-1} g_\nu, \qquad
           g_\zeta^* = g_\zeta - H_{\zeta\nu} H_{\nu\nu}^{-1} g_\nu .
 
-Process noise is an unknown through :math:`\lambda`, the logarithm of its standard deviation; the residuals follow its
-variance :math:`w = e^{2\lambda}`, so that :math:`c_{\lambda\lambda} = 4 w^2 c_{ww} + 2 c_\lambda`. Gauss and Newton see
-the first term alone; the second rules where noise is hardly there, and is added where it is positive.
+Process noise is an unknown through :math:`\lambda`, the logarithm of its standard deviation. Where it is hardly there the
+residuals follow its variance :math:`w = e^{2\lambda}`, so that :math:`c_{\lambda\lambda} = 4 w^2 c_{ww} + 2 c_\lambda`;
+where it rules they follow 1/w, which turns the sign of the last term. Gauss and Newton see the first term alone, which
+dies out on either side: :math:`2 |c_\lambda|` is added, or steps overshoot and the region shrinks for all unknowns.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ class Residuals:
             gradient, hessian = gradient + own[0, 1:], hessian + own[1:, 1:]
             cost += sum(float(np.sum(found.loss[0] / self.sigma[e] ** 2)) for found in row)
             for slot in unknowns.locals_of[e].noise:
-                hessian[slot.index, slot.index] += 2.0 * max(own[0, 1 + slot.index], 0.0)  # see above
+                hessian[slot.index, slot.index] += 2.0 * abs(own[0, 1 + slot.index])  # see above
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
         moved = np.zeros(n)
