@@ -189,6 +189,23 @@ def test_noise_that_is_not_there_does_not_slow_the_search(stand, thor):
     so.testing.assert_recovered(fit, thor, sigmas=4)
 
 
+def test_noise_that_rules_a_state_does_not_slow_the_search(thor):
+    """Forces on two free masses that no log has: the speed of one is all noise, and the rest is told as far as it can."""
+    plant = so.plants.two_link("mass", "mass")
+    truth = plant.complete(thor)
+    driven = so.virtual_log(plant, truth, (Noise(std=1.0, band_hz=60.0),), duration_s=10, rate_hz=400, seed=3)
+    rng = np.random.default_rng(0)
+    forces = {name: 5.0 * rng.normal(size=len(driven)) for name in ("Fe1", "Fe2")}
+    run = so.simulate(plant, truth, so.Log.from_arrays(time=driven.time, I=driven["I"], **forces))
+    seen = {name: run[name] + 0.5 * rng.normal(size=len(driven)) for name in ("F1", "F2")}
+    log = so.Log.from_arrays(time=driven.time, I=driven["I"], **seen)
+    start = truth.update(J=1e-5, b_r=5e-4, eta=0.4, m_1=4.0, m_2=20.0).free("J", "b_r", "eta", "m_1", "m_2")
+    fit = so.fit([experiment(plant, log)], start, method=so.PredictionError())
+    assert fit.status == "converged"
+    assert fit.iterations < 80
+    so.testing.assert_recovered(fit, truth, sigmas=4)
+
+
 def test_the_published_bad_start_is_overcome():
     """EMPS: single shooting and nlgreyest recover none of these; the benchmark runs a hundred."""
     sys.path.insert(0, str(PROBLEMS))
