@@ -13,9 +13,10 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
           g_\zeta^* = g_\zeta - H_{\zeta\nu} H_{\nu\nu}^{-1} g_\nu .
 
 Process noise is an unknown through :math:`\lambda`, the logarithm of its standard deviation. Where it is hardly there
-the residuals follow its variance :math:`w = e^{2\lambda}`, so that :math:`c_{\lambda\lambda} = 4 w^2 c_{ww} + 2 c_\lambda`;
-where it rules they follow 1/w, which turns the sign of the last term. Gauss and Newton see the first term alone, which
-dies out on either side: :math:`2 |c_\lambda|` is added, or steps overshoot and the region shrinks for all unknowns.
+the residuals follow its variance :math:`w = e^{2\lambda}`, so that
+:math:`c_{\lambda\lambda} = 4 w^2 c_{ww} + 2 c_\lambda`; where it rules they follow 1/w, which turns the sign of the
+last term. Gauss and Newton see the first term alone, which dies out on either side: :math:`2 |c_\lambda|` is added, or
+steps overshoot and the region shrinks for all unknowns.
 """
 
 from __future__ import annotations

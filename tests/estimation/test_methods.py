@@ -190,7 +190,7 @@ def test_noise_that_is_not_there_does_not_slow_the_search(stand, thor):
 
 
 def test_noise_that_rules_a_state_does_not_slow_the_search(thor):
-    """Forces on two free masses that no log has: the speed of one is all noise, and the rest is told as far as it can."""
+    """Forces on two free masses that no log has: the speed of one is all noise, the rest is told."""
     plant = so.plants.two_link("mass", "mass")
     truth = plant.complete(thor)
     driven = so.virtual_log(plant, truth, (Noise(std=1.0, band_hz=60.0),), duration_s=10, rate_hz=400, seed=3)
