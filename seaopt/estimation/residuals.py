@@ -180,8 +180,8 @@ class Residuals:
             own = self.normal(e, row)
             gradient, hessian = gradient + own[0, 1:], hessian + own[1:, 1:]
             cost += sum(float(np.sum(found.loss[0] / self.sigma[e] ** 2)) for found in row)
-            for slot in unknowns.locals_of[e].noise:
-                hessian[slot.index, slot.index] += 2.0 * abs(own[0, 1 + slot.index])  # see above
+            noise = [slot.index for slot in unknowns.locals_of[e].noise if slot.index is not None]
+            hessian[noise, noise] += 2.0 * np.abs(own[0, 1:][noise])  # see above
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
         moved = np.zeros(n)
