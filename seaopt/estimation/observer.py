@@ -20,7 +20,9 @@ from seaopt.simulation import Model, Point, transition
 from seaopt.simulation.discretisation import expm_with_derivatives
 
 DOUBLINGS = 60
-LEAK = 1e-6  # a sample: what drifts unseen, as the place of a free body under force sensors, is forgotten in the end
+LEAK = 1e-6  # a sample: what drifts and is hardly seen is forgotten in the end
+HORIZON = 12  # doublings: samples over which an output may show a state
+UNSEEN = 1e-8  # singular values below this part of the largest belong to what no output shows
 DISTRUST = float(np.log(0.1))  # process noise, over each state's size, of a filter that hardly trusts the plant
 RATE_LIMIT = 0.3  # a sample: dry friction at rest looks like a damping that would forget the speed within a sample
 NEIGHBOUR = 1e-6  # relative step of the differences
@@ -114,6 +116,9 @@ def kalman_gain(
 ) -> Float[np.ndarray, "t nx ny"]:  # fmt: skip
     """Return the predictor's steady-state gain of each plant; not finite where there is none.
 
+    What no output shows, as the place of a free body under force sensors, would drift without bound: it is left out of
+    the filter and not corrected.
+
     Parameters
     ----------
     a, c : arrays
@@ -122,23 +127,64 @@ def kalman_gain(
         Variances of the process noise, one a state, and of the measurement noise, one an output.
 
     """
-    nx = a.shape[1]
-    one = np.eye(nx)
     with np.errstate(all="ignore"):
-        x, g, h = (1.0 - LEAK) * a.transpose(0, 2, 1), c.transpose(0, 2, 1) @ (c / r[:, None]), q[:, :, None] * one
-        for _ in range(DOUBLINGS):
-            if not np.all(np.isfinite(h)) or not np.all(np.isfinite(g)):
-                return np.full((len(a), nx, c.shape[1]), np.nan)
-            w = _inverse(one + g @ h)
-            after = h + x.transpose(0, 2, 1) @ h @ w @ x
-            g = g + x @ w @ g @ x.transpose(0, 2, 1)
-            x = x @ w @ x
-            done = np.max(np.abs(after - h)) <= 1e-14 * np.max(np.abs(after))
-            h = after
-            if done:
-                break
-        cross = a @ h @ c.transpose(0, 2, 1)
-        return cross @ _inverse(c @ h @ c.transpose(0, 2, 1) + np.diag(r))
+        told = c / np.sqrt(r)[:, None]
+        if not np.all(np.isfinite(a)) or not np.all(np.isfinite(told)):
+            return np.full((len(a), a.shape[1], c.shape[1]), np.nan)
+        to, back = _seen(a, told)
+        noise = (to * q[:, None, :]) @ to.transpose(0, 2, 1)
+        return back @ _observable_gain(to @ a @ back, c @ back, noise, r)
+
+
+def _seen(
+    a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
+) -> tuple[Float[np.ndarray, "t m nx"], Float[np.ndarray, "t nx m"]]:
+    """Return the map of each plant's states to those that the outputs show, and a map back; m is the first plant's."""
+    _, values, _ = _shown(a[:1], c[:1])
+    rank = max(int(np.count_nonzero(values[0] > UNSEEN * values[0, 0])), 1)
+    if rank == a.shape[1]:
+        one = np.broadcast_to(np.eye(rank), a.shape)
+        return one, one
+    scale, _, vectors = _shown(a, c)
+    chosen = vectors[:, :rank]
+    return chosen * scale[:, None, :], (chosen / scale[:, None, :]).transpose(0, 2, 1)
+
+
+def _shown(
+    a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
+) -> tuple[Float[np.ndarray, "t nx"], Float[np.ndarray, "t m"], Float[np.ndarray, "t nx nx"]]:
+    """Return how much the outputs of 2^HORIZON samples show of each state, and, of states so scaled, the directions."""
+    growth = np.max(np.abs(np.linalg.eigvals(a)), axis=1)
+    rows, power = c, a / np.maximum(growth, 1.0)[:, None, None]  # an unstable plant so scaled shows the same states
+    for number in range(1, HORIZON + 1):
+        rows, power = np.concatenate([rows, rows @ power], axis=1), power @ power
+        if number % 4 == 0:
+            rows = np.linalg.qr(rows, mode="r")
+    scale = np.linalg.norm(rows, axis=1)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, values, vectors = np.linalg.svd(rows / scale[:, None, :])
+    return scale, values, vectors
+
+
+def _observable_gain(
+    a: Float[np.ndarray, "t m m"], c: Float[np.ndarray, "t ny m"], q: Float[np.ndarray, "t m m"],
+    r: Float[np.ndarray, " ny"],
+) -> Float[np.ndarray, "t m ny"]:  # fmt: skip
+    one = np.eye(a.shape[1])
+    x, g, h = (1.0 - LEAK) * a.transpose(0, 2, 1), c.transpose(0, 2, 1) @ (c / r[:, None]), q
+    for _ in range(DOUBLINGS):
+        if not np.all(np.isfinite(h)) or not np.all(np.isfinite(g)):
+            return np.full((len(a), a.shape[1], c.shape[1]), np.nan)
+        w = _inverse(one + g @ h)
+        after = h + x.transpose(0, 2, 1) @ h @ w @ x
+        g = g + x @ w @ g @ x.transpose(0, 2, 1)
+        x = x @ w @ x
+        done = np.max(np.abs(after - h)) <= 1e-14 * np.max(np.abs(after))
+        h = after
+        if done:
+            break
+    cross = a @ h @ c.transpose(0, 2, 1)
+    return cross @ _inverse(c @ h @ c.transpose(0, 2, 1) + np.diag(r))
 
 
 def _inverse(matrices: Float[np.ndarray, "t n n"]) -> Float[np.ndarray, "t n n"]:

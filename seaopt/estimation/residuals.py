@@ -11,6 +11,12 @@ Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973, in Kaufman's form):
 .. math:: \nu^* = \nu - H_{\nu\nu}^{-1} g_\nu, \qquad
           c^* = c - \tfrac12 g_\nu^T H_{\nu\nu}^{-1} g_\nu, \qquad
           g_\zeta^* = g_\zeta - H_{\zeta\nu} H_{\nu\nu}^{-1} g_\nu .
+
+Process noise is an unknown through :math:`\lambda`, the logarithm of its standard deviation. Where it is hardly there
+the residuals follow its variance :math:`w = e^{2\lambda}`, so that
+:math:`c_{\lambda\lambda} = 4 w^2 c_{ww} + 2 c_\lambda`; where it rules they follow 1/w, which turns the sign of the
+last term. Gauss and Newton see the first term alone, which dies out on either side: :math:`2 |c_\lambda|` is added, or
+steps overshoot and the region shrinks for all unknowns.
 """
 
 from __future__ import annotations
@@ -35,6 +41,7 @@ if TYPE_CHECKING:
 
 CHUNK = 1 << 14  # samples whose sums stay in a core's cache
 WATCHED = 8_000  # first samples that tell the integration error in an output, and a filter's sizes and places
+LOST = 1e-3  # below zero: a sum of squares that is nothing but rounding of a far larger one
 ALONE = 8_000  # samples below which experiments are not worth a thread each
 
 
@@ -173,12 +180,15 @@ class Residuals:
             own = self.normal(e, row)
             gradient, hessian = gradient + own[0, 1:], hessian + own[1:, 1:]
             cost += sum(float(np.sum(found.loss[0] / self.sigma[e] ** 2)) for found in row)
+            noise = [slot.index for slot in unknowns.locals_of[e].noise if slot.index is not None]
+            hessian[noise, noise] += 2.0 * np.abs(own[0, 1:][noise])  # see above
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
         moved = np.zeros(n)
         if finite and np.any(linear):
             moved[linear] = -solved(hessian[np.ix_(linear, linear)], gradient[linear], 1e-13)
             cost += 0.5 * float(moved @ gradient)
+            finite = finite and cost > -LOST
             gradient = np.where(linear, 0.0, gradient + hessian @ moved)
         squares, counts = self._sums(passes, moved)
         return Evaluation(
