@@ -8,7 +8,7 @@ first plant that has the part; the other plants get that mass.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,40 @@ from seaopt.plants import Plant, state_space
 
 MAX_REJECTION = 200
 SCREW_MODE, SCREW_MASS = "screw_mode_hz", "m_n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Varied:
+    """One thing that is drawn, SI.
+
+    Parameters
+    ----------
+    name, unit : str
+    value : float or None
+        Nominal; None where there is none (`screw_mode_hz`).
+    std : float or None
+        Of a Gaussian, correlated as in the fit and cut at `low` and `high`; None of a uniform range.
+    low, high : float
+
+    """
+
+    name: str
+    unit: str
+    value: float | None
+    std: float | None
+    low: float
+    high: float
+
+    @property
+    def outside(self) -> bool:
+        """Whether the nominal value lies outside a range."""
+        return self.std is None and self.value is not None and not self.low <= self.value <= self.high
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "-" else f" {self.unit}"
+        if self.std is None:
+            return f"{self.name} {self.low:.4g} to {self.high:.4g}{unit}"
+        return f"{self.name} {self.value:.5g} +- {self.std:.2g}{unit}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,6 +72,8 @@ class Uncertainty:
         Uniform, independent of the rest.
     screw : (frequencies, masses)
         Which effective mass m_n puts the screw's mode where, ascending in frequency; for a range of screw_mode_hz.
+    units : mapping of name to str
+        Of the ranges that `nominal` has no value of.
 
     """
 
@@ -46,17 +82,33 @@ class Uncertainty:
     covariance: Float[np.ndarray, "n n"]
     ranges: Mapping[str, tuple[float, float]]
     screw: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]] = (np.empty(0), np.empty(0))
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @property
     def size(self) -> int:
         """Number of coordinates: of the Gaussian part, then of the ranges."""
         return len(self.names) + len(self.ranges)
 
+    def varied(self) -> tuple[Varied, ...]:
+        """Return what is drawn and how, the Gaussian part first."""
+        stds, known = np.sqrt(np.diag(self.covariance)), dict(self.nominal)
+        found = [
+            Varied(name=name, unit=item.unit, value=item.value, std=float(std), low=item.min, high=item.max)
+            for name, std in zip(self.names, stds, strict=True)
+            for item in (self.nominal[name],)
+        ]
+        for name, (low, high) in self.ranges.items():
+            item = known.get(name)
+            unit = self.units.get(name, "-") if item is None else item.unit
+            value = item.value if item is not None else None if name == SCREW_MODE else 0.0
+            found.append(Varied(name=name, unit=unit, value=value, std=None, low=low, high=high))
+        return tuple(found)
+
     def draw(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n k"]:
         """Return `count` draws as coordinates; Gaussian draws outside a bound are drawn again.
 
-        A coordinate of the Gaussian part is in standard deviations along a principal axis; one of a range runs from
-        -1 to 1.
+        A coordinate of the Gaussian part is in standard deviations along a principal axis of the correlation; one of a
+        range runs from -1 to 1.
 
         Raises
         ------
@@ -121,6 +173,8 @@ class Uncertainty:
         values = self._gaussian(coordinates)
         for j, (name, row) in enumerate(zip(self.names, self._factor(), strict=True)):
             item, std = self.nominal[name], float(np.linalg.norm(row))
+            if std == 0.0:
+                continue
             normal = np.concatenate([row, np.zeros(len(self.ranges))]) / std
             if np.isfinite(item.max):
                 yield normal, (item.max - values[:, j]) / std
@@ -128,9 +182,15 @@ class Uncertainty:
                 yield -normal, (values[:, j] - item.min) / std
 
     def _factor(self) -> Float[np.ndarray, "g g"]:
-        """Return the covariance's factor: standard deviations along principal axes to parameters."""
-        values, vectors = np.linalg.eigh(self.covariance)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
+        """Return the covariance's factor, coordinates to parameters: standard deviations times the correlation's root.
+
+        Of the correlation, whose entries are alike: the eigenvalues of a covariance in m, N/m and kg m^2 span so many
+        decades that the small ones would be rounding.
+        """
+        std = np.sqrt(np.diag(self.covariance))
+        scale = np.where(std > 0.0, std, 1.0)
+        values, vectors = np.linalg.eigh(self.covariance / scale / scale[:, None])
+        return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
     def _gaussian(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
         mean = np.array(self.nominal.values_of(self.names))
@@ -181,11 +241,31 @@ def uncertainty(
     every = (*names, *stds)
     used = [i for i, name in enumerate(every) if name not in ranges and name in known and np.isfinite(whole[i, i])]
     nominal = nominal.with_parameters(*others.values())
+    _check_inside(ranges, nominal)
     screw = _screw_masses(plants, nominal, ranges[SCREW_MODE]) if SCREW_MODE in ranges else (np.empty(0), np.empty(0))
     return Uncertainty(
         nominal=nominal, names=tuple(every[i] for i in used), covariance=whole[np.ix_(used, used)],
-        ranges=dict(ranges), screw=screw,
+        ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, screw=screw,
+        units=_units(plants),
     )  # fmt: skip
+
+
+def _units(plants: Mapping[str, Plant]) -> dict[str, str]:
+    """Return the units of what a range may name."""
+    own = {name: plant.parameter_unit(name) for plant in plants.values() for name in plant.parameters}
+    return {SCREW_MODE: "Hz", **own} | {name: item.unit for name, item in conditions(tuple(plants.values())).items()}
+
+
+def _check_inside(ranges: Mapping[str, tuple[float, float]], nominal: ParameterSet) -> None:
+    """Refuse ranges beyond the given parameters' own bounds, which may be narrower than the plant's."""
+    known = dict(nominal)
+    for name, (low, high) in ranges.items():
+        item = known.get(name)
+        if item is not None and (low < item.min or high > item.max):
+            raise ControlError(
+                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{item.min:g}, {item.max:g}] of the given "
+                "parameters; keep inside them, or widen them"
+            )
 
 
 def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]) -> None:
@@ -211,6 +291,11 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
         if not low <= high:
             raise ControlError(f"range of {name} = [{low:g}, {high:g}] is empty; give [low, high]")
         item = extra.get(name) or parameters.get(name)
+        if item is not None and item.unit == "rad" and name in extra and max(-low, high) > np.pi:
+            raise ControlError(
+                f"range of {name} = [{low:g}, {high:g}] is more than half a turn; angles are in rad, "
+                f"30 deg is {np.radians(30):.4g}"
+            )
         if item is not None and (low < item.min or high > item.max):
             raise ControlError(
                 f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{item.min:g}, {item.max:g}]; "
@@ -223,7 +308,7 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
 def _ends(name: str, given: Any) -> tuple[float, float]:
     """Return low and high of what should be two numbers."""
     pair = list(given) if isinstance(given, (list, tuple, np.ndarray)) else []
-    if len(pair) != 2 or not all(isinstance(item, (int, float, np.number)) for item in pair):
+    if len(pair) != 2 or any(isinstance(item, bool) or not isinstance(item, (int, float, np.number)) for item in pair):
         raise ControlError(f"range of {name} = {' '.join(repr(given).split())} is not a range; give (low, high)")
     return float(pair[0]), float(pair[1])
 
