@@ -1,16 +1,18 @@
 r"""The worst case: the parameters, of all that the fit and the ranges allow, with the largest Ms or spectral radius.
 
 The set is an ellipsoid of the fit's covariance that holds `LEVEL` of its probability, cut by the physical bounds, times
-the box of the ranges. From the worst draws, each round takes the exact gradient of how much of the limits a point uses
-(`seaopt.robustness.severity`) and tries points along it and towards the vertex of the set that it points to (Frank,
-Wolfe, Naval Research Logistics 3, 1956), all starts of a round in one batch. What it finds is a lower bound on the true
-worst case: a witness, checked by `Worst.verify`, and no proof that there is none worse.
+the box of the ranges. From the worst draws and vertices of the ranges, those first that are apart, each round takes the
+exact gradient of how much of the limits a point uses (`seaopt.robustness.severity`) and tries points along it, towards
+the vertex of the set that it points to (Frank, Wolfe, Naval Research Logistics 3, 1956) and about the point, all starts
+of a round in one batch. What it finds is a lower bound on the true worst case: a witness, checked by `Worst.verify`,
+and no proof that there is none worse.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
@@ -25,15 +27,19 @@ from seaopt.robustness.severity import limits, severities, severity_slopes
 
 LEVEL = 0.999
 STARTS = 8
+CORNERS = 64  # vertices of the ranges looked at
+APART = 0.5  # of half a range, or of the ellipsoid's radius
 ROUNDS = 30
 VERTEX_STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.01])
 GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
+PROBE_STEPS = np.repeat(np.array([0.3, 0.1, 0.03, 0.01]), 3)
 ON_BOUND = 1e-8  # of a physical bound, in standard deviations
 MATCH = 1e-6
 ROUNDING = 1e-6
 
 Slopes = Float[np.ndarray, "s k"]
 Trials = Float[np.ndarray, "s t k"]
+Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,10 +123,11 @@ def find_worst(
     """
     points, scores = drawn, severity
     if unknown.size:
-        order = np.argsort(severity)[::-1]
-        best = order[: min(STARTS, order.size)]
-        found, value = _search(controller, plant, unknown, _into_set(unknown, drawn[best]))
-        points, scores = np.vstack([drawn[best[:1]], found]), np.concatenate([severity[best[:1]], value])
+        score = _score(controller, plant, unknown)
+        starts = _into_set(unknown, np.vstack([drawn, _corners(unknown)]))
+        found, value = _search(controller, plant, unknown, _spread(unknown, starts, score(starts)), score)
+        worst = np.argsort(severity)[::-1][:1]
+        points, scores = np.vstack([drawn[worst], found]), np.concatenate([severity[worst], value])
     k = int(np.argmax(scores)) if scores.size else 0
     at = unknown.values(points[k : k + 1]) if unknown.size else {}
     return witnessed(controller, plant, unknown.nominal, {name: float(item[0]) for name, item in at.items()})
@@ -145,19 +152,50 @@ def witnessed(controller: Controller, plant: Plant, nominal: ParameterSet, at: M
     return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))
 
 
-def _search(
-    controller: Controller, plant: Plant, unknown: Uncertainty, x: Float[np.ndarray, "s k"]
-) -> tuple[Float[np.ndarray, "s k"], Float[np.ndarray, " s"]]:
-    """Climb from every start until none gets worse."""
+def _score(controller: Controller, plant: Plant, unknown: Uncertainty) -> Score:
+    """Return the function that tells how bad points are, those outside the bounds not at all."""
 
     def score(points: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " m"]:
         found = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
         return np.where(unknown.inside(points), severities(controller, found), -np.inf)
 
-    value = score(x)
+    return score
+
+
+def _corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
+    """Return vertices of the ranges, the Gaussian part at its mean: all of them, or a fixed choice of many."""
+    size, rng = len(unknown.ranges), np.random.default_rng(0)
+    if 2**size <= CORNERS:
+        signs = np.array(list(product((-1.0, 1.0), repeat=size))).reshape(2**size, size)
+    else:
+        signs = rng.choice((-1.0, 1.0), (CORNERS, size))
+    return np.hstack([np.zeros((len(signs), len(unknown.names))), signs])
+
+
+def _spread(
+    unknown: Uncertainty, points: Float[np.ndarray, "n k"], severity: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "s k"]:
+    """Return the worst points that are apart, then the worst of the others: one valley must not take all starts."""
+    scaled = points.copy()
+    scaled[:, : len(unknown.names)] /= max(_radius(len(unknown.names)), 1.0)
+    order = list(np.argsort(severity)[::-1])
+    kept: list[int] = []
+    for i in order:
+        apart = all(np.max(np.abs(scaled[i] - scaled[j])) > APART for j in kept)
+        if apart and len(kept) < STARTS and np.isfinite(severity[i]):
+            kept.append(i)
+    kept += [i for i in order if i not in kept][: max(STARTS - len(kept), 0)]
+    return points[kept]
+
+
+def _search(
+    controller: Controller, plant: Plant, unknown: Uncertainty, x: Float[np.ndarray, "s k"], score: Score
+) -> tuple[Float[np.ndarray, "s k"], Float[np.ndarray, " s"]]:
+    """Climb from every start until none gets worse."""
+    value, rng = score(x), np.random.default_rng(0)
     for _ in range(ROUNDS):
         slope = _inward(unknown, x, severity_slopes(controller, plant, unknown, x))
-        trials = _trials(unknown, x, slope)
+        trials = _trials(unknown, x, slope, rng)
         scores = score(trials.reshape(-1, x.shape[1])).reshape(trials.shape[:2])
         best = np.argmax(scores, axis=1)
         rows = np.arange(x.shape[0])
@@ -178,8 +216,11 @@ def _inward(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) ->
     return slope
 
 
-def _trials(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) -> Trials:
-    """Return points towards the set's vertex in the slope's direction, and along the slope."""
+def _trials(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes, rng: np.random.Generator) -> Trials:
+    """Return points towards the set's vertex in the slope's direction, along the slope, and at random about x.
+
+    The last for the ridge between two peaks of S, where neither peak's slope leads up.
+    """
     g = len(unknown.names)
     size = np.linalg.norm(slope, axis=1, keepdims=True)
     unit = slope / np.maximum(size, 1e-300)
@@ -187,7 +228,8 @@ def _trials(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) ->
     vertex = np.hstack([_radius(g) * unit[:, :g] / np.maximum(inner, 1e-300), np.sign(unit[:, g:])])
     towards = x[:, None] + VERTEX_STEPS[:, None] * (vertex - x)[:, None]
     along = x[:, None] + GRADIENT_STEPS[:, None] * unit[:, None]
-    whole = np.concatenate([towards, along], axis=1)
+    about = x[:, None] + PROBE_STEPS[:, None] * rng.normal(size=(x.shape[0], PROBE_STEPS.size, x.shape[1]))
+    whole = np.concatenate([towards, along, about], axis=1)
     return _cut(unknown, x, _into_set(unknown, whole.reshape(-1, x.shape[1])).reshape(whole.shape))
 
 
