@@ -15,6 +15,7 @@ from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import resting_on
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.robustness.draws import Varied
 from seaopt.robustness.nominal import PlantMargins, plant_margins
 from seaopt.robustness.simulated import Simulated, simulated
 from seaopt.robustness.verification import witness
@@ -22,6 +23,7 @@ from seaopt.robustness.worst import Worst, witnessed
 
 SCHEMA = "seaopt/robustness/1"
 SIMULATION = "simulation_failures"
+DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
     "disk_margin", "noise_gain", "spectral_radius",
@@ -38,16 +40,42 @@ class Requirement:
     met: bool
     where: str
 
+    @property
+    def sense(self) -> str:
+        """What the value must be to the limit: the bandwidth is placed, a `min_` and passivity are floors."""
+        if self.name == "bandwidth_hz":
+            return "="
+        return "≥" if self.name.startswith("min_") or self.name == "passive_band_hz" else "≤"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MonteCarlo:
-    """Draws and failures; with `confidence`, the probability of failure is below `failure_probability_bound`."""
+    """Draws and failures; with `confidence`, the probability of failure is below `failure_probability_bound`.
+
+    Of the failures, `unstable` draws are so on some plant; of the others, `over_ms` break Ms, and `over_mt` Mt alone.
+    """
 
     samples: int
     failures: int
     seed: int
     failure_probability_bound: float
     confidence: float
+    unstable: int = 0
+    over_ms: int = 0
+    over_mt: int = 0
+
+    def __str__(self) -> str:
+        if not self.samples:
+            return "no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
+        counts = ((self.unstable, "unstable"), (self.over_ms, "over Ms"), (self.over_mt, "over Mt"))
+        kinds = ", ".join(f"{count} {kind}" for count, kind in counts if count)
+        head = f"{self.failures} failures in {self.samples} draws" + (f" ({kinds})" if kinds else "")
+        if self.failures == self.samples:
+            return head
+        return (
+            f"{head}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
+            f"{_confidence(self.confidence)}"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,6 +96,8 @@ class Certificate:
         that `tune(..., robust_to=certificate.worst)` takes them back.
     monte_carlo : MonteCarlo
         Over all plants: a draw fails if it fails on any of them.
+    varied : tuple of Varied
+        What the draws and the worst cases vary, and how.
     controller : Controller
         What was certified.
     models : mapping of name to Plant
@@ -86,6 +116,7 @@ class Certificate:
     controller: Controller
     models: Mapping[str, Plant]
     parameters: ParameterSet
+    varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
 
     def with_simulation(
@@ -143,14 +174,18 @@ class Certificate:
             A field is missing or malformed.
 
         """
+        if controller.design is not None:  # certified too where nobody listed it
+            models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
         try:
+            models = {name: models[name] for name in content["plants"]}
             worst = {
                 name: witnessed(controller, models[name], parameters, item["worst"]["parameters"])
                 for name, item in content["plants"].items()
             }
+            requirements = tuple(Requirement(**_infinite(item)) for item in content["requirements"])
             found = cls(
-                passed=bool(content["passed"]),
-                requirements=tuple(Requirement(**_infinite(item)) for item in content["requirements"]),
+                passed=all(item.met for item in requirements),
+                requirements=requirements,
                 plants={name: controller.close(models[name], parameters).figures() for name in worst},
                 margins={name: plant_margins(controller, models[name], parameters) for name in worst},
                 worst=worst,
@@ -158,6 +193,7 @@ class Certificate:
                 controller=controller,
                 models=models,
                 parameters=parameters,
+                varied=tuple(_varied(item) for item in content.get("varied", [])),
             )
             played = content.get("simulation")
             if played is None:
@@ -180,6 +216,7 @@ class Certificate:
                 for name, item in self.plants.items()
             },
             "monte_carlo": _fields(self.monte_carlo),
+            "varied": [_fields(item) for item in self.varied],
             "notes": list(self.notes),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
@@ -188,19 +225,22 @@ class Certificate:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader should know besides the requirements, one sentence each."""
-        return resting_on(self.parameters, {name for plant in self.models.values() for name in plant.parameters})
+        used = {name for plant in self.models.values() for name in plant.parameters}
+        outside = (
+            f"the nominal {item.name} = {item.value:.4g} lies outside its range of {item.low:.4g} to {item.high:.4g}, "
+            "so that no draw is like the nominal plant"
+            for item in self.varied
+            if item.outside
+        )
+        return (*resting_on(self.parameters, used), *outside)
 
     def __repr__(self) -> str:
         lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]
         for name in self.plants:
             lines += self._plant_lines(name)
-        mc = self.monte_carlo
-        lines.append(
-            f"  {mc.failures} failures in {mc.samples} draws: failure probability below "
-            f"{mc.failure_probability_bound:.2%} at a confidence of {_confidence(mc.confidence)}"
-            if mc.samples
-            else "  no draws: nothing is uncertain; give a fit, prior_std or ranges for a statement on robustness"
-        )
+        if self.varied:
+            lines.append(f"  varied: {'; '.join(map(str, self.varied))}")
+        lines.append(f"  {self.monte_carlo}")
         lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
         for item in self.requirements:
             if not item.met:
@@ -266,6 +306,12 @@ def _signed(value: float | None) -> str:
 def _confidence(value: float) -> str:
     rest = 1.0 - value
     return f"1 - {rest:.0e}" if rest < 1e-3 else f"{value:.3%}"
+
+
+def _varied(item: Mapping[str, Any]) -> Varied:
+    """Return what is varied; JSON has no infinity, so that a missing bound is one."""
+    low, high = (-np.inf if item["low"] is None else item["low"]), (np.inf if item["high"] is None else item["high"])
+    return Varied(**{**item, "low": low, "high": high})
 
 
 def _infinite(item: Mapping[str, Any]) -> dict[str, Any]:

@@ -55,7 +55,13 @@ def plant_requirements(controller: Controller, name: str, figures: LoopFigures) 
     """Return what is required of every plant at the nominal parameters."""
     spec = controller.spec
     return [
-        Requirement(name="spectral_radius", limit=1.0, value=figures.spectral_radius, met=figures.stable, where=name),
+        Requirement(
+            name="spectral_radius",
+            limit=1.0,
+            value=figures.spectral_radius,
+            met=figures.stable,
+            where=name if figures.stable else f"{name}: the loop is UNSTABLE",
+        ),
         *_upper("max_sensitivity", spec.max_sensitivity, figures.ms, name),
         *_upper("max_complementary", spec.max_complementary, figures.mt, name),
         *_lower("min_disk_margin", spec.min_disk_margin, figures.disk_margin, name),
@@ -81,7 +87,8 @@ def draw_requirements(result: MonteCarlo, worst: Mapping[str, Worst]) -> list[Re
     name = max(worst, key=lambda key: worst[key].severity)
     found = worst[name]
     where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
-    witness = f"{name}: worst case has Ms {found.ms:.4g}, Mt {found.mt:.4g}" + (f" at {where}" if where else "")
+    size = f"has Ms {found.ms:.4g}, Mt {found.mt:.4g}" if found.severity < UNSTABLE else "is UNSTABLE"
+    witness = f"{name}: worst case {size}" + (f" at {where}" if where else "")
     rows = [
         Requirement(
             name="monte_carlo_failures", limit=0.0, value=float(result.failures), met=result.failures == 0,
@@ -102,6 +109,10 @@ def _worst_requirements(name: str, found: Worst) -> list[Requirement]:
     used = found.severity if found.severity < UNSTABLE else np.inf
     return [
         Requirement(
-            name="worst_case", limit=1.0, value=used, met=met, where=f"{name} at {where}" + ("" if met else REMEDY)
+            name="worst_case",
+            limit=1.0,
+            value=used,
+            met=met,
+            where=f"{name}{'' if found.severity < UNSTABLE else ', UNSTABLE,'} at {where}" + ("" if met else REMEDY),
         )
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -10,9 +11,12 @@ import pytest
 from scipy.stats import beta
 
 import seaopt as so
+from seaopt.control import TransferFunction
 from seaopt.errors import ControlError
+from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
-from seaopt.robustness.draws import check_ranges
+from seaopt.robustness.certify import _digest
+from seaopt.robustness.draws import Uncertainty, check_ranges
 
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25
@@ -196,3 +200,98 @@ def test_a_known_parameters_prior_is_drawn_too(controller, stand, short_log, tho
     fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], known)
     certificate = so.certify(controller, {"stand": stand}, fit, samples=50)
     assert set(certificate.worst["stand"].parameters) == {"J", "k"}
+
+
+def test_draws_have_the_fits_covariance_whatever_the_units_and_the_order():
+    """Entries from 1e-13 to 1e9 in an order that a factor of the covariance itself would lose."""
+    std = np.array([3e4, 1e-7, 1e-5, 2e-9])
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(4, 4))
+    correlation = root @ root.T
+    correlation /= np.sqrt(np.outer(np.diag(correlation), np.diag(correlation)))
+    covariance = correlation * np.outer(std, std)
+    names = ("k_b", "J", "b_r", "c_b")
+    nominal = so.ParameterSet(Parameter(name=name, value=0.0, unit="-") for name in names)
+    unknown = Uncertainty(nominal=nominal, names=names, covariance=covariance, ranges={})
+    points = np.eye(4)
+    moved = unknown.values(points)
+    still = unknown.values(0.0 * points)
+    factor = np.stack([moved[name] - still[name] for name in names])
+    np.testing.assert_allclose(factor @ factor.T / np.outer(std, std), correlation, atol=1e-12)
+
+
+def test_the_design_plant_is_certified_though_nobody_lists_it(controller, stand, swing, thor):
+    """A law whose own plant breaks the limit on a draw must not pass on another plant alone."""
+    heavy = {"J": (3.31e-6, 6e-6)}
+    alone = so.certify(controller, {"swing": swing}, thor, ranges=heavy, samples=50)
+    listed = so.certify(controller, {"design": stand, "swing": swing}, thor, ranges=heavy, samples=50)
+    assert list(alone.plants) == ["design", "swing"]
+    assert alone.worst["design"].ms == pytest.approx(listed.worst["design"].ms, rel=1e-9)
+    assert alone.monte_carlo == listed.monte_carlo
+    again = so.robustness.Certificate.from_dict(alone.to_dict(), controller, {"swing": swing}, alone.parameters)
+    assert repr(again) == repr(alone)
+
+
+def test_another_law_meets_other_draws(controller, swing, thor):
+    """A law tuned with the worst draws of a certificate must not be certified on the same draws."""
+    softer = replace(
+        controller, measurement=TransferFunction(num=0.9 * controller.measurement.num, den=controller.measurement.den)
+    )
+    points = [
+        so.certify(law, {"swing": swing}, thor, ranges={"I_p": (0.2, 0.6)}, samples=1, seed=seed)
+        for law, seed in ((controller, 1), (controller, 1), (controller, 2), (softer, 1))
+    ]
+    assert len({_digest(controller), _digest(softer)}) == 2
+    assert repr(points[0]) == repr(points[1])
+    assert points[0].monte_carlo != points[2].monte_carlo
+
+
+def test_failures_are_told_apart(controller, stand, swing, thor):
+    """Eigenvalues and peaks of each draw, one by one, against the counts."""
+    ranges = {"I_p": (0.002, 0.6), "delay_s": (0.0, 2e-3)}
+    found = so.certify(controller, {"stand": stand, "swing": swing}, thor, ranges=ranges, samples=300).monte_carlo
+    assert found.unstable + found.over_ms + found.over_mt == found.failures
+    assert min(found.unstable, found.over_ms) > 0
+    assert f"{found.unstable} unstable" in str(found)
+
+
+def test_what_is_varied_is_stated(certificate, controller, stand, swing):
+    told = {item.name: item for item in certificate.varied}
+    assert (told["I_p"].low, told["I_p"].high, told["I_p"].std, told["I_p"].unit) == (0.2, 0.6, None, "kg m^2")
+    assert told["J"].std == pytest.approx(2e-9)
+    assert "I_p 0.2 to 0.6 kg m^2" in repr(certificate)
+    plants = {"stand": stand, "swing": swing}
+    again = so.robustness.Certificate.from_dict(certificate.to_dict(), controller, plants, certificate.parameters)
+    assert again.varied == certificate.varied
+
+
+def test_an_edited_verdict_is_not_believed(certificate, controller, stand, swing):
+    content = certificate.to_dict()
+    content["requirements"][0]["met"] = False
+    plants = {"stand": stand, "swing": swing}
+    assert not so.robustness.Certificate.from_dict(content, controller, plants, certificate.parameters).passed
+
+
+def test_a_nominal_value_outside_its_range_is_noted(controller, swing, thor):
+    found = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.5, 0.6)}, samples=5)
+    assert "I_p = 0.36 lies outside its range of 0.5 to 0.6" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"seed": -1}, "seed = -1"),
+        ({"ranges": {"I_p": (True, 2)}}, "give \\(low, high\\)"),
+        ({"ranges": {"phi": (-30, 30)}}, "angles are in rad"),
+        ({"ranges": {"delay_s": (0, 0.5)}}, "500 samples"),
+    ],
+)
+def test_bad_numbers_are_told_in_one_line(controller, swing, thor, options, words):
+    with pytest.raises(ControlError, match=words):
+        so.certify(controller, {"swing": swing}, thor, **{"samples": 5, **options})
+
+
+def test_a_range_beyond_the_given_sets_own_bounds(controller, swing, thor):
+    narrow = thor.with_parameters(replace(thor["I_p"], max=0.5))
+    with pytest.raises(ControlError, match="of the given parameters"):
+        so.certify(controller, {"swing": swing}, narrow, ranges={"I_p": (0.2, 0.6)}, samples=5)

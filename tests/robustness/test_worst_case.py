@@ -146,7 +146,7 @@ def test_a_witness_verifies_itself_and_goes_back_to_the_tuner(controller, stand,
 
 def test_a_worst_case_that_no_draw_hit_fails_the_certificate(controller, swing, thor):
     """The edge lies at an end of the range that five draws miss; the search finds it, and the requirement names it."""
-    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.02, 1.0)}, samples=5, seed=3)
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.02, 1.0)}, samples=5)
     assert certificate.monte_carlo.failures == 0
     assert controller.close(swing, thor.update(I_p=0.02)).figures().ms > 1.6
     (row,) = [item for item in certificate.requirements if not item.met]
@@ -186,7 +186,7 @@ def test_progress_runs_to_the_end(controller, swing, thor):
         controller, {"swing": swing}, thor, ranges={"I_p": (0.2, 0.6)}, samples=50,
         progress=lambda done, of: seen.append((done, of)),
     )  # fmt: skip
-    assert seen[-1] == (50, 50)
+    assert seen[-1] == (100, 100)  # on both plants: the design plant is one
 
 
 @pytest.mark.parametrize(
