@@ -9,6 +9,7 @@ given values, screened, and the best are refined.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.errors import LogError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.frequency import FrequencyResponse, h1
+from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.simulation import Model, linearised
 
 CANDIDATES = 128
@@ -89,15 +90,15 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
     active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
     if len(active) != 1 or len(experiment.stretches) != 1:
         return None
+    whole = [o for o, output in enumerate(experiment.outputs) if np.all(np.isfinite(log[output]))]
+    measured = [log[experiment.outputs[o]] for o in whole]
+    try:
+        estimated = responses(log[active[0]], measured, log.period, stretch_s=_stretch(len(log)) * log.period)
+    except LogError:
+        return None
     chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, " m"]]] = {}
-    for o, output in enumerate(experiment.outputs):
-        if not np.all(np.isfinite(log[output])):
-            continue
-        try:
-            estimate = h1(log[active[0]], log[output], log.period, stretch_s=_stretch(len(log)) * log.period)
-        except LogError:
-            continue
-        low, high = band_hz if band_hz is not None else (0.0, np.inf)
+    low, high = band_hz if band_hz is not None else (0.0, np.inf)
+    for o, estimate in zip(whole, estimated, strict=True):
         f = estimate.frequency_hz
         good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
         if np.count_nonzero(good) >= 8:
@@ -125,6 +126,7 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
     )
 
 
+@lru_cache(maxsize=64)
 def _stretch(n: int) -> int:
     """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
     length = min(n // 16, LONGEST)
@@ -135,8 +137,10 @@ def _stretch(n: int) -> int:
 def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
     """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
     candidates = np.flatnonzero(good)
-    grid = np.geomspace(f[candidates[0]], f[candidates[-1]], POINTS)
-    nearest = np.abs(np.log(f[candidates]) - np.log(grid)[:, None]).argmin(axis=1)
+    places = np.log(f[candidates])
+    grid = np.linspace(places[0], places[-1], POINTS)
+    after = np.clip(np.searchsorted(places, grid), 1, places.size - 1)
+    nearest = np.where(grid - places[after - 1] <= places[after] - grid, after - 1, after)
     return candidates[np.unique(nearest)]
 
 

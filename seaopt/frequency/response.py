@@ -13,7 +13,7 @@ the stretch is long against the plant's memory; models compared with H1 are spre
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,6 +94,14 @@ def h1(
     (True, True)
 
     """
+    return responses(u, (y,), period, stretch_s=stretch_s)[0]
+
+
+def responses(
+    u: Float[np.ndarray, " n"], outputs: Sequence[Float[np.ndarray, " n"]], period: float, *,
+    stretch_s: float | None = None,
+) -> list[FrequencyResponse]:  # fmt: skip
+    """Estimate the frequency responses from u to several outputs: `h1`, with the spectra of u made once."""
     n = u.size
     length = int(n / 16) if stretch_s is None else round(stretch_s / period)
     length = max(length, 16)
@@ -103,19 +111,34 @@ def h1(
         raise LogError("the input is constant; a frequency response needs excitation")
     starts = np.arange(0, n - length + 1, length // 2)
     window = np.hanning(length)
-    suu, syy, suy = np.zeros(length // 2), np.zeros(length // 2), np.zeros(length // 2, dtype=complex)
+    suu, syy = np.zeros(length // 2), np.zeros((len(outputs), length // 2))
+    suy = np.zeros(syy.shape, dtype=complex)
     for batch in np.array_split(starts, -(-starts.size * length // BATCH)):  # long logs in the memory of a batch
-        uf, yf = (_spectra(values, batch, window) for values in (u, y))
-        suu += np.sum(np.abs(uf) ** 2, axis=0) / starts.size
-        syy += np.sum(np.abs(yf) ** 2, axis=0) / starts.size
-        suy += np.sum(np.conj(uf) * yf, axis=0) / starts.size
-    floor = 1e-300
-    return FrequencyResponse(
-        frequency_hz=np.fft.rfftfreq(length, period)[1:],
-        response=suy / np.maximum(suu, floor),
-        coherence=np.abs(suy) ** 2 / np.maximum(suu * syy, floor),
-        averages=int(starts.size),
-    )
+        uf = _spectra(u, batch, window)
+        suu += _power(uf) / starts.size
+        for o, y in enumerate(outputs):
+            yf = _spectra(y, batch, window)
+            syy[o] += _power(yf) / starts.size
+            suy[o] += np.sum(np.conj(uf) * yf, axis=0) / starts.size
+    frequency, floor = np.fft.rfftfreq(length, period)[1:], 1e-300
+    return [
+        FrequencyResponse(
+            frequency_hz=frequency,
+            response=cross / np.maximum(suu, floor),
+            coherence=_square(cross) / np.maximum(suu * power, floor),
+            averages=int(starts.size),
+        )
+        for cross, power in zip(suy, syy, strict=True)
+    ]
+
+
+def _square(values: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return |values|^2; np.abs takes a root first."""
+    return values.real**2 + values.imag**2
+
+
+def _power(spectra: Complex[np.ndarray, "d m"]) -> Float[np.ndarray, " m"]:
+    return np.sum(_square(spectra), axis=0)
 
 
 def _spectra(
