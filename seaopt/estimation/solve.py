@@ -78,7 +78,7 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
         solution = minimise(
             problem.evaluate, here, unknowns.low, unknowns.high, decrement=ROUGH if rough else decrement,
             max_iterations=max(max_iterations - iterations, 1), callback=callback,
-            follow=problem.followed if problem.straight else None, before=before,
+            follow=problem.followed if problem.straight and attempt else None, before=before,  # in true sigmas
         )  # fmt: skip
         here, iterations = solution.evaluation, iterations + solution.iterations
         if not np.isfinite(here.cost):

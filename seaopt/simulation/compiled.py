@@ -38,7 +38,8 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
         ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer),
         ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
         ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
-        ("last", pointer), ("carry", pointer),
+        ("last", pointer), ("carry", pointer), ("into", pointer), ("correlation", pointer), ("ring", pointer),
+        ("form", pointer), ("lags", whole), ("parts", whole),
     ])  # fmt: skip
 
 
@@ -252,6 +253,24 @@ class Program:
             arguments["carry"] = resume.ctypes.data
         self._call(arguments, n)
         return result
+
+    def double_sum(
+        self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
+    ) -> Float[np.ndarray, "p p"]:
+        """Return the sum over t and s of a(t)' R(t - s) a(s), a the influences into v of the samples that count."""
+        ny, p, nc = into.shape
+        width = _padded(p)
+        padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
+        padded[:, :, :p] = into.transpose(0, 2, 1)
+        halved[0] *= 0.5
+        ring, form, start = np.zeros((2 * len(r), ny, width)), np.zeros((width, width)), np.array(x0, dtype=float)
+        arguments = self.base.copy()
+        arguments["to"], arguments["x0"] = self.segment.n, start.ctypes.data
+        arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
+        arguments["ring"], arguments["form"] = ring.ctypes.data, form.ctypes.data
+        arguments["lags"], arguments["parts"] = len(r) - 1, width // 4
+        self._call(arguments, self.segment.n)
+        return (form + form.T)[:p, :p]
 
     def carry(self) -> Float[np.ndarray, " m"]:
         """Return room for what a stretch hands from one call to the next."""
