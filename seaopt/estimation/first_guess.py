@@ -189,7 +189,7 @@ def _refine(
         trial = np.clip(np.where(spread, theta * np.exp(step), theta), low, high)
         trial_cost, trial_gradient, trial_hessian = _misfit(targets, trial, derivatives=True)
         if trial_cost < cost:
-            small = cost - trial_cost < 1e-6 * cost
+            small = cost - trial_cost < 1e-3 * cost  # least squares in time goes on from here
             theta, cost, gradient, hessian = trial, trial_cost, trial_gradient, trial_hessian
             damping = max(damping / 5, 1e-9)
             if small:

@@ -28,6 +28,7 @@ LOSSES = ("square", "huber", "soft_l1")
 THREADS = "seaopt-pass"
 
 
+@lru_cache(maxsize=32)
 def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
     pointer, whole, real = np.uint64, np.int64, np.float64
