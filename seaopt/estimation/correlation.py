@@ -73,10 +73,20 @@ def lagged_size(samples: int, lags: int) -> int:
     return int(transforms()[1](samples + lags, real=True))
 
 
-def lagged_products(x: Float[np.ndarray, "m n"], size: int) -> Complex[np.ndarray, "m m f"]:
-    """Return the spectra of the sums over t of x_a(t) x_b(t - k): they add up, and irfft gives the sums by lag k."""
+def add_lagged_products(total: Complex[np.ndarray, "m m f"], x: Float[np.ndarray, "m n"], size: int) -> None:
+    """Add the spectra of the sums over t of x_a(t) x_b(t - k), b <= a: irfft of `mirrored` gives the sums by lag k."""
     spectrum = np.asarray(transforms()[2](x, size))
-    return spectrum[:, None] * np.conj(spectrum[None])
+    for b, other in enumerate(np.conj(spectrum)):
+        for a in range(b, len(x)):
+            total[a, b] += spectrum[a] * other
+
+
+def mirrored(total: Complex[np.ndarray, "m m f"]) -> Complex[np.ndarray, "m m f"]:
+    """Return the spectra of all pairs from those that `add_lagged_products` made."""
+    full = total.copy()
+    for b in range(len(full)):
+        full[b, b + 1 :] = np.conj(full[b + 1 :, b])
+    return full
 
 
 def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
