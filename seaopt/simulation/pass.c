@@ -48,6 +48,7 @@ typedef struct {
     double *ring;                  /* 2 (1 + lags) x NY x 4 parts: influences of the last samples, zero at first */
     double *form;                  /* 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s) */
     long lags, parts;
+    long warm;                     /* rows from `from` that bring the state about, and are in no sum */
 } seaopt_pass_args;
 
 /* What goes on from one sample to the next. */
@@ -306,7 +307,7 @@ INLINE void influence(const seaopt_pass_args *a, double *const *v, const int *co
             for (int c = 1; counts[o] && c < NC; c++) sum += v[o][c] * into[(o * NC + c) * parts + j];
             here[o * parts + j] = again[o * parts + j] = sum;
         }
-    for (long j = 0; j < parts; j++) {
+    for (long j = 0; j < parts && k >= a->from + a->warm; j++) {
         loose sum[NY][NY];
         memset(sum, 0, sizeof sum);
         const double *r = a->correlation;
@@ -414,7 +415,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
             if (a->sections) filtered(a, v[o], q->filter[o]);
             if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
             present[o] = present[o] && k >= a->start + a->settle;
-            if (a->gram && present[o]) accumulate(a, q, o);
+            if (a->gram && present[o] && k >= a->from + a->warm) accumulate(a, q, o);
         }
         if (a->into && wide == ALL) influence(a, v, present, k);
     }
