@@ -93,7 +93,8 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
     whole = [o for o, output in enumerate(experiment.outputs) if np.all(np.isfinite(log[output]))]
     measured = [log[experiment.outputs[o]] for o in whole]
     try:
-        estimated = responses(log[active[0]], measured, log.period, stretch_s=_stretch(len(log)) * log.period)
+        stretch_s = _stretch(len(log)) * log.period
+        estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
     except LogError:
         return None
     chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, " m"]]] = {}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from seaopt.estimation.correlation import add_lagged_products, lagged_size, ljung_box, mirrored, transforms
 from seaopt.estimation.losses import pull_of
@@ -103,6 +103,14 @@ def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.n
         present &= np.column_stack([mask[chosen] > 0 for mask in piece.keep])
     present[: max(settle - chosen.start, 0)] = False
     return present
+
+
+def count_of(piece: Segment) -> Int[np.ndarray, " ny"]:
+    """Return how many samples of each output are there and have a weight."""
+    present = [np.isfinite(channel) for channel in piece.y]
+    if piece.keep:
+        present = [own & (mask > 0) for own, mask in zip(present, piece.keep, strict=True)]
+    return np.array([np.count_nonzero(own) for own in present])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -252,8 +252,11 @@ def spread_of(values: Float[np.ndarray, " n"]) -> float:
     count, total, square = 0, 0.0, 0.0
     for start in range(0, values.size, CHUNK):
         part = values[start : start + CHUNK] - first
-        part = part[np.isfinite(part)] if not np.all(np.isfinite(part)) else part
-        count, total, square = count + part.size, total + float(np.sum(part)), square + float(np.sum(part**2))
+        level = float(np.sum(part))
+        if not np.isfinite(level):
+            part = part[np.isfinite(part)]
+            level = float(np.sum(part))
+        count, total, square = count + part.size, total + level, square + float(np.einsum("m,m->", part, part))
     return float(np.sqrt(max(square / count - (total / count) ** 2, 0.0)))
 
 
