@@ -297,8 +297,8 @@ typedef double loose __attribute__((vector_size(32), may_alias, aligned(8))); /*
 
 /* The influences a = into v of a sample, and its part of the double sum over the samples before: the ring holds each
    influence twice, so that those of the last lags always stand in a row. */
-INLINE void influence(const seaopt_pass_args *a, double *const *v, const int *counts, long k) {
-    const long parts = a->parts, size = a->lags + 1, slot = (k - a->start) % size;
+INLINE void influence(const seaopt_pass_args *a, double *const *v, const int *counts, long k, long slot, long parts) {
+    const long size = a->lags + 1;
     loose *const here = (loose *)a->ring + (slot + size) * NY * parts, *const again = here - size * NY * parts;
     const loose *into = (const loose *)a->into;
     for (int o = 0; o < NY; o++)
@@ -385,6 +385,7 @@ static void deliver(hot *q, const seaopt_pass_args *a) {
 
 INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     hot here, *const q = &here;
+    long slot = 0; /* of the ring of influences */
     begin(q, a);
     for (long k = a->from; k < a->to; k++) {
         int present[NY];
@@ -417,7 +418,11 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
             present[o] = present[o] && k >= a->start + a->settle;
             if (a->gram && present[o] && k >= a->from + a->warm) accumulate(a, q, o);
         }
-        if (a->into && wide == ALL) influence(a, v, present, k);
+        if (a->into && wide == ALL) {
+            if (a->parts == 1) influence(a, v, present, k, slot, 1);
+            else influence(a, v, present, k, slot, a->parts);
+            slot = slot < a->lags ? slot + 1 : 0;
+        }
     }
     deliver(q, a);
 }
