@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.estimation.correlation import add_lagged_products, lagged_size, ljung_box, mirrored, transforms
+from seaopt.estimation.correlation import LaggedSums, ljung_box
 from seaopt.estimation.losses import pull_of
 from seaopt.estimation.residuals import CHUNK, Residuals
 from seaopt.simulation import Point, Segment, stream
@@ -175,8 +175,7 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
     total, count = np.zeros(ny), np.zeros(ny)
     longest = max(piece.n for piece in pieces)
     chunk = -(-longest // max(round(longest / max(CHUNK, 4 * lags)), 1))  # of even lengths: transforms are of the longest
-    sizes = lagged_size(lags + chunk, lags), lagged_size(lags, lags)
-    products = [np.zeros((ny, ny, size // 2 + 1), dtype=complex) for size in sizes]  # of tail and chunk, of the tail
+    whole, again = LaggedSums(ny, lags + chunk, lags), LaggedSums(ny, lags, lags)  # tail and chunk, and the tail
     banded = bool(len(problem.weights(e).sections))
     sums = np.zeros((2 + banded, ny, 5))  # used, rest, in the band; see _sums
     for s, piece in enumerate(pieces):
@@ -186,9 +185,9 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
         for part in _chunks(problem, e, s, z, chunk):
             pull = part.where_used(pull_of(problem.loss, part.weighted))
             with_tail = np.concatenate([tail, pull], axis=1)
-            add_lagged_products(products[0], with_tail, sizes[0])
+            whole.add(with_tail)
             if tail.size:
-                add_lagged_products(products[1], tail, sizes[1])
+                again.add(tail)
             tail = with_tail[:, max(with_tail.shape[1] - lags, 0) :]
             total += np.sum(pull, axis=1)
             count += pull.shape[1] if part.used is None else np.count_nonzero(part.used, axis=1)
@@ -207,11 +206,9 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
             here[2, :, 3] -= here[2, :, 2] ** 2 / np.maximum(here[2, :, 0], 1.0)
             here[2, :, 2] = 0.0
         sums += here
-    irfft = transforms()[0]
-    whole, again = (irfft(mirrored(own), size)[:, :, : lags + 1] for own, size in zip(products, sizes, strict=True))
     used, rest, *band = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
     return Leftover(
-        correlation=(whole - again).transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
+        correlation=whole.sums() - again.sums(), mean=total / np.maximum(count, 1.0), count=count, used=used,
         rest=rest, band=band[0] if band else (),
     )  # fmt: skip
 
