@@ -98,7 +98,8 @@ class LaggedSums:
             found[:, a, a] = own[:count]
         for (a, b), total in self.cross.items():
             both = np.asarray(irfft(total, self.size))
-            found[:, a, b], found[:, b, a] = both[:count], np.roll(both[::-1], 1)[:count]
+            found[:, a, b] = both[:count]
+            found[0, b, a], found[1:, b, a] = both[0], both[:-count:-1]
         return found
 
 

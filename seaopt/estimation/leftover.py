@@ -174,7 +174,9 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
     lags = _lags(max(piece.n for piece in pieces))
     total, count = np.zeros(ny), np.zeros(ny)
     longest = max(piece.n for piece in pieces)
-    chunk = -(-longest // max(round(longest / max(CHUNK, 4 * lags)), 1))  # of even lengths: transforms are of the longest
+    chunk = -(
+        -longest // max(round(longest / max(CHUNK, 4 * lags)), 1)
+    )  # of even lengths: transforms are of the longest
     whole, again = LaggedSums(ny, lags + chunk, lags), LaggedSums(ny, lags, lags)  # tail and chunk, and the tail
     banded = bool(len(problem.weights(e).sections))
     sums = np.zeros((2 + banded, ny, 5))  # used, rest, in the band; see _sums

@@ -42,9 +42,9 @@ ALONE = 8_000  # samples below which experiments are not worth a thread each
 class Evaluation:
     """Cost, gradient and Gauss-Newton Hessian at `z`, and each output's weighted sum of squares and count.
 
-    `passes` were made at `origin`, from where residuals are straight to `z`: it differs in the linear unknowns alone, or
-    by the last step of a search (see `least_squares`). `undamped` tells which unknowns
-    a step may change at will: the linear ones. `pending` is the fall of the cost still expected from unknowns that are
+    `passes` were made at `origin`, from where residuals are straight to `z`: the two differ in the linear unknowns
+    alone, or by the last step of a search (see `least_squares`). `undamped` tells which unknowns a step may change at
+    will: the linear ones. `pending` is the fall of the cost still expected from unknowns that are
     not in z (see `shooting`).
     """
 
@@ -167,7 +167,10 @@ class Residuals:
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which is said there
     def assemble(
-        self, z: Float[np.ndarray, " n"], passes: tuple[tuple[Pass, ...], ...], to: Float[np.ndarray, " n"] | None = None
+        self,
+        z: Float[np.ndarray, " n"],
+        passes: tuple[tuple[Pass, ...], ...],
+        to: Float[np.ndarray, " n"] | None = None,
     ) -> Evaluation:
         """Return the evaluation that passes at `z` give: other sigmas need no other passes.
 

@@ -80,7 +80,9 @@ class Unknowns:
     shared: int
     locals_of: tuple[Locals, ...]
     models: tuple[Model, ...]
-    places: dict[tuple[int, int, bool], list[Int[np.ndarray, " nc"]]] = field(init=False, default_factory=dict, repr=False)
+    places: dict[tuple[int, int, bool], list[Int[np.ndarray, " nc"]]] = field(
+        init=False, default_factory=dict, repr=False
+    )
 
     @property
     def precision(self) -> Float[np.ndarray, " n"]:

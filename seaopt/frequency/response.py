@@ -142,11 +142,11 @@ def responses(
 
 def _square(values: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return |values|^2; np.abs takes a root first."""
-    return values.real**2 + values.imag**2
+    return np.real(values) ** 2 + np.imag(values) ** 2
 
 
 def _power(spectra: Complex[np.ndarray, "d m"]) -> Float[np.ndarray, " m"]:
-    parts = spectra.view(spectra.real.dtype)  # real and imaginary, side by side
+    parts = spectra.view(np.real(spectra).dtype)  # real and imaginary, side by side
     return np.sum(np.einsum("dm,dm->m", parts, parts).reshape(-1, 2), axis=1)
 
 

@@ -207,7 +207,9 @@ class Program:
         self.base = base
         self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
         if model.linear and segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections)):
-            self.run_up = _memory_of(data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx], segment.n // 16)
+            self.run_up = _memory_of(
+                data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx], segment.n // 16
+            )
 
     @classmethod
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:

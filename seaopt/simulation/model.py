@@ -88,9 +88,9 @@ class Model:
         p = np.append(self.parameters(theta), 0.0)  # room for a number, which an address needs
         g, dg = np.zeros((cols, rows)), np.zeros(self.np * cols * rows + 1)
         buffer, run = self.functions["matrices"].buffer()  # a fraction of a call's time for small matrices
-        buffer.set_arg(0, memoryview(p))
-        buffer.set_res(0, memoryview(g))
-        buffer.set_res(1, memoryview(dg))
+        buffer.set_arg(0, p.data)
+        buffer.set_res(0, g.data)
+        buffer.set_res(1, dg.data)
         run()
         return g.T.copy(), dg[:-1].reshape(self.np, cols, rows).transpose(0, 2, 1)
 
