@@ -208,7 +208,7 @@ class Program:
         self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
         if model.linear and segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections)):
             self.run_up = _memory_of(
-                data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx], segment.n // 16
+                data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx], segment.n // 8
             )
 
     @classmethod
@@ -246,7 +246,7 @@ class Program:
         edge as `warm` says.
         """
         alone = len(edges) == 2 and resume is None and sums and not (outputs or columns or states)
-        if alone and self.run_up and edges[1] - edges[0] >= PARALLEL:
+        if alone and self.run_up and edges[1] - edges[0] >= max(PARALLEL, 4 * self.run_up):
             halves, starts, ahead = self._halves(int(edges[0]), int(edges[1]), x0)
             found = self.run(halves, starts, warm=ahead)
             gram, loss, count = (np.sum(own, axis=0)[None] for own in (found.gram, found.loss, found.count))
