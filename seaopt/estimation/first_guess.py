@@ -70,8 +70,8 @@ def first_guess(
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
             for _ in range(CANDIDATES)
         ]
-        ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
-        found += [_refine(targets, theta, low, high, spread) for theta in ranked[:REFINED]]
+        ranked = np.argsort(_misfits(targets, candidates), kind="stable")
+        found += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED]]
     guesses: list[Float[np.ndarray, " n"]] = []
     ranked_guesses = sorted(found, key=_first)
     for _, theta in ranked_guesses:
@@ -145,6 +145,39 @@ def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
     return candidates[np.unique(nearest)]
 
 
+def _misfits(targets: list[_Target], candidates: list[Float[np.ndarray, " p"]]) -> Float[np.ndarray, " k"]:
+    """Return half the squared misfit of each candidate, of all at once."""
+    costs = np.zeros(len(candidates))
+    for target in targets:
+        g = np.array([target.model.matrices(theta[target.index])[0] for theta in candidates])
+        try:
+            r, _, _, _ = _mismatch(target, g)
+        except np.linalg.LinAlgError:  # of one of them
+            return np.array([_misfit(targets, theta)[0] for theta in candidates])
+        costs += 0.5 * np.sum(np.real(r) ** 2 + np.imag(r) ** 2, axis=(1, 2))
+    return np.where(np.isfinite(costs), costs, np.inf)
+
+
+@np.errstate(all="ignore")  # what is not finite is told by the caller
+def _mismatch(
+    target: _Target, g: Float[np.ndarray, "*k rows cols"]
+) -> tuple[
+    Complex[np.ndarray, "*k m ny"],
+    Complex[np.ndarray, "*k m ny"],
+    Complex[np.ndarray, "*k m nx"],
+    Complex[np.ndarray, "*k m nx nx"],
+]:
+    """Return weighted differences of the log responses, the responses, the states' and the resolvents."""
+    nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
+    b, c, d = g[..., :nx, nx + target.input], g[..., rows, :nx], g[..., rows, nx + target.input]
+    back = np.linalg.inv(target.s[:, None, None] * np.eye(nx) - g[..., None, :nx, :nx])
+    x = (back @ b[..., None, :, None])[..., 0]
+    response = (x @ np.swapaxes(c, -1, -2) + d[..., None, :]) * target.shift
+    difference: Any = np.log(response) - target.log_response
+    wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
+    return target.weight * wrapped, response, x, back
+
+
 def _misfit(
     targets: list[_Target], theta: Float[np.ndarray, " p"], derivatives: bool = False
 ) -> tuple[float, Any, Any]:
@@ -153,21 +186,15 @@ def _misfit(
     for target in targets:
         nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
         g, dg = target.model.matrices(theta[target.index])
-        b, db = g[:nx, nx + target.input], dg[:, :nx, nx + target.input]
-        c, dc = g[rows, :nx], dg[:, rows, :nx]
         try:
-            back = np.linalg.inv(target.s[:, None, None] * np.eye(nx) - g[:nx, :nx])
+            r, response, x, back = _mismatch(target, g)
         except np.linalg.LinAlgError:
             return np.inf, gradient, hessian
-        x = back @ b
-        response = (x @ c.T + g[rows, nx + target.input]) * target.shift
-        if not np.all(np.isfinite(response)) or np.any(response == 0.0):
+        if not np.all(np.isfinite(r)):
             return np.inf, gradient, hessian
-        difference: Any = np.log(response) - target.log_response
-        wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
-        r = target.weight * wrapped
         cost += 0.5 * float(np.vdot(r, r).real)
         if derivatives:
+            c, db, dc = g[rows, :nx], dg[:, :nx, nx + target.input], dg[:, rows, :nx]
             moved = back @ ((dg[:, :nx, :nx] @ x.T).transpose(2, 1, 0) + db.T)
             slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
             j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
