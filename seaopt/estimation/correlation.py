@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 LAGS = 25
 QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
@@ -73,10 +73,34 @@ def lagged_size(samples: int, lags: int) -> int:
     return int(transforms()[1](samples + lags, real=True))
 
 
-def lagged_products(x: Float[np.ndarray, "m n"], size: int) -> Complex[np.ndarray, "m m f"]:
-    """Return the spectra of the sums over t of x_a(t) x_b(t - k): they add up, and irfft gives the sums by lag k."""
-    spectrum = np.asarray(transforms()[2](x, size))
-    return spectrum[:, None] * np.conj(spectrum[None])
+class LaggedSums:
+    """Sums over t of x_a(t) x_b(t - k), k = 0..lags, of stretches of at most `longest` samples, added one by one."""
+
+    def __init__(self, rows: int, longest: int, lags: int) -> None:
+        self.lags, self.size = lags, lagged_size(longest, lags)
+        lines = self.size // 2 + 1
+        self.own = np.zeros((rows, 2 * lines))  # squares of real and imaginary parts, side by side
+        self.cross = {(a, b): np.zeros(lines, dtype=complex) for a in range(rows) for b in range(a)}
+
+    def add(self, x: Float[np.ndarray, "rows n"]) -> None:
+        """Add a stretch."""
+        spectrum = np.asarray(transforms()[2](x, self.size))
+        self.own += np.square(spectrum.view(float))
+        for (a, b), total in self.cross.items():
+            total += spectrum[a] * np.conj(spectrum[b])
+
+    def sums(self) -> Float[np.ndarray, "lags1 rows rows"]:
+        """Return the sums by lag."""
+        irfft, rows, count = transforms()[0], len(self.own), self.lags + 1
+        found = np.empty((count, rows, rows))
+        power = np.sum(self.own.reshape(rows, -1, 2), axis=2)
+        for a, own in enumerate(np.asarray(irfft(power, self.size))):
+            found[:, a, a] = own[:count]
+        for (a, b), total in self.cross.items():
+            both = np.asarray(irfft(total, self.size))
+            found[:, a, b] = both[:count]
+            found[0, b, a], found[1:, b, a] = both[0], both[:-count:-1]
+        return found
 
 
 def parzen(reach: int) -> Float[np.ndarray, " reach1"]:

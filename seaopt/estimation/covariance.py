@@ -14,8 +14,9 @@ loss's second derivative; for white residuals B is then E[psi^2] J^T J, psi the 
 Statistics, 1981, ch. 7).
 
 Only the parameters' part of :math:`\Sigma` is wanted, so that the double sum is over the influence of each sample on
-them, :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few thousand lags acts on it as a filter,
-in the frequency domain (overlap-save), chunk by chunk: memory does not grow with the log.
+them, :math:`a_t = J_t H^{-1} E`, with as many columns as parameters. R of a few lags is summed in one compiled pass;
+of a few thousand it acts as a filter in the frequency domain (overlap-save), chunk by chunk. Neither takes memory that
+grows with the log.
 Long sums are NumPy's own, or cut short: threads of the linear-algebra library cost more than they on a busy machine.
 """
 
@@ -32,9 +33,11 @@ from seaopt.estimation.leftover import Leftover, column_chunks
 from seaopt.estimation.losses import curvature_of
 from seaopt.estimation.normal import add_gram
 from seaopt.estimation.residuals import CHUNK, Residuals
+from seaopt.simulation import double_sum
 
 CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
 SMALL = 512  # samples of a product that the linear-algebra library does on one thread
+SHORT = 64  # lags that a compiled pass sums more quickly than transforms do
 FEW = 5000  # samples, beyond which what a fit takes out of its own residuals no longer matters
 LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
 
@@ -101,10 +104,18 @@ def _summed(
     """Return one experiment's part of the double sum."""
     pieces, total = problem.segments[e], np.zeros((inverse.shape[1],) * 2)
     reach, chunk = len(r) - 1, max(CHUNK, 4 * len(r))
+    into_of = [_into(problem, e, s, inverse) for s in range(len(pieces))]
+    if reach <= SHORT:
+        model, point, weights = problem.unknowns.models[e], problem.point(e, z), problem.weights(e)
+        sums = [
+            double_sum(model, piece, point, problem.start(e, s, z), weights, into_of[s], r)
+            for s, piece in enumerate(pieces)
+        ]
+        if all(found is not None for found in sums):
+            return np.sum(np.array(sums), axis=0)
     longest = reach + min(chunk, max(piece.n for piece in pieces))
     whole, again = (_Form.make(r, n) for n in (longest, reach))
-    for s in range(len(pieces)):
-        into = _into(problem, e, s, inverse)
+    for s, into in enumerate(into_of):
         tail = np.zeros((*into.shape[:2], 0))
         for _, columns, used in column_chunks(problem, e, s, z, chunk):
             with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)

@@ -9,6 +9,7 @@ given values, screened, and the best are refined.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.errors import LogError
 from seaopt.estimation.experiment import Experiment
 from seaopt.estimation.unknowns import Unknowns
-from seaopt.frequency import FrequencyResponse, h1
+from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.simulation import Model, linearised
 
 CANDIDATES = 128
@@ -69,8 +70,8 @@ def first_guess(
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
             for _ in range(CANDIDATES)
         ]
-        ranked = sorted(candidates, key=lambda theta: _misfit(targets, theta)[0])
-        found += [_refine(targets, theta, low, high, spread) for theta in ranked[:REFINED]]
+        ranked = np.argsort(_misfits(targets, candidates), kind="stable")
+        found += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED]]
     guesses: list[Float[np.ndarray, " n"]] = []
     ranked_guesses = sorted(found, key=_first)
     for _, theta in ranked_guesses:
@@ -89,15 +90,16 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
     active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
     if len(active) != 1 or len(experiment.stretches) != 1:
         return None
+    whole = [o for o, output in enumerate(experiment.outputs) if np.all(np.isfinite(log[output]))]
+    measured = [log[experiment.outputs[o]] for o in whole]
+    try:
+        stretch_s = _stretch(len(log)) * log.period
+        estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
+    except LogError:
+        return None
     chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, " m"]]] = {}
-    for o, output in enumerate(experiment.outputs):
-        if not np.all(np.isfinite(log[output])):
-            continue
-        try:
-            estimate = h1(log[active[0]], log[output], log.period, stretch_s=_stretch(len(log)) * log.period)
-        except LogError:
-            continue
-        low, high = band_hz if band_hz is not None else (0.0, np.inf)
+    low, high = band_hz if band_hz is not None else (0.0, np.inf)
+    for o, estimate in zip(whole, estimated, strict=True):
         f = estimate.frequency_hz
         good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
         if np.count_nonzero(good) >= 8:
@@ -125,6 +127,7 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
     )
 
 
+@lru_cache(maxsize=64)
 def _stretch(n: int) -> int:
     """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
     length = min(n // 16, LONGEST)
@@ -135,9 +138,44 @@ def _stretch(n: int) -> int:
 def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
     """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
     candidates = np.flatnonzero(good)
-    grid = np.geomspace(f[candidates[0]], f[candidates[-1]], POINTS)
-    nearest = np.abs(np.log(f[candidates]) - np.log(grid)[:, None]).argmin(axis=1)
+    places = np.log(f[candidates])
+    grid = np.linspace(places[0], places[-1], POINTS)
+    after = np.clip(np.searchsorted(places, grid), 1, places.size - 1)
+    nearest = np.where(grid - places[after - 1] <= places[after] - grid, after - 1, after)
     return candidates[np.unique(nearest)]
+
+
+def _misfits(targets: list[_Target], candidates: list[Float[np.ndarray, " p"]]) -> Float[np.ndarray, " k"]:
+    """Return half the squared misfit of each candidate, of all at once."""
+    costs = np.zeros(len(candidates))
+    for target in targets:
+        g = np.array([target.model.matrices(theta[target.index])[0] for theta in candidates])
+        try:
+            r, _, _, _ = _mismatch(target, g)
+        except np.linalg.LinAlgError:  # of one of them
+            return np.array([_misfit(targets, theta)[0] for theta in candidates])
+        costs += 0.5 * np.sum(np.real(r) ** 2 + np.imag(r) ** 2, axis=(1, 2))
+    return np.where(np.isfinite(costs), costs, np.inf)
+
+
+@np.errstate(all="ignore")  # what is not finite is told by the caller
+def _mismatch(
+    target: _Target, g: Float[np.ndarray, "*k rows cols"]
+) -> tuple[
+    Complex[np.ndarray, "*k m ny"],
+    Complex[np.ndarray, "*k m ny"],
+    Complex[np.ndarray, "*k m nx"],
+    Complex[np.ndarray, "*k m nx nx"],
+]:
+    """Return weighted differences of the log responses, the responses, the states' and the resolvents."""
+    nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
+    b, c, d = g[..., :nx, nx + target.input], g[..., rows, :nx], g[..., rows, nx + target.input]
+    back = np.linalg.inv(target.s[:, None, None] * np.eye(nx) - g[..., None, :nx, :nx])
+    x = (back @ b[..., None, :, None])[..., 0]
+    response = (x @ np.swapaxes(c, -1, -2) + d[..., None, :]) * target.shift
+    difference: Any = np.log(response) - target.log_response
+    wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
+    return target.weight * wrapped, response, x, back
 
 
 def _misfit(
@@ -148,21 +186,15 @@ def _misfit(
     for target in targets:
         nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
         g, dg = target.model.matrices(theta[target.index])
-        b, db = g[:nx, nx + target.input], dg[:, :nx, nx + target.input]
-        c, dc = g[rows, :nx], dg[:, rows, :nx]
         try:
-            back = np.linalg.inv(target.s[:, None, None] * np.eye(nx) - g[:nx, :nx])
+            r, response, x, back = _mismatch(target, g)
         except np.linalg.LinAlgError:
             return np.inf, gradient, hessian
-        x = back @ b
-        response = (x @ c.T + g[rows, nx + target.input]) * target.shift
-        if not np.all(np.isfinite(response)) or np.any(response == 0.0):
+        if not np.all(np.isfinite(r)):
             return np.inf, gradient, hessian
-        difference: Any = np.log(response) - target.log_response
-        wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
-        r = target.weight * wrapped
         cost += 0.5 * float(np.vdot(r, r).real)
         if derivatives:
+            c, db, dc = g[rows, :nx], dg[:, :nx, nx + target.input], dg[:, rows, :nx]
             moved = back @ ((dg[:, :nx, :nx] @ x.T).transpose(2, 1, 0) + db.T)
             slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
             j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
@@ -185,7 +217,7 @@ def _refine(
         trial = np.clip(np.where(spread, theta * np.exp(step), theta), low, high)
         trial_cost, trial_gradient, trial_hessian = _misfit(targets, trial, derivatives=True)
         if trial_cost < cost:
-            small = cost - trial_cost < 1e-6 * cost
+            small = cost - trial_cost < 1e-3 * cost  # least squares in time goes on from here
             theta, cost, gradient, hessian = trial, trial_cost, trial_gradient, trial_hessian
             damping = max(damping / 5, 1e-9)
             if small:

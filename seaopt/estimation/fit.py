@@ -12,7 +12,7 @@ from jaxtyping import Float
 from seaopt.errors import EstimationError
 from seaopt.estimation.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.least_squares import Callback
-from seaopt.estimation.leftover import counted
+from seaopt.estimation.leftover import count_of
 from seaopt.estimation.losses import Huber, Linear, Loss, SoftL1
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
 from seaopt.estimation.residuals import Residuals, spread_of
@@ -190,7 +190,7 @@ def _problem(
     )  # fmt: skip
     for e, experiment in enumerate(experiments):
         settle = problem.weights(e).settle
-        seen = sum(np.sum(counted(piece, 0), axis=0) for piece in segments[e])
+        seen = sum(count_of(piece) for piece in segments[e])
         for name, count in zip(experiment.outputs, np.asarray(seen), strict=True):
             if not count:
                 raise EstimationError(

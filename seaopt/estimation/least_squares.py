@@ -28,23 +28,26 @@ from seaopt.estimation.residuals import Evaluation
 Status = Literal["converged", "max_iterations", "stalled"]
 Callback = Callable[[int, float], None]
 Evaluate = Callable[[Any, "Evaluation | None", float], Evaluation]
+Follow = Callable[[Evaluation, Any], Evaluation]
 
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE = 1e-12  # of the cost
 REACH = 0.3  # first radius, over the size of the first point
 NEAR = 1e-4  # squared standard deviations that rounding may leave, where the residuals themselves are rounding
 TINY = 1e-15  # of the size of the point: a radius that is rounding
+STRAIGHT = 2e-5  # distance over the one before, squared: the Hessian changes by a few times that over the step to come
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """Where the search ended."""
+    """Where the search ended, and the distance, squared, from which its last step was made if that was a whole one."""
 
     z: Float[np.ndarray, " n"]
     evaluation: Evaluation
     status: Status
     message: str
     iterations: int
+    before: float = 0.0
 
 
 def minimise(
@@ -57,6 +60,8 @@ def minimise(
     decrement: float = DECREMENT,
     max_iterations: int = 50,
     callback: Callback | None = None,
+    follow: Follow | None = None,
+    before: float = 0.0,
 ) -> Solution:
     """Minimise a sum of squares from `start`, inside the bounds.
 
@@ -76,6 +81,11 @@ def minimise(
         Evaluations after the first.
     callback : callable, optional
         Called with the iteration and the cost.
+    follow : callable, optional
+        (evaluation, z) -> what it says of a z nearby if residuals are straight from there: then a last step needs no
+        evaluation of its own once the whole steps before it have shown how straight they are.
+    before : float
+        Of the search that this one goes on from.
 
     """
     here = start if isinstance(start, Evaluation) else evaluate(np.clip(start, low, high), None, 0.0)
@@ -89,7 +99,7 @@ def minimise(
         distance = _decrement(here, held) + 2.0 * here.pending
         if distance <= decrement + RELATIVE * here.cost:
             return Solution(
-                z=here.z, evaluation=here, status="converged", iterations=iteration - 1,
+                z=here.z, evaluation=here, status="converged", iterations=iteration - 1, before=before,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
             )  # fmt: skip
         if iteration > max_iterations:
@@ -105,6 +115,15 @@ def minimise(
                 z=here.z, evaluation=here, status="converged" if near else "stalled", iterations=iteration,
                 message=f"no smaller step can be told from rounding, and {left}",
             )  # fmt: skip
+        whole = damping == 0.0 and bool(np.all(trial == here.z + step))
+        if follow is not None and whole and _straight(distance, before, decrement + RELATIVE * here.cost):
+            here = follow(here, trial)
+            if callback is not None:
+                callback(iteration, here.cost)
+            return Solution(
+                z=here.z, evaluation=here, status="converged", iterations=iteration,
+                message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
+            )  # fmt: skip
         predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved) + here.pending
         there = evaluate(trial, here, damping)
         ratio = (here.cost - there.cost) / predicted if predicted > 0.0 and np.isfinite(there.cost) else -1.0
@@ -113,7 +132,7 @@ def minimise(
         elif ratio > 0.75 or damping == 0.0:
             radius = max(radius, 2.0 * length)
         if ratio > 1e-4:
-            here = there
+            here, before = there, distance if whole else 0.0
             scale = np.maximum(scale, _norms(here))
         if callback is not None:
             callback(iteration, here.cost)
@@ -121,6 +140,19 @@ def minimise(
         z=here.z, evaluation=here, status="max_iterations", iterations=max_iterations,
         message=f"still moving after {max_iterations} iterations; raise max_iterations or start closer",
     )  # fmt: skip
+
+
+def _straight(distance: float, before: float, allowed: float) -> bool:
+    """Tell from two distances to the minimum, squared, whether the next step may be followed without an evaluation.
+
+    Whole steps square what is left of the distance: it falls by r = distance / before to the power of two, and then of
+    four; all are squares. A tenth of the distance allowed is asked of that, for it is not quite so in many dimensions.
+    If steps only shortened the distance by one factor, what is left would still be small.
+    """
+    if not 0.0 < distance <= STRAIGHT * before:
+        return False
+    ratio = distance / before
+    return distance * ratio <= NEAR and distance * ratio**2 <= 0.01 * allowed
 
 
 def _norms(here: Evaluation) -> Float[np.ndarray, " n"]:

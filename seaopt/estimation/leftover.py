@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from seaopt.estimation.correlation import lagged_products, lagged_size, ljung_box, transforms
+from seaopt.estimation.correlation import LaggedSums, ljung_box
 from seaopt.estimation.losses import pull_of
 from seaopt.estimation.residuals import CHUNK, Residuals
 from seaopt.simulation import Point, Segment, stream
@@ -39,21 +39,28 @@ def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]
         row: list[Errors] = []
         for s in range(len(pieces)):
             parts = list(_chunks(problem, e, s, z))
-            weighted = np.concatenate([np.where(part.used, part.weighted, 0.0) for part in parts])
-            row.append(Errors(weighted=weighted, raw=np.concatenate([part.raw for part in parts])))
+            weighted = np.concatenate([part.where_used(part.weighted) for part in parts], axis=1)
+            row.append(Errors(weighted=weighted.T, raw=np.concatenate([part.raw for part in parts], axis=1).T))
         found.append(row)
     return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Chunk:
-    """Rows of a segment: model minus measured, filtered residuals in sigma, which count, and the measured in a band."""
+    """Rows of a segment: model minus measured, filtered residuals in sigma, which count, and the measured in a band.
+
+    Arrays have one row an output. `used` is None where every sample counts.
+    """
 
     rows: slice
-    raw: Float[np.ndarray, "m ny"]
-    weighted: Float[np.ndarray, "m ny"]
-    used: Bool[np.ndarray, "m ny"]
-    in_band: Float[np.ndarray, "m ny"] | None
+    raw: Float[np.ndarray, "ny m"]
+    weighted: Float[np.ndarray, "ny m"]
+    used: Bool[np.ndarray, "ny m"] | None
+    in_band: Float[np.ndarray, "ny m"] | None
+
+    def where_used(self, values: Float[np.ndarray, "ny m"]) -> Float[np.ndarray, "ny m"]:
+        """Return the values, zero where a sample does not count."""
+        return values if self.used is None else np.where(self.used, values, 0.0)
 
 
 def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chunk: int = CHUNK) -> Iterator[_Chunk]:
@@ -61,21 +68,23 @@ def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chun
     model, point, weights, piece = (
         problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
     )  # fmt: skip
-    first, filtered = 0, bool(len(weights.sections))
+    first, filtered, sigma = 0, bool(len(weights.sections)), problem.sigma[e][:, None]
     for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=chunk, columns=filtered):
         assert part.outputs is not None
         rows = slice(first, first + len(part.outputs))
         first = rows.stop
-        measured = np.column_stack([channel[rows] for channel in piece.y])
-        raw = part.outputs * point.gain
-        raw += point.offset
-        raw -= measured
+        raw = np.multiply(part.outputs.T, point.gain[:, None], order="C")
+        raw += point.offset[:, None]
+        for o, channel in enumerate(piece.y):
+            raw[o] -= channel[rows]
         if point.drift_terms:
-            raw += piece.drift_basis(rows, point.drift_terms) @ point.drift.T
-        left = raw if part.columns is None else part.columns[:, :, 0]
+            raw += point.drift @ piece.drift_basis(rows, point.drift_terms).T
+        left = raw if part.columns is None else part.columns[:, :, 0].T
+        every = not piece.keep and rows.start >= weights.settle and bool(np.all(np.isfinite(np.sum(raw, axis=1))))
         yield _Chunk(
-            rows=rows, raw=raw, weighted=left / problem.sigma[e], used=counted(piece, weights.settle, rows),
-            in_band=None if part.columns is None else _modelled(part.columns, point) - left,
+            rows=rows, raw=raw, weighted=left / sigma,
+            used=None if every else counted(piece, weights.settle, rows).T,
+            in_band=None if part.columns is None else _modelled(part.columns, point).T - left,
         )  # fmt: skip
 
 
@@ -94,6 +103,14 @@ def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.n
         present &= np.column_stack([mask[chosen] > 0 for mask in piece.keep])
     present[: max(settle - chosen.start, 0)] = False
     return present
+
+
+def count_of(piece: Segment) -> Int[np.ndarray, " ny"]:
+    """Return how many samples of each output are there and have a weight."""
+    present = [np.isfinite(channel) for channel in piece.y]
+    if piece.keep:
+        present = [own & (mask > 0) for own, mask in zip(present, piece.keep, strict=True)]
+    return np.array([np.count_nonzero(own) for own in present])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -155,9 +172,12 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
     """Return what an experiment's residuals come to."""
     pieces, ny = problem.segments[e], len(problem.sigma[e])
     lags = _lags(max(piece.n for piece in pieces))
-    chunk, total, count = max(CHUNK, 4 * lags), np.zeros(ny), np.zeros(ny)
-    sizes = lagged_size(lags + min(chunk, max(piece.n for piece in pieces)), lags), lagged_size(lags, lags)
-    products = [np.zeros((ny, ny, size // 2 + 1), dtype=complex) for size in sizes]  # of tail and chunk, of the tail
+    total, count = np.zeros(ny), np.zeros(ny)
+    longest = max(piece.n for piece in pieces)
+    chunk = -(
+        -longest // max(round(longest / max(CHUNK, 4 * lags)), 1)
+    )  # of even lengths: transforms are of the longest
+    whole, again = LaggedSums(ny, lags + chunk, lags), LaggedSums(ny, lags, lags)  # tail and chunk, and the tail
     banded = bool(len(problem.weights(e).sections))
     sums = np.zeros((2 + banded, ny, 5))  # used, rest, in the band; see _sums
     for s, piece in enumerate(pieces):
@@ -165,43 +185,44 @@ def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover
         started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
         origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
         for part in _chunks(problem, e, s, z, chunk):
-            pull = np.ascontiguousarray(np.where(part.used, pull_of(problem.loss, part.weighted), 0.0).T)
+            pull = part.where_used(pull_of(problem.loss, part.weighted))
             with_tail = np.concatenate([tail, pull], axis=1)
-            products[0] += lagged_products(with_tail, sizes[0])
+            whole.add(with_tail)
             if tail.size:
-                products[1] += lagged_products(tail, sizes[1])
+                again.add(tail)
             tail = with_tail[:, max(with_tail.shape[1] - lags, 0) :]
-            total += pull.sum(axis=1)
-            count += [np.count_nonzero(column) for column in part.used.T]
-            kept = counted(piece, 0, part.rows)
+            total += np.sum(pull, axis=1)
+            count += pull.shape[1] if part.used is None else np.count_nonzero(part.used, axis=1)
+            kept = None if part.used is None else counted(piece, 0, part.rows).T
             for o, channel in enumerate(piece.y):
                 measured = channel[part.rows] - origin[o]
-                here[0, o] += _sums(kept[:, o], measured, part.raw[:, o])
-                here[1, o] += _sums(~kept[:, o] & np.isfinite(measured) & started, measured, part.raw[:, o])
+                if part.used is None or kept is None:
+                    here[0, o] += _sums(None, measured, part.raw[o])
+                else:
+                    here[0, o] += _sums(kept[o], measured, part.raw[o])
+                    here[1, o] += _sums(~kept[o] & np.isfinite(measured) & started, measured, part.raw[o])
                 if part.in_band is not None:
-                    left = part.weighted[:, o] * problem.sigma[e][o]
-                    here[2, o] += _sums(part.used[:, o], part.in_band[:, o], left)
+                    left = part.weighted[o] * problem.sigma[e][o]
+                    here[2, o] += _sums(None if part.used is None else part.used[o], part.in_band[o], left)
         if banded:  # each segment's filter settles at a level of its own
             here[2, :, 3] -= here[2, :, 2] ** 2 / np.maximum(here[2, :, 0], 1.0)
             here[2, :, 2] = 0.0
         sums += here
-    irfft = transforms()[0]
-    whole, again = (irfft(both, size)[:, :, : lags + 1] for both, size in zip(products, sizes, strict=True))
     used, rest, *band = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
     return Leftover(
-        correlation=(whole - again).transpose(2, 0, 1), mean=total / np.maximum(count, 1.0), count=count, used=used,
+        correlation=whole.sums() - again.sums(), mean=total / np.maximum(count, 1.0), count=count, used=used,
         rest=rest, band=band[0] if band else (),
     )  # fmt: skip
 
 
 def _sums(
-    chosen: Bool[np.ndarray, " m"], measured: Float[np.ndarray, " m"], misses: Float[np.ndarray, " m"]
+    chosen: Bool[np.ndarray, " m"] | None, measured: Float[np.ndarray, " m"], misses: Float[np.ndarray, " m"]
 ) -> tuple[float, float, float, float, float]:
     """Return of the chosen samples: count, power of the misses, sum and squares of the measured, sum of the misses."""
-    if not np.all(chosen):
+    if chosen is not None:
         measured, misses = measured[chosen], misses[chosen]
-    square = float(np.sum(measured**2))
-    return measured.size, float(np.sum(misses**2)), float(np.sum(measured)), square, float(np.sum(misses))
+    power, square = (float(np.einsum("m,m->", x, x)) for x in (misses, measured))
+    return measured.size, power, float(np.sum(measured)), square, float(np.sum(misses))
 
 
 def _part(n: float, power: float, first: float, square: float, raw: float) -> Part:

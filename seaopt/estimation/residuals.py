@@ -49,8 +49,9 @@ ALONE = 8_000  # samples below which experiments are not worth a thread each
 class Evaluation:
     """Cost, gradient and Gauss-Newton Hessian at `z`, and each output's weighted sum of squares and count.
 
-    `passes` were made at `origin`, which differs from `z` in the linear unknowns alone. `undamped` tells which unknowns
-    a step may change at will: the linear ones. `pending` is the fall of the cost still expected from unknowns that are
+    `passes` were made at `origin`, from where residuals are straight to `z`: the two differ in the linear unknowns
+    alone, or by the last step of a search (see `least_squares`). `undamped` tells which unknowns a step may change at
+    will: the linear ones. `pending` is the fall of the cost still expected from unknowns that are
     not in z (see `shooting`).
     """
 
@@ -172,8 +173,16 @@ class Residuals:
         return self.assemble(z, self.passes(z))
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which is said there
-    def assemble(self, z: Float[np.ndarray, " n"], passes: tuple[tuple[Pass, ...], ...]) -> Evaluation:
-        """Return the evaluation that passes at `z` give: other sigmas need no other passes."""
+    def assemble(
+        self,
+        z: Float[np.ndarray, " n"],
+        passes: tuple[tuple[Pass, ...], ...],
+        to: Float[np.ndarray, " n"] | None = None,
+    ) -> Evaluation:
+        """Return the evaluation that passes at `z` give: other sigmas need no other passes.
+
+        It is that of `to`, if given, as far as residuals are straight from `z`.
+        """
         n, unknowns = z.size, self.unknowns
         cost, gradient, hessian = unknowns.prior(z)
         for e, row in enumerate(passes):
@@ -184,12 +193,18 @@ class Residuals:
             hessian[noise, noise] += 2.0 * np.abs(own[0, 1:][noise])  # see above
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
-        moved = np.zeros(n)
+        moved = np.zeros(n) if to is None else to - z
+        if finite and to is not None:
+            bent = hessian @ moved
+            cost += float(moved @ (gradient + 0.5 * bent))
+            gradient = gradient + bent
         if finite and np.any(linear):
-            moved[linear] = -solved(hessian[np.ix_(linear, linear)], gradient[linear], 1e-13)
-            cost += 0.5 * float(moved @ gradient)
+            best = np.zeros(n)
+            best[linear] = -solved(hessian[np.ix_(linear, linear)], gradient[linear], 1e-13)
+            cost += 0.5 * float(best @ gradient)
             finite = finite and cost > -LOST
-            gradient = np.where(linear, 0.0, gradient + hessian @ moved)
+            gradient = np.where(linear, 0.0, gradient + hessian @ best)
+            moved += best
         squares, counts = self._sums(passes, moved)
         return Evaluation(
             z=z + moved, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian, squares=squares,
@@ -203,6 +218,15 @@ class Residuals:
             for o, places in enumerate(self.columns(e, s)):
                 add_gram(total, found.gram[0, o] / self.sigma[e][o] ** 2, places)
         return total
+
+    def followed(self, here: Evaluation, z: Float[np.ndarray, " n"]) -> Evaluation:
+        """Return what an evaluation says of a `z` nearby, as far as residuals are straight to there."""
+        return self.assemble(here.origin, here.passes, z)
+
+    @property
+    def straight(self) -> bool:
+        """Whether a pass tells the weighted residuals nearby: it does for least squares of simulation errors."""
+        return isinstance(self.loss, Linear) and self.observers is None
 
     @property
     def exactly_linear(self) -> bool:
@@ -241,8 +265,11 @@ def spread_of(values: Float[np.ndarray, " n"]) -> float:
     count, total, square = 0, 0.0, 0.0
     for start in range(0, values.size, CHUNK):
         part = values[start : start + CHUNK] - first
-        part = part[np.isfinite(part)] if not np.all(np.isfinite(part)) else part
-        count, total, square = count + part.size, total + float(np.sum(part)), square + float(np.sum(part**2))
+        level = float(np.sum(part))
+        if not np.isfinite(level):
+            part = part[np.isfinite(part)]
+            level = float(np.sum(part))
+        count, total, square = count + part.size, total + level, square + float(np.einsum("m,m->", part, part))
     return float(np.sqrt(max(square / count - (total / count) ** 2, 0.0)))
 
 

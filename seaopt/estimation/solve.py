@@ -20,6 +20,7 @@ from seaopt.simulation import Point, Segment, run_passes
 
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
+ROUGH = 1.0  # squared standard deviations to the minimum, near enough to tell the sigmas
 NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
 HELD_REACH = 100.0  # a plant that is held to the log may be moved far at once
 FURTHER = 5  # guesses of the frequency responses that are tried at most
@@ -69,10 +70,15 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     problem, here = started(problem, start)
     decrement = DECREMENT if problem.observers is None else NOISE_DECREMENT
     checks: Checks = (None,) * len(problem.experiments)
+    rough, before = problem.straight and not explains_little(problem, here), 0.0
+    if rough:  # as good a start tells the sigmas well enough to come near the minimum, and there they are told well
+        problem = problem.with_sigma(estimated_sigma(problem, here))
+        here = problem.assemble(here.origin, here.passes)
     for attempt in range(MAX_ROUNDS):
         solution = minimise(
-            problem.evaluate, here, unknowns.low, unknowns.high, decrement=decrement,
+            problem.evaluate, here, unknowns.low, unknowns.high, decrement=ROUGH if rough else decrement,
             max_iterations=max(max_iterations - iterations, 1), callback=callback,
+            follow=problem.followed if problem.straight and attempt else None, before=before,  # in true sigmas
         )  # fmt: skip
         here, iterations = solution.evaluation, iterations + solution.iterations
         if not np.isfinite(here.cost):
@@ -80,13 +86,14 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
             return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
         sigma = estimated_sigma(problem, here)
         settled = all(np.allclose(new, old, rtol=5e-3) for new, old in zip(sigma, problem.sigma, strict=True))
-        before, problem = problem.substeps, problem.with_sigma(sigma)
+        steps, problem = problem.substeps, problem.with_sigma(sigma)
         if isinstance(problem.loss, Linear):
-            here = problem.assemble(here.origin, here.passes)  # other sigmas need no other passes
+            here = problem.assemble(here.origin, here.passes, here.z)  # other sigmas need no other passes
         elif not settled:
             here = problem.evaluate(here.z)
         problem, here, checks = refined(problem, here, checks if settled else (None,) * len(checks))
-        done, spent = settled and problem.substeps == before, iterations >= max_iterations
+        done, spent = settled and not rough and problem.substeps == steps, iterations >= max_iterations
+        rough, before = False, solution.before
         if done or spent or attempt == MAX_ROUNDS - 1:
             solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
             if not done and spent:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -66,6 +66,8 @@ class Unknowns:
         One an experiment.
     models : tuple of Model
         One an experiment, in its own free parameters.
+    places : dict
+        What `columns` has found.
 
     """
 
@@ -78,6 +80,9 @@ class Unknowns:
     shared: int
     locals_of: tuple[Locals, ...]
     models: tuple[Model, ...]
+    places: dict[tuple[int, int, bool], list[Int[np.ndarray, " nc"]]] = field(
+        init=False, default_factory=dict, repr=False
+    )
 
     @property
     def precision(self) -> Float[np.ndarray, " n"]:
@@ -99,6 +104,11 @@ class Unknowns:
 
     def columns(self, e: int, s: int, corrected: bool = False) -> list[Int[np.ndarray, " nc"]]:
         """Return, for each output, which unknown each derivative column of segment s is; -1 for none."""
+        if (e, s, corrected) not in self.places:
+            self.places[e, s, corrected] = self._columns(e, s, corrected)
+        return self.places[e, s, corrected]
+
+    def _columns(self, e: int, s: int, corrected: bool) -> list[Int[np.ndarray, " nc"]]:
         places, model = self.locals_of[e], self.models[e]
         own = [
             [offset, *drift, gain] for offset, drift, gain in zip(places.offset, places.drift, places.gain, strict=True)

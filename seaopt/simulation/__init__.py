@@ -4,10 +4,10 @@ from seaopt.simulation.compiled import threads
 from seaopt.simulation.discretisation import Clock, Hold, transition
 from seaopt.simulation.model import Model, depends_on_time, linearised, make_model
 from seaopt.simulation.passes import Layout, Pass, Point, RobustLoss, Segment, Weights, layout_of
-from seaopt.simulation.run import run_passes, stream
+from seaopt.simulation.run import double_sum, run_passes, stream
 from seaopt.simulation.simulate import simulate
 
 __all__ = [
     "Clock", "Hold", "Layout", "Model", "Pass", "Point", "RobustLoss", "Segment", "Weights", "depends_on_time",
-    "layout_of", "linearised", "make_model", "run_passes", "simulate", "stream", "threads", "transition",
+    "double_sum", "layout_of", "linearised", "make_model", "run_passes", "simulate", "stream", "threads", "transition",
 ]  # fmt: skip

@@ -24,10 +24,12 @@ from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
 PARALLEL = 20_000  # samples below which a second thread does not pay
+FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
 LOSSES = ("square", "huber", "soft_l1")
 THREADS = "seaopt-pass"
 
 
+@lru_cache(maxsize=32)
 def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     """Return seaopt_pass_args of pass.c, field by field; pointers are whole numbers."""
     pointer, whole, real = np.uint64, np.int64, np.float64
@@ -38,7 +40,8 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
         ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer),
         ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
         ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
-        ("last", pointer), ("carry", pointer),
+        ("last", pointer), ("carry", pointer), ("into", pointer), ("correlation", pointer), ("ring", pointer),
+        ("form", pointer), ("lags", whole), ("parts", whole), ("warm", whole),
     ])  # fmt: skip
 
 
@@ -137,6 +140,17 @@ def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray
     return np.concatenate([d.ravel(), blocks[0, :, :nx].ravel()])
 
 
+@np.errstate(over="ignore", invalid="ignore")
+def _memory_of(a: Float[np.ndarray, "nx nx"], limit: int) -> int:
+    """Return the power of two of samples after which nothing is left of a state; 0 if that is more than a limit."""
+    samples = 1
+    while samples <= limit:
+        if float(np.max(np.abs(a), initial=0.0)) < FORGOTTEN:
+            return samples
+        a, samples = a @ a, 2 * samples
+    return 0
+
+
 def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     clock = point.clock
     foh = float(clock.hold == "first")
@@ -191,6 +205,11 @@ class Program:
         base["sos"], base["sections"] = memory.constant(weights.sections), len(weights.sections)
         base["loss"], base["knee"] = LOSSES.index(weights.loss), memory.constant(weights.knee)
         self.base = base
+        self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
+        if model.linear and segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections)):
+            self.run_up = _memory_of(
+                data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx], segment.n // 8
+            )
 
     @classmethod
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
@@ -218,12 +237,20 @@ class Program:
         states: bool = False,
         resume: Float[np.ndarray, " m"] | None = None,
         room: Pass | None = None,
+        warm: Int[np.ndarray, " shots"] | int = 0,
     ) -> Pass:
         """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped.
 
         Outputs are those of the first samples `shown`, of all if it is left out. Outputs and columns are written into
-        the `room` of a pass that is not needed any more, if there is one.
+        the `room` of a pass that is not needed any more, if there is one. A shot starts so many samples ahead of its
+        edge as `warm` says.
         """
+        alone = len(edges) == 2 and resume is None and sums and not (outputs or columns or states)
+        if alone and self.run_up and edges[1] - edges[0] >= max(PARALLEL, 4 * self.run_up):
+            halves, starts, ahead = self._halves(int(edges[0]), int(edges[1]), x0)
+            found = self.run(halves, starts, warm=ahead)
+            gram, loss, count = (np.sum(own, axis=0)[None] for own in (found.gram, found.loss, found.count))
+            return Pass(gram=gram, loss=loss, count=count, last=found.last[1:])
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
         rows = n if shown is None else min(shown, n)
@@ -238,8 +265,8 @@ class Program:
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
         arguments = np.repeat(self.base, shots)
-        arguments["from"], arguments["to"], arguments["shown"] = edges[:-1], edges[1:], rows
-        arguments["start"] = edges[:-1] if resume is None else 0
+        arguments["from"], arguments["to"], arguments["shown"] = edges[:-1] - warm, edges[1:], rows
+        arguments["start"], arguments["warm"] = edges[:-1] - warm if resume is None else 0, warm
         arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
         filled = {"rho": result.loss, "count": result.count, "last": result.last}
         for name, array in (filled | {"gram": result.gram} if sums else filled).items():
@@ -253,6 +280,35 @@ class Program:
         self._call(arguments, n)
         return result
 
+    def double_sum(
+        self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
+    ) -> Float[np.ndarray, "p p"]:
+        """Return the sum over t and s of a(t)' R(t - s) a(s), a the influences into v of the samples that count."""
+        ny, p, nc = into.shape
+        width = _padded(p)
+        padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
+        padded[:, :, :p] = into.transpose(0, 2, 1)
+        halved[0] *= 0.5
+        edges, starts, warm = np.array([0, self.segment.n]), np.array(x0[None], dtype=float), np.zeros(1, dtype=int)
+        if self.run_up:
+            edges, starts, warm = self._halves(0, self.segment.n, starts)
+            warm[1:] += len(r)  # influences reach so far back
+        ring, form = np.zeros((len(warm), 2 * len(r), ny, width)), np.zeros((len(warm), width, width))
+        arguments = np.repeat(self.base, len(warm))
+        arguments["from"], arguments["start"], arguments["to"] = edges[:-1] - warm, edges[:-1] - warm, edges[1:]
+        arguments["warm"], arguments["lags"], arguments["parts"] = warm, len(r) - 1, width // 4
+        arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
+        for name, array in {"x0": starts, "ring": ring, "form": form}.items():
+            arguments[name] = array.ctypes.data + array.strides[0] * np.arange(len(warm))
+        self._call(arguments, self.segment.n)
+        total = np.sum(form, axis=0)
+        return (total + total.T)[:p, :p]
+
+    def _halves(self, first: int, last: int, x0: Float[np.ndarray, "1 nx"]) -> tuple[Any, Any, Any]:
+        """Return edges, starts and run-up of two halves; the second starts at zero and forgets it before it counts."""
+        starts = np.vstack([x0, np.zeros_like(x0)])
+        return np.array([first, (first + last) // 2, last]), starts, np.array([0, self.run_up])
+
     def carry(self) -> Float[np.ndarray, " m"]:
         """Return room for what a stretch hands from one call to the next."""
         return np.zeros(int(self.library.carry_size()))
@@ -263,11 +319,11 @@ class Program:
         if count < 2 or n < PARALLEL or threading.current_thread().name.startswith(THREADS):
             call(arguments.ctypes.data, count)
             return
-        pool = threads()
         bounds = np.linspace(0, count, workers() + 1).astype(int)
         size = arguments.dtype.itemsize
-        spans = [(int(a), int(b - a)) for a, b in pairwise(bounds) if b > a]
-        jobs = [pool.submit(call, arguments.ctypes.data + first * size, many) for first, many in spans]
+        spans = [(arguments.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds) if b > a]
+        jobs = [threads().submit(call, *span) for span in spans[1:]]
+        call(*spans[0])
         for job in jobs:
             job.result()
 

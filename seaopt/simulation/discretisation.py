@@ -83,16 +83,17 @@ def expm_with_derivatives(
     if not np.isfinite(norm) or not np.all(np.isfinite(dn)):
         return np.full_like(n, np.nan), np.full_like(dn, np.nan)
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / REACH))))
-    x, dx = n * 2.0**-squarings, dn * 2.0**-squarings
-    one = np.eye(n.shape[0])
-    e, de = one.copy(), np.zeros_like(dn)
+    m = n.shape[0]
+    x = np.zeros((len(dn) + 1, 2 * m, 2 * m))  # [n, dn; 0, n]: powers of it are [n^k, d(n^k); 0, n^k]
+    x[:, :m, :m] = x[:, m:, m:] = n * 2.0**-squarings
+    x[1:, :m, m:] = dn * 2.0**-squarings
+    one = np.eye(2 * m)
+    e = np.broadcast_to(one, x.shape)
     for k in range(DEGREE, 0, -1):
-        de = (x @ de + dx @ e) / k
         e = one + x @ e / k
     for _ in range(squarings):
-        de = e @ de + de @ e
         e = e @ e
-    return e, de
+    return e[0, :m, :m], e[1:, :m, m:]
 
 
 def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> Float[np.ndarray, "..."]:

@@ -40,9 +40,15 @@ typedef struct {
     double *outputs;               /* shown x NY or NULL */
     double *columns;               /* (to - from) x NY x NC or NULL */
     double *states;                /* (to - from) x NX or NULL */
-    double *last;                  /* NX x NJ: Z one step after the last row, or NULL; without sums and columns its
-                                      derivatives are not made */
+    double *last;                  /* NX x NJ: Z one step after the last row, or NULL; without sums, columns and influences
+                                      its derivatives are not made */
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
+    const double *into;            /* NY x NC x 4 parts: takes v to its influence on so many estimates; or NULL */
+    const double *correlation;     /* (1 + lags) x NY x NY: R(k), R(0) halved */
+    double *ring;                  /* 2 (1 + lags) x NY x 4 parts: influences of the last samples, zero at first */
+    double *form;                  /* 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s) */
+    long lags, parts;
+    long warm;                     /* rows from `from` that bring the state about, and are in no sum */
 } seaopt_pass_args;
 
 /* What goes on from one sample to the next. */
@@ -287,6 +293,35 @@ static inline void accumulate(const seaopt_pass_args *a, hot *q, int o) {
     if (k + 1 == BLOCK) sum_waiting(q, o);
 }
 
+typedef double loose __attribute__((vector_size(32), may_alias, aligned(8))); /* four doubles at any address */
+
+/* The influences a = into v of a sample, and its part of the double sum over the samples before: the ring holds each
+   influence twice, so that those of the last lags always stand in a row. */
+INLINE void influence(const seaopt_pass_args *a, double *const *v, const int *counts, long k, long slot, long parts) {
+    const long size = a->lags + 1;
+    loose *const here = (loose *)a->ring + (slot + size) * NY * parts, *const again = here - size * NY * parts;
+    const loose *into = (const loose *)a->into;
+    for (int o = 0; o < NY; o++)
+        for (long j = 0; j < parts; j++) {
+            loose sum = {0.0, 0.0, 0.0, 0.0};
+            for (int c = 1; counts[o] && c < NC; c++) sum += v[o][c] * into[(o * NC + c) * parts + j];
+            here[o * parts + j] = again[o * parts + j] = sum;
+        }
+    for (long j = 0; j < parts && k >= a->from + a->warm; j++) {
+        loose sum[NY][NY];
+        memset(sum, 0, sizeof sum);
+        const double *r = a->correlation;
+        for (long lag = 0; lag < size; lag++, r += NY * NY)
+            for (int o = 0; o < NY; o++)
+                for (int b = 0; b < NY; b++) sum[o][b] += r[o * NY + b] * here[(b - lag * NY) * parts + j];
+        for (int o = 0; o < NY; o++) {
+            for (int b = 1; b < NY; b++) sum[o][0] += sum[o][b];
+            for (long i = 0; i < 4 * parts; i++)
+                ((loose *)a->form)[i * parts + j] += ((const double *)(here + o * parts))[i] * sum[o][0];
+        }
+    }
+}
+
 /* Denormal numbers, into which sensitivities to the initial state decay, cost a hundredfold: take them as zero. */
 static unsigned long flush_denormals(void) {
 #if defined(__SSE2__)
@@ -350,6 +385,7 @@ static void deliver(hot *q, const seaopt_pass_args *a) {
 
 INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     hot here, *const q = &here;
+    long slot = 0; /* of the ring of influences */
     begin(q, a);
     for (long k = a->from; k < a->to; k++) {
         int present[NY];
@@ -379,7 +415,13 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
         for (int o = 0; a->y[0] && wide == ALL && o < NY; o++) {
             if (a->sections) filtered(a, v[o], q->filter[o]);
             if (a->columns) memcpy(a->columns + ((k - a->from) * NY + o) * NC, v[o], NC * sizeof(double));
-            if (a->gram && present[o] && k >= a->start + a->settle) accumulate(a, q, o);
+            present[o] = present[o] && k >= a->start + a->settle;
+            if (a->gram && present[o] && k >= a->from + a->warm) accumulate(a, q, o);
+        }
+        if (a->into && wide == ALL) {
+            if (a->parts == 1) influence(a, v, present, k, slot, 1);
+            else influence(a, v, present, k, slot, a->parts);
+            slot = slot < a->lags ? slot + 1 : 0;
         }
     }
     deliver(q, a);
@@ -388,7 +430,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
 EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     const unsigned long mode = flush_denormals();
     for (long i = 0; i < count; i++) {
-        if (ALL == 1 || list[i].gram || list[i].columns) one_pass(list + i, ALL);
+        if (ALL == 1 || list[i].gram || list[i].columns || list[i].into) one_pass(list + i, ALL);
         else one_pass(list + i, 1);
     }
     restore_denormals(mode);

@@ -93,6 +93,31 @@ def stream(
         yield part
 
 
+def double_sum(
+    model: Model,
+    segment: Segment,
+    point: Point,
+    x0: Float[np.ndarray, " nx"],
+    weights: Weights,
+    into: Float[np.ndarray, "ny p nc"],
+    r: Float[np.ndarray, "lags1 ny ny"],
+) -> Float[np.ndarray, "p p"] | None:
+    """Return the sum over t and s of a(t)' R(t - s) a(s) in one pass; None where there is no compiler.
+
+    Parameters
+    ----------
+    model, segment, point, x0, weights
+        As of `run_passes`.
+    into : array, shape (ny, p, nc)
+        Takes the column v of an output to its influence a on p estimates; its first column is zero.
+    r : array, shape (lags + 1, ny, ny)
+        R(k)[a, b] of output a with output b so many samples before; R(-k) = R(k)'. Time grows with the lags.
+
+    """
+    program = Program.make(model, segment, point, weights)
+    return None if program is None else program.double_sum(x0, into, r)
+
+
 def _cut(whole: Pass, chunk: int) -> Iterator[Pass]:
     assert whole.outputs is not None
     for start in range(0, len(whole.outputs), chunk):

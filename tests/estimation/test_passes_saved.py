@@ -1,0 +1,135 @@
+"""What a fit does in fewer passes: halves of a log at once, sums over influences, and a last step that is followed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import seaopt as so
+from seaopt.estimation.correlation import LaggedSums
+from seaopt.estimation.least_squares import minimise
+from seaopt.estimation.residuals import Evaluation
+from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, make_model, run_passes
+from seaopt.simulation.compiled import PARALLEL, Program
+from seaopt.simulation.compiler import find_compiler
+from seaopt.simulation.interpreted import interpreted_passes
+
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+RATE = 400.0
+
+
+@pytest.fixture(scope="module")
+def case(thor):
+    """Return a pass of the stand over a log long enough to be halved, with samples missing."""
+    stand, free, rng = so.plants.high_impedance(), ("J", "b_r"), np.random.default_rng(0)
+    model = make_model(stand, thor, free, ("F1", "F2"))
+    y = rng.normal(size=(2, PARALLEL + 777)) * 100.0
+    y[0, 500:600] = np.nan
+    u = rng.normal(size=y.shape[1])
+    point = Point(
+        theta=np.array(thor.values_of(free)) * 1.1, offset=np.array([3.0, -2.0]), gain=np.array([1.0, 1.1]),
+        drift=np.array([[1.0], [2.0]]), clock=Clock(period=1 / RATE, delay_s=0.3 / RATE, delay_free=True),
+    )  # fmt: skip
+    return model, Segment(u=(u,), y=tuple(y), drift_span=(-1.0, 2.0 / y.shape[1])), point, np.array([[1e-3, 0.05]])
+
+
+@needs_compiler
+@pytest.mark.parametrize("loss", ["square", "huber"])
+def test_two_halves_are_the_interpreted_whole(case, loss):
+    model, segment, point, x0 = case
+    weights = replace(Weights.plain(2), loss=loss, knee=np.full(2, 80.0))
+    program = Program.make(model, segment, point, weights)
+    assert program is not None
+    assert 0 < program.run_up < segment.n // 8
+    ours = run_passes(model, segment, point, x0, weights)
+    theirs = interpreted_passes(model, segment, point, weights, np.array([0, segment.n]), x0)
+    np.testing.assert_allclose(ours.gram, theirs.gram, rtol=1e-9, atol=1e-12 * np.max(theirs.gram))
+    np.testing.assert_allclose(ours.loss, theirs.loss, rtol=1e-10)
+    np.testing.assert_array_equal(ours.count, theirs.count)
+    np.testing.assert_allclose(ours.last[:, :, 0], theirs.last[:, :, 0], rtol=1e-9)
+
+
+@needs_compiler
+def test_a_plant_that_does_not_forget_is_not_halved(case):
+    """A mass that nothing brakes or holds keeps its state: the second half cannot start from zero."""
+    segment = case[1]
+    mass = so.Plant(
+        name="mass", states={"x": "m", "v": "m/s"}, inputs={"F": "N"}, outputs={"y": "m"}, parameters={"m": "kg"},
+        f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.m}, h=lambda t, x, u, p: {"y": x.x},
+    )  # fmt: skip
+    model = make_model(mass, so.ParameterSet.of(m=(2.0, "kg")), ("m",), ("y",))
+    here = Point(theta=np.array([2.0]), offset=np.zeros(1), gain=np.ones(1), clock=Clock(period=1 / RATE))
+    program = Program.make(model, Segment(u=segment.u, y=segment.y[:1]), here, Weights.plain(1))
+    assert program is not None
+    assert program.run_up == 0
+
+
+@needs_compiler
+@pytest.mark.parametrize(("rows", "lags", "p"), [(400, 0, 2), (400, 7, 3), (None, 5, 6)])
+def test_the_double_sum_is_numpys(case, rows, lags, p):
+    model, segment, point, x0 = case
+    cut = slice(0, rows)
+    segment = Segment(u=(segment.u[0][cut],), y=tuple(y[cut] for y in segment.y), drift_span=segment.drift_span)
+    rng = np.random.default_rng(1)
+    columns = run_passes(model, segment, point, x0, sums=False, columns=True).columns
+    into = rng.normal(size=(2, p, columns.shape[2])) / np.sqrt(np.mean(columns**2, axis=0))[:, None]
+    into[:, :, 0] = 0.0
+    r = rng.normal(size=(lags + 1, 2, 2))
+    r[0] += r[0].T
+    influence = np.einsum("opc,toc->top", into, columns) * np.isfinite(np.array(segment.y)).T[:, :, None]
+    expected = np.einsum("tai,ab,tbj->ij", influence, r[0], influence)
+    for k in range(1, lags + 1):
+        part = np.einsum("tai,ab,tbj->ij", influence[k:], r[k], influence[:-k])
+        expected += part + part.T
+    found = double_sum(model, segment, point, x0[0], Weights.plain(2), into, r)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-10 * np.max(np.abs(expected)))
+
+
+def test_lagged_sums_are_numpys():
+    """Stretches that overlap by the lags, less the overlaps, are the whole."""
+    x, lags = np.random.default_rng(2).normal(size=(3, 500)), 20
+    whole, again = LaggedSums(3, 320, lags), LaggedSums(3, lags, lags)
+    whole.add(x[:, :300])
+    whole.add(x[:, 300 - lags :])
+    again.add(x[:, 300 - lags : 300])
+    expected = [[[np.sum(a[k:] * b[: 500 - k]) for b in x] for a in x] for k in range(lags + 1)]
+    np.testing.assert_allclose(whole.sums() - again.sums(), expected, atol=1e-10)
+
+
+def test_a_last_step_is_followed_without_an_evaluation_and_ends_where_scipy_does():
+    """Of an exponential in noise; the same search with all evaluations takes one more."""
+    t, rng = np.linspace(0, 3, 400), np.random.default_rng(3)
+    y = 2.0 * np.exp(-0.7 * t) + 0.01 * rng.normal(size=t.size)
+    seen: list[np.ndarray] = []
+
+    def residual(z):
+        return (z[0] * np.exp(-z[1] * t) - y) / 0.01
+
+    def jacobian(z):
+        return np.column_stack([np.exp(-z[1] * t), -t * z[0] * np.exp(-z[1] * t)]) / 0.01
+
+    def evaluation(z, origin):
+        r, j = residual(origin), jacobian(origin)
+        r = r + j @ (z - origin)
+        return Evaluation(
+            z=z, cost=0.5 * float(r @ r), gradient=j.T @ r, hessian=j.T @ j, squares=(), counts=(),
+            undamped=np.zeros(2, dtype=bool), origin=origin, passes=(),
+        )  # fmt: skip
+
+    def evaluate(z, here, damping):
+        seen.append(z)
+        return evaluation(z, z)
+
+    bounds, start = np.full(2, np.inf), np.array([1.95, 0.71])
+    all_made = minimise(evaluate, start, -bounds, bounds)
+    plain = len(seen)
+    seen.clear()
+    followed = minimise(evaluate, start, -bounds, bounds, follow=lambda here, z: evaluation(z, here.origin))
+    best = least_squares(residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    std = np.sqrt(np.diag(np.linalg.inv(jacobian(best).T @ jacobian(best))))
+    assert followed.status == all_made.status == "converged"
+    assert len(seen) < plain
+    assert np.max(np.abs(followed.z - best) / std) < 1e-4
