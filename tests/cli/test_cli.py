@@ -163,7 +163,7 @@ def test_values_that_the_fit_does_not_identify_are_named_wherever_they_are_used(
         out = seaopt(stage, "ranged.toml", "-o", "ranged", cwd=folder)
         assert "warning: the fit does not identify K_tau and eta: K_tau = 0.0" in out.stderr
         assert "note: the fit does not identify K_tau and eta: K_tau = 0.0" in out.stdout
-        (note,) = json.loads((folder / "ranged" / file).read_text(encoding="utf-8"))["notes"]
+        note = json.loads((folder / "ranged" / file).read_text(encoding="utf-8"))["notes"][0]
         assert "K_tau" in note and " b_r" not in note
 
 
