@@ -22,7 +22,7 @@ CURVES = 5
 SENSITIVITY, TRACKING = 0, 4
 REFINED = 3  # local maxima refined of each curve before the proof
 MAX_ROUNDS = 20
-ON_CIRCLE = 1e-5  # how near a pole of L is on the circle: a double one is only known to the root of rounding
+BESIDE = 1e-5  # how near a pole of L on the circle -1/L is that pole's: a double one is known to the root of rounding
 RESOLVED = 1e-9
 
 
@@ -101,12 +101,16 @@ def _gain_factors(
     """Return the factors -1/L at angles where L is real and negative, and these angles.
 
     A pole of L on the circle, an integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is
-    rounding.
+    rounding. A pole is on the circle if it is no further from it than it is known; next to a light mode, which is off
+    it, a crossing is one.
     """
-    s, t = np.real(system.curves(turns)[:2])
     with np.errstate(divide="ignore", invalid="ignore"):
-        factors = -s / t
-    infinite = np.any(np.abs(np.exp(1j * turns)[:, None] - system.opened) < ON_CIRCLE, axis=1)
+        factors = -np.real(system.sensitivity(turns) / system.curves(turns)[1])
+    poles = system.opened
+    beside = np.abs(np.exp(1j * turns)[:, None] - poles) < BESIDE
+    if np.any(beside):
+        beside &= np.abs(np.abs(poles) - 1.0) <= system.resolution()
+    infinite = np.any(beside, axis=1)
     crossing = (factors > RESOLVED) & (factors < 1.0 / RESOLVED) & ~infinite
     return factors[crossing], turns[crossing]
 
