@@ -85,14 +85,28 @@ def measured(system: ClosedLoop) -> Measured:
         return np.array(rows)[which, np.arange(theta.size)]
 
     found = sign_changes(function, edges[: len(pencils)])
-    crossovers, turns = found[0], np.concatenate([[0.0], found[1], [np.pi]])
+    turns = np.concatenate([[0.0], found[1], [np.pi]])
     factors, angles = _gain_factors(system, turns)
-    s, t = system.curves(crossovers)[:2]
     return Measured(
-        peaks=peaks, at=at, ends=ends, static=static, crossovers=crossovers, crossover_phases=np.angle(-t / s),
+        peaks=peaks, at=at, ends=ends, static=static, crossovers=found[0], crossover_phases=_phases(system, found[0]),
         gain_factors=factors, gain_angles=angles, sensitivity_edges=found[2],
         bandwidth_edges=found[5] if static else np.empty(0), band_edges=np.sort(np.concatenate(found[3:5])),
     )  # fmt: skip
+
+
+def crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return where abs(L) = 1, and the phase of -L there (rad); the loop need not be stable."""
+
+    def function(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
+        return 2.0 * system.curves(theta)[0].real - 1.0
+
+    (found,) = sign_changes(function, arcs([system.equal()]))
+    return found, _phases(system, found)
+
+
+def _phases(system: ClosedLoop, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    s, t = system.curves(theta)[:2]
+    return np.angle(-t / s)
 
 
 def _gain_factors(
