@@ -19,7 +19,10 @@ from seaopt.control.peaks import HALF_POWER, TRACKING, Measured, measured
 from seaopt.control.response import ClosedLoop, close
 
 LOWEST_HZ = 1e-3
-STABLE = 1.0 - 1e-11  # a spectral radius nearer to 1 is 1 to rounding
+# A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
+# nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
+# takes longer than 11 days at 1 kHz.
+STABLE, GROWING = 1.0 - 1e-11, 1.0 + 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -93,7 +93,7 @@ class ClosedLoop:
         return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
 
     def resolution(self) -> Float[np.ndarray, " n"]:
-        """Return how well each pole of plant and law is known: rounding times its condition, that of a double one large.
+        """Return how well each pole of plant and law is known: rounding times its condition, large of a double one.
 
         The first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
         7.2.2).

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -120,7 +121,7 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     outside = np.array([item.unstable(samples) for item in grid])
     if outside[0, 0]:
         return 0.0
-    stepping = np.array([_steps(a, b, samples) for a, b in zip(grid[:-1], grid[1:], strict=True)])
+    stepping = np.array([_steps(a, b, samples) for a, b in pairwise(grid)])
     events = (outside[:-1] > 0) | (outside[1:] > 0) | stepping
     for w, cell in zip(*np.nonzero(events.T), strict=True):
         found = _first(late, grid[cell], grid[cell + 1], int(w))
@@ -135,8 +136,9 @@ def _late(controller: Controller, plant: Plant, params: ParameterSet, part: floa
     delay = Parameter(name=DELAY, value=before + part * controller.sample_time_s, unit="s")
     system = controller.close(plant, params.with_parameters(delay)).system()
     angles, phases = crossovers(system)
+    nyquist = system.curves(np.array([np.pi]))[0, 0]
     return _Late(
-        part=part, angles=angles, phases=np.mod(phases, TURN), loud=bool(system.curves(np.array([np.pi]))[0, 0].real < 0.5),
+        part=part, angles=angles, phases=np.mod(phases, TURN), loud=bool(nyquist.real < 0.5),
         outside=int(np.sum(~(np.abs(system.poles) < STABLE))),
     )  # fmt: skip
 
@@ -182,7 +184,7 @@ def _first(late: Callable[[float], _Late], low: _Late, high: _Late, w: int) -> f
             for j in np.flatnonzero(before != after)
         ]
         ends = [*sorted(ends), high.part]
-    for end, following in zip(ends[:-1], ends[1:], strict=True):
+    for end, following in pairwise(ends):
         if late(0.5 * (end + following)).unstable(samples)[0]:
             return end
     return bisected(lambda at: bool(at.unstable(samples)[0])) if high.unstable(samples)[0] else None

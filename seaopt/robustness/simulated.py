@@ -157,6 +157,8 @@ def _large(found: LargeSignal) -> str:
 
 
 def _bands(found: Passivity) -> str:
+    if not found.held_stable:
+        return "nowhere: the loop is UNSTABLE with link 2 held"
     bands = ", ".join(f"{low:.3g} to {high:.4g} Hz" for low, high in found.bands_hz) or "nowhere"
     lost = "" if found.violated_hz is None else f"; {-found.least_damping_N_s_per_m:.3g} N s/m are missing elsewhere"
     return bands + lost

@@ -1,4 +1,4 @@
-"""The sampled delay margin against eigenvalues of the loop with its delay as states, densely scanned, in NumPy alone."""
+"""The sampled delay margin against eigenvalues of the loop with delay as states, densely scanned, in NumPy alone."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def modes(*given):
 
 
 def radius(given, law, delay):
-    """The spectral radius under u = -law y with `delay` seconds, a sample of it the controller's: every command a state."""
+    """The spectral radius under u = -law y with `delay` seconds, the controller's among them: every command a state."""
     n = 2 * len(given)
     a, b, c = np.zeros((n, n)), np.zeros(n), np.zeros(n)
     for i, (hz, zeta, gain) in enumerate(given):
