@@ -294,3 +294,22 @@ def test_a_loop_that_grows_with_the_link_held_is_passive_nowhere(gain, thor, sta
         if grows:
             assert not found.holds((1.0, 20.0))
             assert found.violated_hz == found.low_hz
+
+
+def test_an_undamped_pole_is_no_hole(thor, stand):
+    """At the pole itself the responses are infinite and Z under feedback is that of the equations."""
+    params = thor.update(b_r=0.0)
+    m, _, k, m_l = figures(params)
+    f = np.sqrt(k / (m + m_l)) / (2 * np.pi) * np.array([1.0, 1.0 + 1e-15, 1.0 - 1e-12, 1.0 + 1e-9, 1.0 + 1e-6, 1.1])
+    s = 2j * np.pi * f
+    port = port_of(stand, params, "F1", current_per_force(stand, params))
+    c = 3.0 + 0.02 * s
+    found = port.response(f).impedance(c)
+    np.testing.assert_allclose(found, IMPEDANCES["unlumped", "link1"](m, 0.0, k, m_l, c, s), rtol=1e-6)
+
+
+def test_an_actuator_without_damping_has_the_bands_of_one_with_hardly_any(thor, stand):
+    none, hardly = (passivity(tuned(), stand, thor.update(b_r=b)) for b in (0.0, 1e-12))
+    np.testing.assert_allclose(none.bands_hz, hardly.bands_hz, rtol=1e-6)
+    assert none.held_stable
+    assert none.least_damping_N_s_per_m == pytest.approx(hardly.least_damping_N_s_per_m, rel=1e-6)
