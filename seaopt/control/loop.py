@@ -112,15 +112,18 @@ class Loop:
 
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
-        nyquist = self.plant.nyquist_hz
-        base = np.geomspace(LOWEST_HZ, nyquist, 1200)
+        base = np.geomspace(LOWEST_HZ, self.plant.nyquist_hz, 1200)
         poles = np.concatenate([np.linalg.eigvals(self.plant.a), self.eigenvalues()])
+        return np.union1d(base, self.about(poles))
+
+    def about(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """Return frequencies that resolve poles, up to the Nyquist frequency, unsorted."""
+        nyquist = self.plant.nyquist_hz
         f0 = np.abs(np.angle(poles)) / (2 * np.pi * self.plant.sample_time_s)
         width = np.maximum(np.abs(1.0 - np.abs(poles)) * nyquist / np.pi, 1e-9 * nyquist)
         fan = np.concatenate([[0.0], *[[-x, x] for x in np.geomspace(0.05, 30.0, 20)]])
         near = (f0[:, None] + width[:, None] * fan).ravel()
-        inside = near[(near > LOWEST_HZ) & (near < nyquist)]
-        return np.unique(np.concatenate([base, inside]))
+        return near[(near > LOWEST_HZ) & (near < nyquist)]
 
     def figures(self) -> LoopFigures:
         """Return the loop's figures."""

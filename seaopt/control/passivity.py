@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.controller import Controller
-from seaopt.control.crossings import crossings
+from seaopt.control.crossings import crossings, with_minima
 from seaopt.control.digital import DigitalPlant, hold
 from seaopt.control.law import TransferFunction
 from seaopt.control.loop import GROWING, Loop
@@ -178,7 +178,7 @@ def passivity(
     port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
     law = controller.measurement
     impedance, angle = _curves(port, law, ts, controller.delay_samples)
-    f = _with_minima(angle, _with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
+    f = with_minima(angle, with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
     stable = _held_stable(port, controller)
     bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
@@ -201,7 +201,7 @@ def least_cosine(
 ) -> tuple[float, float]:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, and the frequency in Hz where it is."""
     _, angle = _curves(port, law, sample_time_s, delay_samples)
-    f = _with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
+    f = with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
     found = angle(f)
     least = int(np.argmin(found))
     return float(found[least]), float(f[least])
@@ -282,18 +282,6 @@ def _grid(port: Port, law: TransferFunction, sample_time_s: float, low_hz: float
     near = (at[:, None] + np.maximum(width, 1e-6 * high_hz)[:, None] * fan).ravel()
     inside = near[(near > low_hz) & (near < high_hz)]
     return np.unique(np.concatenate([np.geomspace(low_hz, high_hz, POINTS), inside]))
-
-
-def _with_minima(curve: Callable[[Frequencies], Frequencies], f: Frequencies) -> Float[np.ndarray, " k"]:
-    """Return f with every local minimum of the curve, by thirds."""
-    values = curve(f)
-    inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
-    low, high = f[inner - 1], f[inner + 1]
-    for _ in range(60 if inner.size else 0):
-        left, right = low + (high - low) / 3, high - (high - low) / 3
-        lower = curve(left) < curve(right)
-        low, high = np.where(lower, low, left), np.where(lower, right, high)
-    return np.unique(np.concatenate([f, 0.5 * (low + high)]))
 
 
 def _bands(

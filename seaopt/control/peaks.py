@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.response import ClosedLoop, Indices, arcs, bracketed, sign_changes
+from seaopt.errors import ControlError
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PROOF = 1e-7
@@ -63,7 +64,14 @@ class Measured:
 
 
 def measured(system: ClosedLoop) -> Measured:
-    """Return the peaks and crossings of a stable closed loop."""
+    """Return the peaks and crossings of a stable closed loop.
+
+    Raises
+    ------
+    ControlError
+        A peak cannot be proved.
+
+    """
     peaks, at = _candidates(system)
     ends = system.curves(np.array([0.0, np.pi]))
     static = float(np.abs(ends[TRACKING, 0]))
@@ -171,7 +179,14 @@ def _proved(
     system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curves: Int[np.ndarray, " c"],
     edges: list[Float[np.ndarray, " _"]],
 ) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
-    """Return the peaks, raised until no arc of the level set just above them holds a larger value."""
+    """Return the peaks, raised until no arc of the level set just above them holds a larger value.
+
+    Raises
+    ------
+    ControlError
+        That does not come to an end.
+
+    """
     for _ in range(MAX_ROUNDS):
         own = np.repeat(curves, [row.size - 1 for row in edges])
         low, high = np.concatenate([row[:-1] for row in edges]), np.concatenate([row[1:] for row in edges])
@@ -179,7 +194,7 @@ def _proved(
         values = np.abs(system.curves(middle)[own, np.arange(own.size)])
         above = values > peaks[own] * (1.0 + PROOF)
         if not np.any(above):
-            break
+            return peaks, at
         own, low, high = own[above], low[above], high[above]
         for k, value, theta in zip(own, values[above], middle[above], strict=True):
             if value > peaks[k]:
@@ -189,4 +204,7 @@ def _proved(
         peaks, at = _climbed(system, peaks, at, own[rising], low[rising], high[rising])
         curves = np.unique(own)
         edges = arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])
-    return peaks, at
+    raise ControlError(
+        f"the peaks of this loop are still rising after {MAX_ROUNDS} rounds, so that they cannot be stated; look at "
+        "modes of the plant or the law that lie closer to the unit circle than rounding resolves"
+    )

@@ -295,8 +295,7 @@ def sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) ->
     before, after = flips[left], flips[left] + 1
     close_by, ends = bent[left], (theta[before], theta[after], values[before], values[after])
     low, high, at_low, at_high = (
-        np.where(close_by, inner[left], outer)
-        for inner, outer in zip((low, high, at_low, at_high), ends, strict=True)
+        np.where(close_by, inner[left], outer) for inner, outer in zip((low, high, at_low, at_high), ends, strict=True)
     )
     found[left] = bracketed(lambda x, i: function(x, own[left[i]]), low, high, at_low, at_high, 1e-13)
     return [found[own == row] for row in range(len(edges))]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import DigitalPlant, Loop, TransferFunction
+from seaopt.control import DigitalPlant, Loop, TransferFunction, peaks
 from seaopt.control.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from tests.control.test_loop import loop_of
@@ -395,3 +395,27 @@ def test_an_undamped_mode_is_no_crossing(hz):
     for factor in np.geomspace(1e-3, 0.999 * min(up, 1e6), 50):
         assert np.max(np.abs(poles_of(loop, factor))) < 1.0
     assert up == 1e9 or np.max(np.abs(poles_of(loop, 1.001 * up))) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("hz", "zeta", "shift"), [(77.123, 1e-3, 1.0), (77.123, 1e-4, 1.0003), (3.21, 1e-5, 1.00001), (431.7, 1e-3, 1.002)]
+)
+def test_the_nu_gap_of_two_light_modes_is_that_of_a_grid_laid_about_them(hz, zeta, shift):
+    a, b = (
+        modal([(20.0, 0.7, 0.3), mode], delay=1, law=gained(0.2))
+        for mode in ((hz, zeta, 3 * zeta), (hz * shift, 1.5 * zeta, 3 * zeta))
+    )
+    f = np.concatenate([np.geomspace(0.01, 499.9, 20_000), hz * (1 + 60 * zeta * np.linspace(-1, 1, 100_001))])
+    l1, l2 = independent(a, f), independent(b, f)
+    chord = np.abs(l1 - l2) / np.sqrt((1 + np.abs(l1) ** 2) * (1 + np.abs(l2) ** 2))
+    gap, at = nu_gap(a, b)
+    assert gap == pytest.approx(chord.max(), rel=1e-6)
+    assert gap >= chord.max() * (1 - 1e-9)
+    assert at == pytest.approx(f[chord.argmax()], rel=0.01 * zeta + 1e-7)
+
+
+def test_peaks_that_are_not_proved_are_not_stated(monkeypatch):
+    """With no round allowed, nothing is proved."""
+    monkeypatch.setattr(peaks, "MAX_ROUNDS", 0)
+    with pytest.raises(ControlError, match="cannot be stated"):
+        modal([(20.0, 0.7, 1.0)]).figures()
