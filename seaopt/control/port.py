@@ -106,7 +106,8 @@ class Port:
 
     def _poles(self) -> Complex[np.ndarray, " n"]:
         """Return the poles with link 2 at rest."""
-        return np.linalg.eigvals(self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed])
+        moved = self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed]
+        return np.linalg.eigvals(moved).astype(complex)
 
     def _beside(self, f: Frequencies) -> Frequencies:
         out = f.copy()
