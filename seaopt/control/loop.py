@@ -15,7 +15,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.control.digital import DigitalPlant
 from seaopt.control.law import TransferFunction
-from seaopt.control.peaks import HALF_POWER, TRACKING, Measured, measured
+from seaopt.control.peaks import HALF_POWER, TRACKING, measured
 from seaopt.control.response import ClosedLoop, close
 
 LOWEST_HZ = 1e-3
@@ -138,7 +138,6 @@ class Loop:
         found = measured(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
         (ms, mt, skew, noise, reference), ms_at = found.peaks, found.at[0]
-        phase, delay = _phase_margins(found)
         crossovers, slow, below = found.crossovers, found.sensitivity_edges, found.bandwidth_edges
         quiet = abs(found.ends[0, 0]) < HALF_POWER
         band = _tracking_band(system, found.band_edges)
@@ -153,25 +152,16 @@ class Loop:
             mt=float(mt),
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / found.static if found.static else np.inf,
-            gain_margin_db=_gain_margin(found),
-            phase_margin_deg=phase,
-            delay_margin_s=None if delay is None else delay * self.plant.sample_time_s,
+            gain_margin_db=_least(found.gains_db),
+            phase_margin_deg=_least(found.lags_deg),
+            delay_margin_s=_least(found.delays * self.plant.sample_time_s),
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
         )
 
 
-def _gain_margin(found: Measured) -> float | None:
-    factors = found.gain_factors
-    return float(np.min(np.abs(20.0 * np.log10(factors)))) if factors.size else None
-
-
-def _phase_margins(found: Measured) -> tuple[float | None, float | None]:
-    """Return the least phase (deg, of either sign) and the least delay (samples) that put L through -1."""
-    if not found.crossovers.size:
-        return None, None
-    angle = found.crossover_phases
-    return float(np.degrees(np.min(np.abs(angle)))), float(np.min(np.mod(angle, 2 * np.pi) / found.crossovers))
+def _least(sizes: Float[np.ndarray, " k"]) -> float | None:
+    return float(np.min(np.abs(sizes))) if sizes.size else None
 
 
 def _tracking_band(system: ClosedLoop, inner: Float[np.ndarray, " k"]) -> tuple[float, float] | None:

@@ -114,9 +114,7 @@ def margins(loop: Loop) -> Margins:
         )  # fmt: skip
     found = measured(system)
     hz = 1.0 / (2 * np.pi * loop.plant.sample_time_s)
-    gains = 20.0 * np.log10(found.gain_factors)
-    lag = np.degrees(found.crossover_phases)
-    delays = np.mod(found.crossover_phases, 2 * np.pi) / found.crossovers * loop.plant.sample_time_s
+    gains, lag, delays = found.gains_db, found.lags_deg, found.delays * loop.plant.sample_time_s
     least, soonest = (int(np.argmin(x)) if x.size else None for x in (np.abs(lag), delays))
     disks = {
         kind: disk(skew, float(found.at[curve]), system.sensitivity(found.at[curve : curve + 1])[0], hz)

@@ -62,6 +62,21 @@ class Measured:
     bandwidth_edges: Float[np.ndarray, " n"]
     band_edges: Float[np.ndarray, " o"]
 
+    @property
+    def gains_db(self) -> Float[np.ndarray, " l"]:
+        """The gain factors in dB: margins up positive, down negative."""
+        return 20.0 * np.log10(self.gain_factors)
+
+    @property
+    def lags_deg(self) -> Float[np.ndarray, " k"]:
+        """The phases at the crossovers in degrees: lag to -1 positive, lead negative."""
+        return np.degrees(self.crossover_phases)
+
+    @property
+    def delays(self) -> Float[np.ndarray, " k"]:
+        """The delay, in samples, that each crossover's phase amounts to."""
+        return np.mod(self.crossover_phases, 2 * np.pi) / self.crossovers
+
 
 def measured(system: ClosedLoop) -> Measured:
     """Return the peaks and crossings of a stable closed loop.

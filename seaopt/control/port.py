@@ -91,7 +91,7 @@ class Port:
     def modes_hz(self) -> tuple[Frequencies, Frequencies]:
         """Return frequency and half width of the poles with link 2 at rest."""
         poles = self._poles()
-        return np.abs(poles.imag) / (2 * np.pi), np.abs(poles.real) / (2 * np.pi)
+        return np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
 
     def link_held(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"], float]:
         """Return (a, b, c, d) from motor force to the fed-back one with link 2 at rest, what cannot move left out."""
@@ -113,7 +113,7 @@ class Port:
         out = f.copy()
         for pole in self._poles():
             near = np.abs(2j * np.pi * out - pole) < BESIDE * np.abs(pole)
-            out[near] = abs(pole.imag) * (1.0 + BESIDE) / (2 * np.pi)
+            out[near] = abs(complex(pole).imag) * (1.0 + BESIDE) / (2 * np.pi)
         return out
 
 
