@@ -248,8 +248,9 @@ def passivity_rows(
 
 def _held_stable(port: Port, controller: Controller) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
-    continuous = tuple(np.array([item]) for item in port.link_held())
-    a, b, c, d = hold(*continuous, controller.sample_time_s, np.array([port.delay_s]))
+    a, b, c, d = port.link_held()
+    late = np.array([port.delay_s])
+    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), controller.sample_time_s, late)
     plant = DigitalPlant(
         a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=controller.sample_time_s,
         delay_samples=controller.delay_samples, static_gain=np.nan,
