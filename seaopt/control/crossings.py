@@ -1,4 +1,4 @@
-"""Zeros of a curve over frequency that a grid brackets."""
+"""Zeros and minima of a curve over frequency that a grid brackets."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
+
+SAME = 1e-11  # of a frequency: nearer, two values of a curve differ by rounding, which would hide a minimum beside them
 
 
 def crossings(
@@ -31,3 +33,25 @@ def crossings(
         same = np.sign(curve(middle)) == left
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return 0.5 * (low + high)
+
+
+def with_minima(
+    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, " k"]:
+    """Return f with every local minimum of the curve on it refined by thirds, ascending.
+
+    Examples
+    --------
+    >>> with_minima(lambda f: (f - 0.7) ** 2, np.array([0.0, 1.0, 3.0])).round(6).tolist()
+    [0.0, 0.7, 1.0, 3.0]
+
+    """
+    apart = f[np.concatenate([[True], np.diff(f) > SAME * np.abs(f[1:])])]
+    values = curve(apart)
+    inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
+    low, high = apart[inner - 1], apart[inner + 1]
+    for _ in range(60 if inner.size else 0):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        lower = curve(left) < curve(right)
+        low, high = np.where(lower, low, left), np.where(lower, right, high)
+    return np.unique(np.concatenate([f, 0.5 * (low + high)]))

@@ -15,11 +15,14 @@ from jaxtyping import Complex, Float
 
 from seaopt.control.digital import DigitalPlant
 from seaopt.control.law import TransferFunction
-from seaopt.control.peaks import HALF_POWER, TRACKING, Measured, measured
+from seaopt.control.peaks import HALF_POWER, TRACKING, measured
 from seaopt.control.response import ClosedLoop, close
 
 LOWEST_HZ = 1e-3
-STABLE = 1.0 - 1e-11  # a spectral radius nearer to 1 is 1 to rounding
+# A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
+# nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
+# takes longer than 11 days at 1 kHz.
+STABLE, GROWING = 1.0 - 1e-11, 1.0 + 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,15 +112,18 @@ class Loop:
 
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
-        nyquist = self.plant.nyquist_hz
-        base = np.geomspace(LOWEST_HZ, nyquist, 1200)
+        base = np.geomspace(LOWEST_HZ, self.plant.nyquist_hz, 1200)
         poles = np.concatenate([np.linalg.eigvals(self.plant.a), self.eigenvalues()])
+        return np.union1d(base, self.about(poles))
+
+    def about(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """Return frequencies that resolve poles, up to the Nyquist frequency, unsorted."""
+        nyquist = self.plant.nyquist_hz
         f0 = np.abs(np.angle(poles)) / (2 * np.pi * self.plant.sample_time_s)
         width = np.maximum(np.abs(1.0 - np.abs(poles)) * nyquist / np.pi, 1e-9 * nyquist)
         fan = np.concatenate([[0.0], *[[-x, x] for x in np.geomspace(0.05, 30.0, 20)]])
         near = (f0[:, None] + width[:, None] * fan).ravel()
-        inside = near[(near > LOWEST_HZ) & (near < nyquist)]
-        return np.unique(np.concatenate([base, inside]))
+        return near[(near > LOWEST_HZ) & (near < nyquist)]
 
     def figures(self) -> LoopFigures:
         """Return the loop's figures."""
@@ -132,7 +138,6 @@ class Loop:
         found = measured(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
         (ms, mt, skew, noise, reference), ms_at = found.peaks, found.at[0]
-        phase, delay = _phase_margins(found)
         crossovers, slow, below = found.crossovers, found.sensitivity_edges, found.bandwidth_edges
         quiet = abs(found.ends[0, 0]) < HALF_POWER
         band = _tracking_band(system, found.band_edges)
@@ -147,25 +152,16 @@ class Loop:
             mt=float(mt),
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / found.static if found.static else np.inf,
-            gain_margin_db=_gain_margin(found),
-            phase_margin_deg=phase,
-            delay_margin_s=None if delay is None else delay * self.plant.sample_time_s,
+            gain_margin_db=_least(found.gains_db),
+            phase_margin_deg=_least(found.lags_deg),
+            delay_margin_s=_least(found.delays * self.plant.sample_time_s),
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
         )
 
 
-def _gain_margin(found: Measured) -> float | None:
-    factors = found.gain_factors
-    return float(np.min(np.abs(20.0 * np.log10(factors)))) if factors.size else None
-
-
-def _phase_margins(found: Measured) -> tuple[float | None, float | None]:
-    """Return the least phase (deg, of either sign) and the least delay (samples) that put L through -1."""
-    if not found.crossovers.size:
-        return None, None
-    angle = found.crossover_phases
-    return float(np.degrees(np.min(np.abs(angle)))), float(np.min(np.mod(angle, 2 * np.pi) / found.crossovers))
+def _least(sizes: Float[np.ndarray, " k"]) -> float | None:
+    return float(np.min(np.abs(sizes))) if sizes.size else None
 
 
 def _tracking_band(system: ClosedLoop, inner: Float[np.ndarray, " k"]) -> tuple[float, float] | None:

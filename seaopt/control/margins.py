@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loop import STABLE, Loop
+from seaopt.control.crossings import with_minima
+from seaopt.control.loop import GROWING, STABLE, Loop
 from seaopt.control.peaks import measured
 from seaopt.errors import ControlError
 
@@ -113,9 +114,7 @@ def margins(loop: Loop) -> Margins:
         )  # fmt: skip
     found = measured(system)
     hz = 1.0 / (2 * np.pi * loop.plant.sample_time_s)
-    gains = 20.0 * np.log10(found.gain_factors)
-    lag = np.degrees(found.crossover_phases)
-    delays = np.mod(found.crossover_phases, 2 * np.pi) / found.crossovers * loop.plant.sample_time_s
+    gains, lag, delays = found.gains_db, found.lags_deg, found.delays * loop.plant.sample_time_s
     least, soonest = (int(np.argmin(x)) if x.size else None for x in (np.abs(lag), delays))
     disks = {
         kind: disk(skew, float(found.at[curve]), system.sensitivity(found.at[curve : curve + 1])[0], hz)
@@ -170,7 +169,14 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
 
     where :math:`1 + \overline{L_2} L_1` winds about zero as often as :math:`L_2` has more poles outside the circle than
     :math:`L_1`; else it is 1 (Vinnicombe, Uncertainty and Feedback, 2001, 3.3). Computed on a grid that resolves the
-    poles of both, halved until neighbours turn by less than a right angle. A plant that is not finite is 1 from any.
+    poles of both loops, their plants and their laws, halved until neighbours turn by less than a right angle; every
+    local maximum on it is climbed by thirds. A plant that is not finite is 1 from any.
+
+    Raises
+    ------
+    ControlError
+        The loops run at different sample times.
+
     """
     if first.plant.sample_time_s != second.plant.sample_time_s:
         raise ControlError(
@@ -179,7 +185,9 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
         )
     if not all(np.all(np.isfinite(loop.eigenvalues())) for loop in (first, second)):
         return 1.0, None
-    f = np.union1d(first.grid(), second.grid())
+    loops = (first, second)
+    laws = [loop.about(np.linalg.eigvals(loop.measurement.state_space()[0]).astype(complex)) for loop in loops]
+    f = np.unique(np.concatenate([*(loop.grid() for loop in loops), *laws]))
     for _ in range(40):
         turning = _turning(first, second, f)
         wide = np.flatnonzero(np.abs(np.angle(turning[1:] / turning[:-1])) > np.pi / 2)
@@ -188,13 +196,18 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
         f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
     turning = _turning(first, second, f)
     winding = round(float(np.sum(np.angle(turning[1:] / turning[:-1]))) / np.pi)
-    outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > 1.0 + 1e-9)) for loop in (first, second)]
+    outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > GROWING)) for loop in (first, second)]
     if winding != outside[0] - outside[1]:
         return 1.0, None
-    l1, l2 = first.open_loop(f), second.open_loop(f)
-    chord = np.abs(l1 - l2) / np.sqrt((1.0 + np.abs(l1) ** 2) * (1.0 + np.abs(l2) ** 2))
+    f = with_minima(lambda x: -_chord(first, second, x), f)
+    chord = _chord(first, second, f)
     worst = int(np.argmax(chord))
     return float(chord[worst]), float(f[worst])
+
+
+def _chord(first: Loop, second: Loop, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    l1, l2 = first.open_loop(f), second.open_loop(f)
+    return np.abs(l1 - l2) / np.sqrt((1.0 + np.abs(l1) ** 2) * (1.0 + np.abs(l2) ** 2))
 
 
 def _turning(first: Loop, second: Loop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:

@@ -3,7 +3,8 @@ r"""Passivity of the controlled actuator at link 2: what it does to a hand, a le
 Link 1 is held, link 2 is moved with the speed v, and F2 v is the power that goes into the actuator (link 2 feels -F2,
 so that a mass has the impedance +j omega m). The actuator is passive where its impedance Z = F2/v has Re Z >= 0; where
 it is so at every frequency, nothing passive that link 2 is attached to is made unstable by it (Colgate, Hogan, Int. J.
-Control 48(1), 1988).
+Control 48(1), 1988). That takes a loop that does not grow with link 2 held, Z having no pole on the right: of any
+other, Re Z says nothing.
 
 With :math:`F_1 = G_{11} F_m + G_{12} v` and :math:`F_2 = G_{21} F_m + G_{22} v` of the plant's linearisation, and
 :math:`F_m = -C' F_1`,
@@ -41,8 +42,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.controller import Controller
-from seaopt.control.crossings import crossings
+from seaopt.control.crossings import crossings, with_minima
+from seaopt.control.digital import DigitalPlant, hold
 from seaopt.control.law import TransferFunction
+from seaopt.control.loop import GROWING, Loop
 from seaopt.control.port import Frequencies, Port, Response, held, port_of, sight
 from seaopt.control.spec import ControllerSpec
 from seaopt.errors import ControlError
@@ -64,10 +67,12 @@ class Passivity:
     ----------
     low_hz, high_hz : float
         What was looked at.
+    held_stable : bool
+        No closed-loop eigenvalue is outside the circle with link 2 held.
     bands_hz : tuple of (low, high)
-        Where Re Z >= 0.
+        Where Re Z >= 0; none if not `held_stable`.
     violated_hz : float or None
-        The lowest frequency at which Re Z < 0 begins; None: nowhere.
+        The lowest frequency at which Re Z < 0 begins, `low_hz` if not `held_stable`; None: nowhere.
     least_damping_N_s_per_m : float
         The least Re Z; where it is negative, this much viscous damping at the port would make up for it.
     least_hz : float
@@ -81,6 +86,7 @@ class Passivity:
 
     low_hz: float
     high_hz: float
+    held_stable: bool
     bands_hz: tuple[tuple[float, float], ...]
     violated_hz: float | None
     least_damping_N_s_per_m: float
@@ -112,6 +118,8 @@ class Passivity:
     def __repr__(self) -> str:
         bands = ", ".join(f"{low:.4g} to {high:.4g} Hz" for low, high in self.bands_hz) or "nowhere"
         lines = [f"Passive at link 2: {bands} (of {self.low_hz:g} to {self.high_hz:g} Hz)"]
+        if not self.held_stable:
+            return f"{lines[0]}\n  the loop is UNSTABLE with link 2 held"
         if self.violated_hz is not None:
             lines.append(
                 f"  violated from {self.violated_hz:.4g} Hz, most at {self.least_hz:.4g} Hz: Re Z = "
@@ -170,13 +178,15 @@ def passivity(
     port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
     law = controller.measurement
     impedance, angle = _curves(port, law, ts, controller.delay_samples)
-    f = _with_minima(angle, _with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
-    bands, violated = _bands(lambda x: angle(x) + ROUNDING, f)
+    f = with_minima(angle, with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
+    stable = _held_stable(port, controller)
+    bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
     least = int(np.argmin(np.real(z)))
     return Passivity(
         low_hz=low_hz,
         high_hz=high,
+        held_stable=stable,
         bands_hz=bands,
         violated_hz=violated,
         least_damping_N_s_per_m=float(np.real(z[least])),
@@ -191,7 +201,7 @@ def least_cosine(
 ) -> tuple[float, float]:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, and the frequency in Hz where it is."""
     _, angle = _curves(port, law, sample_time_s, delay_samples)
-    f = _with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
+    f = with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
     found = angle(f)
     least = int(np.argmin(found))
     return float(found[least]), float(f[least])
@@ -236,6 +246,19 @@ def passivity_rows(
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 
+def _held_stable(port: Port, controller: Controller) -> bool:
+    """Tell whether nothing grows in the sampled loop with link 2 held."""
+    a, b, c, d = port.link_held()
+    late = np.array([port.delay_s])
+    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), controller.sample_time_s, late)
+    plant = DigitalPlant(
+        a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=controller.sample_time_s,
+        delay_samples=controller.delay_samples, static_gain=np.nan,
+    )  # fmt: skip
+    poles = Loop(plant=plant, reference=controller.measurement, measurement=controller.measurement).eigenvalues()
+    return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
+
+
 def _curves(port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
@@ -260,18 +283,6 @@ def _grid(port: Port, law: TransferFunction, sample_time_s: float, low_hz: float
     near = (at[:, None] + np.maximum(width, 1e-6 * high_hz)[:, None] * fan).ravel()
     inside = near[(near > low_hz) & (near < high_hz)]
     return np.unique(np.concatenate([np.geomspace(low_hz, high_hz, POINTS), inside]))
-
-
-def _with_minima(curve: Callable[[Frequencies], Frequencies], f: Frequencies) -> Float[np.ndarray, " k"]:
-    """Return f with every local minimum of the curve, by thirds."""
-    values = curve(f)
-    inner = np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])) + 1
-    low, high = f[inner - 1], f[inner + 1]
-    for _ in range(60 if inner.size else 0):
-        left, right = low + (high - low) / 3, high - (high - low) / 3
-        lower = curve(left) < curve(right)
-        low, high = np.where(lower, low, left), np.where(lower, right, high)
-    return np.unique(np.concatenate([f, 0.5 * (low + high)]))
 
 
 def _bands(

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.response import ClosedLoop, Indices, arcs, bracketed, sign_changes
+from seaopt.errors import ControlError
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PROOF = 1e-7
@@ -22,7 +23,7 @@ CURVES = 5
 SENSITIVITY, TRACKING = 0, 4
 REFINED = 3  # local maxima refined of each curve before the proof
 MAX_ROUNDS = 20
-ON_CIRCLE = 1e-5  # how near a pole of L is on the circle: a double one is only known to the root of rounding
+BESIDE = 1e-5  # how near a pole of L on the circle -1/L is that pole's: a double one is known to the root of rounding
 RESOLVED = 1e-9
 
 
@@ -61,9 +62,31 @@ class Measured:
     bandwidth_edges: Float[np.ndarray, " n"]
     band_edges: Float[np.ndarray, " o"]
 
+    @property
+    def gains_db(self) -> Float[np.ndarray, " l"]:
+        """The gain factors in dB: margins up positive, down negative."""
+        return 20.0 * np.log10(self.gain_factors)
+
+    @property
+    def lags_deg(self) -> Float[np.ndarray, " k"]:
+        """The phases at the crossovers in degrees: lag to -1 positive, lead negative."""
+        return np.degrees(self.crossover_phases)
+
+    @property
+    def delays(self) -> Float[np.ndarray, " k"]:
+        """The delay, in samples, that each crossover's phase amounts to."""
+        return np.mod(self.crossover_phases, 2 * np.pi) / self.crossovers
+
 
 def measured(system: ClosedLoop) -> Measured:
-    """Return the peaks and crossings of a stable closed loop."""
+    """Return the peaks and crossings of a stable closed loop.
+
+    Raises
+    ------
+    ControlError
+        A peak cannot be proved.
+
+    """
     peaks, at = _candidates(system)
     ends = system.curves(np.array([0.0, np.pi]))
     static = float(np.abs(ends[TRACKING, 0]))
@@ -85,14 +108,28 @@ def measured(system: ClosedLoop) -> Measured:
         return np.array(rows)[which, np.arange(theta.size)]
 
     found = sign_changes(function, edges[: len(pencils)])
-    crossovers, turns = found[0], np.concatenate([[0.0], found[1], [np.pi]])
+    turns = np.concatenate([[0.0], found[1], [np.pi]])
     factors, angles = _gain_factors(system, turns)
-    s, t = system.curves(crossovers)[:2]
     return Measured(
-        peaks=peaks, at=at, ends=ends, static=static, crossovers=crossovers, crossover_phases=np.angle(-t / s),
+        peaks=peaks, at=at, ends=ends, static=static, crossovers=found[0], crossover_phases=_phases(system, found[0]),
         gain_factors=factors, gain_angles=angles, sensitivity_edges=found[2],
         bandwidth_edges=found[5] if static else np.empty(0), band_edges=np.sort(np.concatenate(found[3:5])),
     )  # fmt: skip
+
+
+def crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return where abs(L) = 1, and the phase of -L there (rad); the loop need not be stable."""
+
+    def function(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
+        return 2.0 * system.curves(theta)[0].real - 1.0
+
+    (found,) = sign_changes(function, arcs([system.equal()]))
+    return found, _phases(system, found)
+
+
+def _phases(system: ClosedLoop, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    s, t = system.curves(theta)[:2]
+    return np.angle(-t / s)
 
 
 def _gain_factors(
@@ -101,12 +138,16 @@ def _gain_factors(
     """Return the factors -1/L at angles where L is real and negative, and these angles.
 
     A pole of L on the circle, an integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is
-    rounding.
+    rounding. A pole is on the circle if it is no further from it than it is known; next to a light mode, which is off
+    it, a crossing is one.
     """
-    s, t = np.real(system.curves(turns)[:2])
     with np.errstate(divide="ignore", invalid="ignore"):
-        factors = -s / t
-    infinite = np.any(np.abs(np.exp(1j * turns)[:, None] - system.opened) < ON_CIRCLE, axis=1)
+        factors = -np.real(system.sensitivity(turns) / system.curves(turns)[1])
+    poles = system.opened
+    beside = np.abs(np.exp(1j * turns)[:, None] - poles) < BESIDE
+    if np.any(beside):
+        beside &= np.abs(np.abs(poles) - 1.0) <= system.resolution()
+    infinite = np.any(beside, axis=1)
     crossing = (factors > RESOLVED) & (factors < 1.0 / RESOLVED) & ~infinite
     return factors[crossing], turns[crossing]
 
@@ -153,7 +194,14 @@ def _proved(
     system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curves: Int[np.ndarray, " c"],
     edges: list[Float[np.ndarray, " _"]],
 ) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
-    """Return the peaks, raised until no arc of the level set just above them holds a larger value."""
+    """Return the peaks, raised until no arc of the level set just above them holds a larger value.
+
+    Raises
+    ------
+    ControlError
+        That does not come to an end.
+
+    """
     for _ in range(MAX_ROUNDS):
         own = np.repeat(curves, [row.size - 1 for row in edges])
         low, high = np.concatenate([row[:-1] for row in edges]), np.concatenate([row[1:] for row in edges])
@@ -161,7 +209,7 @@ def _proved(
         values = np.abs(system.curves(middle)[own, np.arange(own.size)])
         above = values > peaks[own] * (1.0 + PROOF)
         if not np.any(above):
-            break
+            return peaks, at
         own, low, high = own[above], low[above], high[above]
         for k, value, theta in zip(own, values[above], middle[above], strict=True):
             if value > peaks[k]:
@@ -171,4 +219,7 @@ def _proved(
         peaks, at = _climbed(system, peaks, at, own[rising], low[rising], high[rising])
         curves = np.unique(own)
         edges = arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])
-    return peaks, at
+    raise ControlError(
+        f"the peaks of this loop are still rising after {MAX_ROUNDS} rounds, so that they cannot be stated; look at "
+        "modes of the plant or the law that lie closer to the unit circle than rounding resolves"
+    )

@@ -14,6 +14,7 @@ from seaopt.plants import Plant, state_space
 
 Frequencies = Float[np.ndarray, " m"]
 Response = Complex[np.ndarray, " m"]
+BESIDE = 1e-7  # of a pole: nearer, the response is evaluated this far beside it
 NOT_AFFINE = 1e-6  # Delta of this share of its terms, and more, makes the condition quadratic in the gains
 
 
@@ -64,8 +65,11 @@ class Port:
     delay_s: float = 0.0
 
     def response(self, f: Frequencies) -> PortResponse:
-        """Return the responses to motor force and to motion, Fe2 being what that motion takes."""
-        n, s = self.motor.size, 2j * np.pi * f
+        """Return the responses to motor force and to motion, Fe2 being what that motion takes.
+
+        They are infinite at an undamped pole, though Z under feedback is not: there they are those just beside it.
+        """
+        n, s = self.motor.size, 2j * np.pi * self._beside(f)
         inner = np.zeros((f.size, n + 1, n + 1), dtype=complex)
         inner[:, :n, :n] = s[:, None, None] * np.eye(n) - self.a
         inner[:, :n, n] = -self.force
@@ -86,9 +90,31 @@ class Port:
 
     def modes_hz(self) -> tuple[Frequencies, Frequencies]:
         """Return frequency and half width of the poles with link 2 at rest."""
+        poles = self._poles()
+        return np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
+
+    def link_held(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"], float]:
+        """Return (a, b, c, d) from motor force to the fed-back one with link 2 at rest, what cannot move left out."""
+        n, at = self.motor.size, self.force[self.speed]
+        taken, pulled = -self.a[self.speed] / at, -self.motor[self.speed] / at  # Fe2 of x and of F_m
+        a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pulled
+        c, d = self.feedback[:n] + self.feedback[n + 1] * taken, self.feedback[n] + self.feedback[n + 1] * pulled
+        moving = np.arange(n) != self.speed
+        while np.any(still := moving & ~np.any(a[:, moving], axis=1) & (b == 0.0)):
+            moving &= ~still
+        return a[np.ix_(moving, moving)], b[moving], c[moving], float(d)
+
+    def _poles(self) -> Complex[np.ndarray, " n"]:
+        """Return the poles with link 2 at rest."""
         moved = self.a - np.outer(self.force, self.a[self.speed]) / self.force[self.speed]
-        poles = np.linalg.eigvals(moved)
-        return np.abs(poles.imag) / (2 * np.pi), np.abs(poles.real) / (2 * np.pi)
+        return np.linalg.eigvals(moved).astype(complex)
+
+    def _beside(self, f: Frequencies) -> Frequencies:
+        out = f.copy()
+        for pole in self._poles():
+            near = np.abs(2j * np.pi * out - pole) < BESIDE * np.abs(pole)
+            out[near] = abs(complex(pole).imag) * (1.0 + BESIDE) / (2 * np.pi)
+        return out
 
 
 def port_of(plant: Plant, params: ParameterSet, measured: str, current_per_force_A_per_N: float) -> Port:

@@ -41,7 +41,9 @@ from seaopt.control.law import TransferFunction
 SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
 SAME_ROOT = 1e-7
 NEAR = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction
+STRAIGHT = 1e-6  # what is left of a function, of its value at the ends of that, where it is a straight line there
 MAX_STEPS = 100
+ROUNDINGS = 100 * float(np.finfo(float).eps)  # error of a sampled plant or a law, as a fraction
 LARGEST = 1e100  # entry of a loop's matrices: beyond, its eigenvalues cannot be computed
 
 Pencil = tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]
@@ -61,6 +63,8 @@ class ClosedLoop:
         The complex Schur form of `a`, and `b` and `c` in its basis.
     opened
         The poles of plant and law, which are the zeros of S.
+    blocks
+        The matrices of plant and law whose eigenvalues those are.
 
     """
 
@@ -72,6 +76,7 @@ class ClosedLoop:
     right: Complex[np.ndarray, "n 2"]
     left: Complex[np.ndarray, "2 n"]
     opened: Complex[np.ndarray, " n"]
+    blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
 
     @property
     def poles(self) -> Complex[np.ndarray, " n"]:
@@ -86,6 +91,14 @@ class ClosedLoop:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
         z = np.exp(1j * theta)[:, None]
         return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
+
+    def resolution(self) -> Float[np.ndarray, " n"]:
+        """Return how well each pole of plant and law is known: rounding times its condition, large of a double one.
+
+        The first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
+        7.2.2).
+        """
+        return np.concatenate([_resolution(block) for block in self.blocks])
 
     def slopes(self, theta: Float[np.ndarray, " m"]) -> Float[np.ndarray, "5 m"]:
         """Return half the derivative of -1/abs(curve)^2 along the angle.
@@ -175,7 +188,9 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     whole = np.block([[a, b], [c, np.zeros((2, 2))]])
     if not np.max(np.abs(whole)) < LARGEST:
         gone = np.diag(opened)
-        return ClosedLoop(a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened)
+        return ClosedLoop(
+            a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, ak)
+        )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
         scale = scale[: n + m] / np.sqrt(scale[-2] * scale[-1])
@@ -185,8 +200,23 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     triangle, basis = (np.asarray(item) for item in schur(a, output="complex")[:2])
     opened = np.concatenate([np.linalg.eigvals(ap), np.linalg.eigvals(ak)]).astype(complex)
     return ClosedLoop(
-        a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened
+        a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened,
+        blocks=(ap, ak),
     )  # fmt: skip
+
+
+def _resolution(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+    """Return the eigenvalues' errors for a backward error of ROUNDINGS, in the order of `numpy.linalg.eigvals`."""
+    from scipy.linalg import eig, matrix_balance
+
+    if not a.size:
+        return np.empty(0)
+    balanced: Any = matrix_balance(a, permute=False)[0]
+    values, left, right = (np.asarray(item) for item in eig(balanced, left=True, right=True))
+    with np.errstate(divide="ignore"):  # of a defective eigenvalue the two vectors are at right angles
+        errors = ROUNDINGS * np.linalg.norm(balanced) / np.abs(np.sum(left.conj() * right, axis=0))
+    order = np.argmin(np.abs(np.linalg.eigvals(a)[:, None] - values), axis=1)
+    return errors[order]
 
 
 def law_state_space(
@@ -260,11 +290,14 @@ def sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) ->
     tight = at_low * at_high < 0.0
     found = low.copy()
     found[tight] += ((high - low) * at_low / (at_low - at_high))[tight]
-    wide = np.flatnonzero(~tight)  # the eigenvalue is not quite where the function is zero
-    before, after = flips[wide], flips[wide] + 1
-    found[wide] = bracketed(
-        lambda x, i: function(x, own[wide[i]]), theta[before], theta[after], values[before], values[after], 1e-13
+    bent = tight & (np.abs(function(found, own)) > STRAIGHT * np.maximum(np.abs(at_low), np.abs(at_high)))
+    left = np.flatnonzero(~tight | bent)  # the eigenvalue is not quite where the function is zero, or a mode is narrow
+    before, after = flips[left], flips[left] + 1
+    close_by, ends = bent[left], (theta[before], theta[after], values[before], values[after])
+    low, high, at_low, at_high = (
+        np.where(close_by, inner[left], outer) for inner, outer in zip((low, high, at_low, at_high), ends, strict=True)
     )
+    found[left] = bracketed(lambda x, i: function(x, own[left[i]]), low, high, at_low, at_high, 1e-13)
     return [found[own == row] for row in range(len(edges))]
 
 

@@ -28,7 +28,7 @@ from seaopt.control.controller import Controller
 from seaopt.control.convex import improved
 from seaopt.control.digital import sample
 from seaopt.control.law import Nominal
-from seaopt.control.loop import Loop, LoopFigures
+from seaopt.control.loop import GROWING, Loop, LoopFigures
 from seaopt.control.polish import polished
 from seaopt.control.port import port_of
 from seaopt.control.spec import LOWEST_HZ, ControllerSpec
@@ -158,7 +158,7 @@ def make_task(
             "feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
     for name, sampled in zip(names, plants, strict=True):
-        if np.max(np.abs(np.linalg.eigvals(sampled.a))) > 1.0 + 1e-9:
+        if np.max(np.abs(np.linalg.eigvals(sampled.a))) > GROWING:
             raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
     port = None if spec.passive_band_hz is None else port_of(plant, params, spec.measured, gain)

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
+from seaopt.control.loop import GROWING
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -30,7 +31,6 @@ MASSES_KG = (0.1, 1000.0)
 STIFFNESSES_N_PER_M = (1e1, 1e8)
 DAMPINGS_N_S_PER_M = (0.0, 10.0, 100.0, 1000.0)
 POINTS = 25
-ROUNDING = 1e-9  # a spectral radius this far above 1 is rounding: growth by e in 11 days at 1 kHz
 BISECTIONS = 30
 SPRING = Parameter(name="k_e", value=0.0, unit="N/m", min=0.0, description="stiffness of the environment")
 DAMPER = Parameter(name="d_e", value=0.0, unit="N s/m", min=0.0, description="damping of the environment")
@@ -88,8 +88,8 @@ class StabilityMap:
 
     @property
     def stable(self) -> Bool[np.ndarray, "d m k"]:
-        """Which environments of the grid the loop is stable against."""
-        return self.spectral_radius <= 1.0 + ROUNDING
+        """Which environments of the grid the loop is stable against: nothing grows (`GROWING` of the loop's module)."""
+        return self.spectral_radius <= GROWING
 
     @property
     def everywhere(self) -> bool:
@@ -215,7 +215,7 @@ def coupled_stability(
         mass=mass, stiffness=stiffness, damping=damping, spectral_radius=radius,
         boundary=tuple(
             _boundary(controller, coupled, parameters, mass, stiffness, float(each), stable)
-            for each, stable in zip(damping, radius <= 1.0 + ROUNDING, strict=True)
+            for each, stable in zip(damping, radius <= GROWING, strict=True)
         ),
         worst=environment(controller, coupled, parameters, float(m[at]), float(k[at]), float(d[at])),
         fixed_stable=_fixed(controller, coupled, parameters),
@@ -233,7 +233,7 @@ def environment(
     return Environment(
         m_2=m_2, k_e=k_e, d_e=d_e, spectral_radius=radius,
         frequency_hz=float(abs(np.angle(largest)) / (2 * np.pi * period)),
-        doubling_s=math.log(2.0) * period / math.log(radius) if radius > 1.0 + ROUNDING else None,
+        doubling_s=math.log(2.0) * period / math.log(radius) if radius > GROWING else None,
     )  # fmt: skip
 
 
@@ -261,7 +261,7 @@ def _radii(
 def _fixed(controller: Controller, coupled: Plant, parameters: ParameterSet) -> bool:
     """Tell whether the loop is stable with the link fixed: what a mass of 1e9 kg on the ground is to it."""
     values = coupled.complete(parameters).update(m_2=1e9, k_e=1e12, d_e=1e9)
-    return bool(np.max(np.abs(controller.close(coupled, values).eigenvalues())) <= 1.0 + ROUNDING)
+    return bool(np.max(np.abs(controller.close(coupled, values).eigenvalues())) <= GROWING)
 
 
 def _boundary(
@@ -280,6 +280,6 @@ def _boundary(
     for _ in range(BISECTIONS if len(kept) else 0):
         middle = 0.5 * (kept + lost)
         at = np.exp(middle)
-        good = _radii(controller, coupled, parameters, at[:, 0], at[:, 1], np.full(len(at), damping)) <= 1.0 + ROUNDING
+        good = _radii(controller, coupled, parameters, at[:, 0], at[:, 1], np.full(len(at), damping)) <= GROWING
         kept, lost = np.where(good[:, None], middle, kept), np.where(good[:, None], lost, middle)
     return np.exp(0.5 * (kept + lost))

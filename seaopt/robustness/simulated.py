@@ -12,15 +12,14 @@ import numpy as np
 from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.passivity import Passivity, passivity
-from seaopt.errors import ControlError, SimulationError
+from seaopt.errors import ControlError, SeaoptError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.environments import StabilityMap, coupled_stability
 from seaopt.robustness.large_signal import LargeSignal, large_signal
-from seaopt.robustness.verification import Verification, verify
+from seaopt.robustness.verification import Verification, check_plants, verify
 
 Found = TypeVar("Found")
-Refusal = type[Exception] | tuple[type[Exception], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,26 +126,27 @@ def simulated(
         raise ControlError(
             "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
         )
+    check_plants(plants, draws or {}, {})
     plant, values = controller.design
     device = sensors or Sensors()
     left_out: dict[str, str] = {}
 
-    def had(what: str, refusal: Refusal, verb: Callable[[], Found]) -> Found | None:
+    def had(what: str, verb: Callable[[], Found]) -> Found | None:
         try:
             return verb()
-        except refusal as error:
+        except SeaoptError as error:
             left_out[what] = str(error)
-            return None
+        except np.linalg.LinAlgError as error:
+            left_out[what] = f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
+        return None
 
     return Simulated(
-        verification=had("simulation", SimulationError, lambda: verify(
+        verification=had("simulation", lambda: verify(
             controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed
         )),
-        large_signal=had(
-            "large signals", (ControlError, SimulationError), lambda: large_signal(controller, plant, values)
-        ),
-        passivity=had("passivity", ControlError, lambda: passivity(controller, plant, values)),
-        environments=had("environments", ControlError, lambda: coupled_stability(controller, plant, values)),
+        large_signal=had("large signals", lambda: large_signal(controller, plant, values)),
+        passivity=had("passivity", lambda: passivity(controller, plant, values)),
+        environments=had("environments", lambda: coupled_stability(controller, plant, values)),
         left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
     )  # fmt: skip
 
@@ -157,6 +157,8 @@ def _large(found: LargeSignal) -> str:
 
 
 def _bands(found: Passivity) -> str:
+    if not found.held_stable:
+        return "nowhere: the loop is UNSTABLE with link 2 held"
     bands = ", ".join(f"{low:.3g} to {high:.4g} Hz" for low, high in found.bands_hz) or "nowhere"
     lost = "" if found.violated_hz is None else f"; {-found.least_damping_N_s_per_m:.3g} N s/m are missing elsewhere"
     return bands + lost

@@ -161,7 +161,7 @@ def verify(
     (True, 11)
 
     """
-    _check(plants, draws or {}, partners or {})
+    check_plants(plants, draws or {}, partners or {})
     stages = {
         name: Stage(
             controller=controller, plant=plant, partner=_partner(name, plant, plants, controller, partners or {}),
@@ -197,7 +197,8 @@ def verify(
     )  # fmt: skip
 
 
-def _check(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
+def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
+    """Refuse no plants at all, and draws or partners of plants that are not there."""
     if not isinstance(plants, Mapping) or not plants:
         raise ControlError("verify needs a mapping of name to plant with at least one; give {name: plant}")
     for what, given in (("draws", draws), ("partners", partners)):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import DigitalPlant, Loop, TransferFunction
+from seaopt.control import DigitalPlant, Loop, TransferFunction, peaks
 from seaopt.control.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from tests.control.test_loop import loop_of
@@ -354,3 +354,68 @@ def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
         ends = [np.array(h(x0 + s * step, current, p)).ravel()[0] for s in (1, -1)]
         assert c[0][i] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-4, abs=1e-2)
     assert params["phi"].value == 0.4
+
+
+def velocity(hz, zeta, gain, ts=1e-3, delay=1):
+    """A light mode under feedback of its own speed that undoes a share `gain` of its damping."""
+    w = 2 * np.pi * hz
+    a, b, c = np.array([[0, w], [-w, -2 * zeta * w]]), np.array([[0.0], [w]]), np.array([[0.0, 1.0]])
+    a, b, c, _, _ = cont2discrete((a, b, c, np.zeros((1, 1))), ts)
+    plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=delay, static_gain=0.0)
+    law = gained(-gain * 2 * zeta)
+    return Loop(plant=plant, reference=law, measurement=law)
+
+
+@pytest.mark.parametrize("zeta", [1e-2, 1e-3, 1e-5])
+@pytest.mark.parametrize(("hz", "gain"), [(0.1, 0.3), (1.0, 0.3), (1.0, 0.8), (30.0, 0.3), (400.0, 0.8)])
+def test_a_crossing_next_to_a_light_mode_is_one(hz, zeta, gain):
+    """The factor that takes the damping away, by bisection on NumPy's eigenvalues; the pole is 6e-9 to 0.03 away."""
+    loop = velocity(hz, zeta, gain, delay=int(hz < 100))
+    low, high = 1.0, 100.0
+    assert np.max(np.abs(poles_of(loop, high))) > 1.0 > np.max(np.abs(poles_of(loop)))
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if np.max(np.abs(poles_of(loop, middle))) < 1.0 else (low, middle)
+    found = margins(loop)
+    assert 10 ** (found.gain_up_db / 20) == pytest.approx(low, rel=1e-5)
+    assert found.gain_up_db == pytest.approx(loop.figures().gain_margin_db, rel=1e-12)
+    assert any(abs(f - hz) < 0.2 * hz for f, _ in found.gain_crossings)
+
+
+@pytest.mark.parametrize("hz", [0.1, 1.0, 30.0, 400.0])
+def test_an_undamped_mode_is_no_crossing(hz):
+    """On the circle to rounding: 1 + L has no zero there for any factor but none at all."""
+    loop = velocity(hz, 0.0, 0.0, delay=int(hz < 100))
+    law = gained(1e-3)
+    loop = Loop(plant=loop.plant, reference=law, measurement=law)
+    found = margins(loop)
+    up, down = (1e9 if x is None else 10 ** (x / 20) for x in (found.gain_up_db, found.gain_down_db))
+    assert found.disks
+    assert down == 1e9
+    for factor in np.geomspace(1e-3, 0.999 * min(up, 1e6), 50):
+        assert np.max(np.abs(poles_of(loop, factor))) < 1.0
+    assert up == 1e9 or np.max(np.abs(poles_of(loop, 1.001 * up))) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("hz", "zeta", "shift"), [(77.123, 1e-3, 1.0), (77.123, 1e-4, 1.0003), (3.21, 1e-5, 1.00001), (431.7, 1e-3, 1.002)]
+)
+def test_the_nu_gap_of_two_light_modes_is_that_of_a_grid_laid_about_them(hz, zeta, shift):
+    a, b = (
+        modal([(20.0, 0.7, 0.3), mode], delay=1, law=gained(0.2))
+        for mode in ((hz, zeta, 3 * zeta), (hz * shift, 1.5 * zeta, 3 * zeta))
+    )
+    f = np.concatenate([np.geomspace(0.01, 499.9, 20_000), hz * (1 + 60 * zeta * np.linspace(-1, 1, 100_001))])
+    l1, l2 = independent(a, f), independent(b, f)
+    chord = np.abs(l1 - l2) / np.sqrt((1 + np.abs(l1) ** 2) * (1 + np.abs(l2) ** 2))
+    gap, at = nu_gap(a, b)
+    assert gap == pytest.approx(chord.max(), rel=1e-6)
+    assert gap >= chord.max() * (1 - 1e-9)
+    assert at == pytest.approx(f[chord.argmax()], rel=0.01 * zeta + 1e-7)
+
+
+def test_peaks_that_are_not_proved_are_not_stated(monkeypatch):
+    """With no round allowed, nothing is proved."""
+    monkeypatch.setattr(peaks, "MAX_ROUNDS", 0)
+    with pytest.raises(ControlError, match="cannot be stated"):
+        modal([(20.0, 0.7, 1.0)]).figures()

@@ -209,7 +209,7 @@ def test_a_violation_between_grid_points_is_found(thor, stand):
     """A resonance of the law 1e-3 Hz wide at 12.3456 Hz."""
     pole = np.exp((-2 * np.pi * 5e-4 + 2j * np.pi * 12.3456) * TS)
     den = np.array([1.0, -2 * pole.real, abs(pole) ** 2])
-    law = TransferFunction(num=3.0 * den + np.array([0.0, -3e-5, 3e-5]), den=den)
+    law = TransferFunction(num=3.0 * den + np.array([0.0, 3e-5, -3e-5]), den=den)
     controller = replace(tuned(), reference=law, measurement=law)
     found = passivity(controller, stand, thor, high_hz=60.0)
     f = np.linspace(12.33, 12.36, 100_001)
@@ -263,3 +263,53 @@ def test_what_is_found_says_where(thor, stand):
     assert not found.holds((0.1, 1.01 * found.violated_hz))
     assert f"violated from {found.violated_hz:.4g} Hz" in repr(found)
     assert set(found.to_dict()) >= {"bands_hz", "violated_hz", "least_hz", "limit_hz"}
+
+
+def spun(params, law, delay=1):
+    """The eigenvalues of the stand's loop under F_m = -law F1, in NumPy alone."""
+    m, b, k, m_l = figures(params)
+    block = np.zeros((3, 3))
+    block[0, 1] = 1.0
+    block[1] = np.array([-k, -b, 1.0]) / (m + m_l)
+    step = expm(block * TS)
+    big = np.zeros((2 + delay, 2 + delay))
+    big[:2, :2], big[:2, -1] = step[:2, :2], step[:2, 2]
+    big[2, 0] += -law * k
+    for i in range(1, delay):
+        big[2 + i, 1 + i] = 1.0
+    return np.linalg.eigvals(big)
+
+
+@pytest.mark.parametrize("gain", [-3.0, -1.05, 0.0, 1.0, 5.0, 10.0, 20.0, 30.0])
+def test_a_loop_that_grows_with_the_link_held_is_passive_nowhere(gain, thor, stand):
+    """Re Z >= 0 below 26 Hz under k_p = 30 says nothing: an eigenvalue is at 1.027."""
+    law = TransferFunction(num=np.array([gain]), den=np.array([1.0]))
+    controller = replace(tuned(), reference=law, measurement=law)
+    grows = bool(np.max(np.abs(spun(thor, gain))) > 1.0)
+    for plant in (stand, moving_output()):  # what link 2 is does not matter
+        found = passivity(controller, plant, thor)
+        assert found.held_stable is found.to_dict()["held_stable"] is not grows
+        assert bool(found.bands_hz) is not grows
+        assert ("UNSTABLE with link 2 held" in repr(found)) is grows
+        if grows:
+            assert not found.holds((1.0, 20.0))
+            assert found.violated_hz == found.low_hz
+
+
+def test_an_undamped_pole_is_no_hole(thor, stand):
+    """At the pole itself the responses are infinite and Z under feedback is that of the equations."""
+    params = thor.update(b_r=0.0)
+    m, _, k, m_l = figures(params)
+    f = np.sqrt(k / (m + m_l)) / (2 * np.pi) * np.array([1.0, 1.0 + 1e-15, 1.0 - 1e-12, 1.0 + 1e-9, 1.0 + 1e-6, 1.1])
+    s = 2j * np.pi * f
+    port = port_of(stand, params, "F1", current_per_force(stand, params))
+    c = 3.0 + 0.02 * s
+    found = port.response(f).impedance(c)
+    np.testing.assert_allclose(found, IMPEDANCES["unlumped", "link1"](m, 0.0, k, m_l, c, s), rtol=1e-6)
+
+
+def test_an_actuator_without_damping_has_the_bands_of_one_with_hardly_any(thor, stand):
+    none, hardly = (passivity(tuned(), stand, thor.update(b_r=b)) for b in (0.0, 1e-12))
+    np.testing.assert_allclose(none.bands_hz, hardly.bands_hz, rtol=1e-6)
+    assert none.held_stable
+    assert none.least_damping_N_s_per_m == pytest.approx(hardly.least_damping_N_s_per_m, rel=1e-6)

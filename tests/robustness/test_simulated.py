@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import seaopt as so
@@ -109,3 +111,18 @@ def test_a_plant_that_cannot_be_simulated_has_not_passed(controller, linear, sta
 def test_a_controller_without_its_design_plant_is_refused(controller, stand, thor):
     with pytest.raises(ControlError, match="design plant"):
         simulated(replace(controller, design=None), {"stand": stand}, thor)
+
+
+def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkeypatch):
+    def broken(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    module = sys.modules["seaopt.robustness.simulated"]  # the package's name of it is the function
+    monkeypatch.setattr(module, "passivity", broken)
+    monkeypatch.setattr(module, "large_signal", broken)
+    monkeypatch.setattr(module, "verify", lambda *_, **__: None)
+    found = simulated(controller, {"stand": stand}, thor)
+    assert "Singular matrix" in found.left_out["passivity"]
+    assert found.passivity_dict() is None
+    assert set(found.left_out) == {"passivity", "large signals"}
+    assert found.environments is not None
