@@ -29,7 +29,7 @@ from seaopt.robustness.worst import Worst, severities
 
 SLACK = 1e-9
 EDGES = np.pi * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 31)])  # of the arcs at the start
-BLOCK = 64  # boxes at a time
+BLOCK = 128  # boxes at a time
 ARCS = 4096  # arcs at a time: bounds the memory
 CANDIDATES = 16  # arcs of a block at whose worst corners a plant is measured
 ARC_SHARE = 0.5  # an arc is halved if the angle's share in D is at least this much of what the box adds to it

@@ -154,7 +154,7 @@ def _packed(item: Taylor, own: Int[np.ndarray, " p"]) -> Packed:
     second = np.array([[over.place(i, j) for j in range(k)] for i in range(k)], dtype=int).reshape(k, k)
     half = np.where(np.eye(k) > 0.0, 1.0, 0.5)[:, :, None, None]
     h = (item.a[second] * half).reshape(k * k, *item.r.shape)
-    rest = item.r + np.sum(np.abs(item.a[over.until[2] :]), axis=0)
+    rest = item.r + np.sum(np.abs(item.a[over.until[min(2, over.degree)] :]), axis=0)
     return np.moveaxis(np.concatenate([item.a[: 1 + k], h]), 0, 1)[own], rest[own]
 
 

@@ -12,22 +12,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.digital import DELAY
-from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, jacobians
 from seaopt.robustness.enclosure import Entry, enclosed, halvings, matrix
 from seaopt.robustness.region import Boxes, Region
+from seaopt.robustness.rest import at_rest
 from seaopt.robustness.taylor import Basis, Taylor, basis, constant, kept, stacked
 
 REACH, DEGREE = 0.25, 9  # of the series: 0.25^10 / 11! = 2e-14, which is enclosed too
 WORST_BASIS = 1e5  # condition of a modal basis, beyond which Schur's takes its place
-NEWTON_STEPS, WIDENINGS = 30, 4
 DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 3 of more
 
 
@@ -59,15 +57,16 @@ def pulse(controller: Controller, plant: Plant, nominal: ParameterSet, within: R
         The plant's equations have an instruction without an enclosure, or cannot rest at a box's centre.
 
     """
-    uncertain = within.enclosed(boxes, DEGREES[within.size] if within.size < len(DEGREES) else 3)
-    count, over = boxes.centre.shape[0], next(iter(uncertain.values())).basis if uncertain else basis(0, 1)
+    degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
+    uncertain = within.enclosed(boxes, degree)
+    count, over = boxes.centre.shape[0], basis(within.size, degree)
     p: list[Entry] = [
         uncertain.get(name, value)
         for name, value in zip(plant.parameters, plant.parameter_values(nominal), strict=True)
     ]
     at: dict[str, Entry] = {**within.fixed, **{n: item for n, item in uncertain.items() if n not in plant.parameters}}
     delay = at.pop(DELAY, 0.0)
-    x, u = _rest(plant, p, at, count, over)
+    x, u = at_rest(plant, p, at, count, over)
     n, m = len(plant.states), len(plant.inputs)
     found = enclosed(jacobians(plant), [x, u, p])
     row = list(plant.outputs).index(controller.spec.measured)
@@ -155,74 +154,3 @@ def _bases(a: Float[np.ndarray, "b n n"]) -> tuple[Float[np.ndarray, "b n n"], F
     for k in np.flatnonzero(poor):
         right[k] = np.asarray(schur(balanced[k], output="real")[1])
     return np.linalg.inv(right) / scale, scale[:, None] * right
-
-
-def _rest(
-    plant: Plant, p: list[Entry], at: dict[str, Entry], count: int, over: Basis
-) -> tuple[list[Entry], list[Entry]]:
-    """Enclose states and inputs at rest: Newton's method to second order, then Krawczyk's test for what is left.
-
-    (Krawczyk, Computing 4, 1969; Neumaier, Interval Methods for Systems of Equations, 1990, chapter 5.)
-    """
-    names = list(plant.states)
-    x: list[Entry] = [at.get(name, 0.0) for name in names]
-    u: list[Entry] = [0.0] * len(plant.inputs)
-    fixed = [k for k, item in enumerate(x) if isinstance(item, Taylor) or item != 0.0]
-    if not fixed:
-        return x, u
-    if len(fixed) > 1:
-        raise ControlError("a plant rests at one given state")
-    loose = [k for k in range(len(names)) if k not in fixed]
-    key = "dense dynamics"
-    if key not in plant.cache:
-        rates = ca.densify(ca.substitute(plant.dynamics, plant.t, 0.0))
-        plant.cache[key] = ca.Function("dynamics", [plant.x, plant.u, plant.p], [rates])
-
-    def placed(y: list[Entry]) -> tuple[list[Entry], list[Entry]]:
-        own = dict(zip(loose, y[:-1], strict=True))
-        return [own.get(k, item) for k, item in enumerate(x)], [y[-1], *u[1:]]
-
-    def residual(y: list[Entry], values: list[Entry]) -> Taylor:
-        states, inputs = placed(y)
-        return matrix(enclosed(plant.cache[key], [states, inputs, values])[0], len(names), count, over)
-
-    def slopes(y: list[Entry], values: list[Entry]) -> Taylor:
-        states, inputs = placed(y)
-        found = enclosed(jacobians(plant), [states, inputs, values])
-        a, b = (matrix(found[k], len(names), count, over) for k in (0, 1))
-        return _columns(a, loose, b)
-
-    def entries(y: Taylor) -> list[Entry]:
-        return [y[:, k, 0] for k in range(len(names))]
-
-    values = p
-    y = constant(np.zeros((count, len(names), 1)), over)
-    for _ in range(NEWTON_STEPS):
-        step = np.linalg.solve(slopes(entries(y), values).c, residual(entries(y), values).c)
-        y = constant(y.c - step, over)
-        if np.max(np.abs(step), initial=0.0) <= 1e-13 * np.max(np.abs(y.c), initial=1e-6):
-            break
-    inverse = np.linalg.inv(slopes(entries(y), values).c)
-    same = np.eye(1)
-    for _ in range(over.degree + 1):
-        y = y - residual(entries(y), values).between(inverse, same)
-        y = y.with_rest(np.zeros_like(y.r))
-    miss = residual(entries(y), values).between(inverse, same)
-    first = np.abs(miss.c) + miss.reach
-    wide, moved = y, first
-    for _ in range(WIDENINGS):
-        wide = y.with_rest(1.2 * moved + 1e-14 * y.size + 1e-20)
-        slack = constant(np.broadcast_to(np.eye(len(names)), inverse.shape).copy(), over) - slopes(
-            entries(wide), values
-        ).between(inverse, np.eye(len(names)))
-        moved = first + slack.size @ wide.r
-        if np.all(moved <= wide.r):
-            break
-    proven = np.all(moved <= wide.r, axis=1, keepdims=True)
-    return placed(entries(wide.with_rest(np.where(proven, wide.r, np.inf))))
-
-
-def _columns(a: Taylor, loose: list[int], b: Taylor) -> Taylor:
-    return Taylor(
-        a.basis, *(np.concatenate([x[..., loose], y[..., :1]], axis=-1) for x, y in ((a.a, b.a), (a.r, b.r)))
-    )

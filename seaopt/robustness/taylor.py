@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 Array = Float[np.ndarray, "..."]
+SPARSE = 8  # monomials up to which a product goes through them one by one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +40,10 @@ class Basis:
         Which monomial a product is; -1 beyond the degree.
     until : array, shape (degree + 1,)
         How many monomials are of at most a degree.
+    degrees : array, shape (m,)
+        Of every monomial.
+    pairs : three arrays
+        Monomials whose products are within the degree, by ascending product, and where each product starts.
 
     """
 
@@ -47,6 +52,8 @@ class Basis:
     powers: Int[np.ndarray, "m k"]
     target: Int[np.ndarray, "m m"]
     until: Int[np.ndarray, " d"]
+    degrees: Int[np.ndarray, " m"]
+    pairs: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " m"]]
 
     def place(self, *coordinates: int) -> int:
         """Return where the product of coordinates is."""
@@ -58,13 +65,19 @@ class Basis:
 
 @cache
 def basis(size: int, degree: int) -> Basis:
-    """Return the monomials of `size` coordinates up to a degree, at least 1."""
+    """Return the monomials of `size` coordinates up to a degree; 0 if there are none."""
+    degree = degree if size else 0
     rows = [each for d in range(degree + 1) for each in combinations_with_replacement(range(size), d)]
     powers = np.array([[row.count(k) for k in range(size)] for row in rows], dtype=int).reshape(len(rows), size)
     where = {tuple(row): k for k, row in enumerate(powers)}
     target = np.array([[where.get(tuple(a + b), -1) for b in powers] for a in powers], dtype=int)
-    until = np.searchsorted(np.sum(powers, axis=1), np.arange(degree + 1), side="right")
-    return Basis(size, degree, powers, target, until)
+    degrees = np.sum(powers, axis=1)
+    until = np.searchsorted(degrees, np.arange(degree + 1), side="right")
+    first, second = np.nonzero(target >= 0)
+    order = np.argsort(target[first, second], kind="stable")
+    first, second = first[order], second[order]
+    starts = np.searchsorted(target[first, second], np.arange(degrees.size))
+    return Basis(size, degree, powers, target, until, degrees, (first, second, starts))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,10 +111,14 @@ class Taylor:
         """Largest size."""
         return np.sum(np.abs(self.a), axis=0) + self.r
 
-    def sizes(self) -> list[Array]:
-        """Return the largest size of the parts of each degree."""
-        ends = self.basis.until
-        return [np.abs(self.a[0]), *(np.sum(np.abs(self.a[i:j]), axis=0) for i, j in zip(ends, ends[1:], strict=False))]
+    def truncated(self, degree: int) -> Taylor:
+        """Return a model of a lower degree, what it leaves out in its rest."""
+        over, count = basis(self.basis.size, degree), int(self.basis.until[min(degree, self.basis.degree)])
+        return Taylor(over, self.a[:count], self.r + np.sum(np.abs(self.a[count:]), axis=0))
+
+    def sizes(self) -> Array:
+        """Return the largest size of the parts of each degree, shape (degree + 1, *s)."""
+        return np.add.reduceat(np.abs(self.a), np.concatenate([[0], self.basis.until[:-1]]), axis=0)
 
     def __neg__(self) -> Taylor:
         return Taylor(self.basis, -self.a, self.r)
@@ -199,19 +216,25 @@ def kept(item: Taylor, mask: Bool[np.ndarray, "..."]) -> Taylor:
 @np.errstate(over="ignore", invalid="ignore")  # not finite becomes an infinite rest
 def _product(a: Taylor, b: Taylor, times: Callable[[Array, Array], Array]) -> Taylor:
     over = a.basis
-    whole = times(a.a[0], b.a)
-    others = np.flatnonzero(np.any(b.a != 0.0, axis=tuple(range(1, b.a.ndim))))
-    degrees = np.sum(over.powers, axis=1)
-    for i in np.flatnonzero(np.any(a.a != 0.0, axis=tuple(range(1, a.a.ndim)))):
-        if i:
-            own = others[: np.searchsorted(others, over.until[over.degree - degrees[i]])]
+    mine, others = _present(a), _present(b)
+    if mine.size > SPARSE and times is np.multiply:
+        first, second, starts = over.pairs
+        whole = np.add.reduceat(a.a[first] * b.a[second], starts, axis=0)
+    else:
+        whole = np.zeros((over.until[-1], *times(a.r, b.r).shape))
+        for i in mine:
+            own = others[: np.searchsorted(others, over.until[over.degree - over.degrees[i]])]
             whole[over.target[i, own]] += times(a.a[i], b.a[own])
-    first, second = a.sizes(), b.sizes()
-    every = np.cumsum(second[::-1], axis=0)  # entry k: the parts of the k + 1 highest degrees
-    rest = times(a.size, b.r) + times(a.r, every[-1])
-    for d in range(1, over.degree + 1):
-        rest = rest + times(first[d], every[d - 1])
+    parts, every = a.sizes(), np.cumsum(b.sizes()[::-1], axis=0)  # entry k: the parts of the k + 1 highest degrees
+    rest = times(np.sum(parts, axis=0) + a.r, b.r) + times(a.r, every[-1])
+    if over.degree:
+        rest = rest + np.sum(times(parts[1:], every[:-1]), axis=0)
     return _finite(Taylor(over, whole, rest))
+
+
+def _present(item: Taylor) -> Int[np.ndarray, " m"]:
+    """Return the monomials that some entry has."""
+    return np.flatnonzero(np.any(item.a.reshape(item.a.shape[0], -1), axis=1))
 
 
 def _finite(item: Taylor) -> Taylor:
