@@ -11,10 +11,12 @@ Every bound is a theorem up to the rounding of double precision, for which a bil
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loop import STABLE
@@ -93,15 +95,33 @@ class Bracket:
     left_out: str = ""
     parameters: dict[str, float] = field(default_factory=dict[str, float])
 
-    def __repr__(self) -> str:
+    @property
+    def statement(self) -> str:
+        """What is proven, in words; its figures are rounded up."""
         if self.left_out:
-            return f"Bracket(left out: {self.left_out})"
+            return f"no bound: {self.left_out}"
         if not self.proven_stable:
-            return f"Bracket(nothing proven in {self.boxes} boxes)"
-        return (
-            f"Bracket(Ms {self.ms_lower:.5g} to {self.ms_upper:.5g}, Mt {self.mt_lower:.5g} to {self.mt_upper:.5g}, "
-            f"all stable, {self.boxes} boxes)"
-        )
+            return f"no bound in {self.boxes} boxes"
+        return f"proven: all stable, Ms below {_above(self.ms_upper)}, Mt below {_above(self.mt_upper)}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what robustness.json keeps with the worst case."""
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.name != "parameters"}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Bracket:
+        """Return what robustness.json keeps; bounds that are missing are infinite, as JSON has no infinity."""
+        names = [item.name for item in fields(cls) if item.name != "parameters"]
+        return cls(**{name: np.inf if content[name] is None else content[name] for name in names})
+
+    def __repr__(self) -> str:
+        return f"Bracket(Ms from {self.ms_lower:.5g}, Mt from {self.mt_lower:.5g}; {self.statement})"
+
+
+def _above(value: float) -> str:
+    """Return a number with four digits, rounded up."""
+    step = 10.0 ** (np.floor(np.log10(value)) - 3)
+    return f"{np.ceil(value / step) * step:.4g}"
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -239,9 +259,7 @@ def _step(found: _Search) -> None:
         _halve(found, boxes, left, influence)
 
 
-def _bounded(
-    found: _Search, sampled: Pulse, boxes: Boxes, arcs: Arcs
-) -> tuple[Arcs, Float[np.ndarray, "b k"]]:
+def _bounded(found: _Search, sampled: Pulse, boxes: Boxes, arcs: Arcs) -> tuple[Arcs, Float[np.ndarray, "b k"]]:
     """Return the arcs of which the box has to be halved, and how much each coordinate of it is to blame."""
     hard = found.hardness * boxes.radius
     hard = hard / np.maximum(np.sum(hard, axis=1, keepdims=True), 1e-300)
@@ -307,13 +325,13 @@ def _of(arcs: Arcs, boxes: Int[np.ndarray, " b"], count: int) -> Arcs:
 
 def _meet(found: _Search, points: Float[np.ndarray, "c k"], *, centres: bool) -> None:
     """Measure plants at points: centres of boxes have to be stable, and those of the set bound the worst from below."""
+    within = found.within
+    points = points if within.size else points[:1]
     if not points.shape[0]:
         return
-    within = found.within
     fixed = {name: np.full(len(points), value) for name, value in within.fixed.items()}
     every = within.at(points) | fixed
-    draws = every or {next(iter(found.plant.states)): np.zeros(1)}
-    figures = batch_figures(found.controller, found.plant, found.unknown.nominal, draws)
+    figures = batch_figures(found.controller, found.plant, found.unknown.nominal, every)
     if centres:
         found.stable &= bool(np.all(figures.spectral_radius < STABLE))
     inside = within.inside(points)

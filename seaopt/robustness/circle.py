@@ -55,7 +55,7 @@ class Arcs:
 
     def bounded(self, s: Float[np.ndarray, " p"], t: Float[np.ndarray, " p"]) -> Arcs:
         """Return the arcs with bounds where they are better."""
-        return replace(self, s=np.minimum(self.s, s), t=np.minimum(self.t, t))
+        return replace(self, s=np.fmin(self.s, s), t=np.fmin(self.t, t))
 
     def halves(self) -> Arcs:
         """Return both halves of every arc."""
@@ -131,24 +131,24 @@ def bounded(controller: Controller, plant: Pulse, boxes: Boxes, ball: int, arcs:
     proper = _proper(controller, plant)[own]
     top_s, top_t = np.where(proper, top_s, np.inf), np.where(proper, top_t, np.inf)
     size = np.maximum(np.abs(d.c), 1e-300)
-    shares = np.abs(d.g) / size[:, None]
+    by_box = np.abs(d.g[:, :-1]) + np.sum(np.abs(d.h[:, :-1]), axis=2)
     return Found(
-        s=top_s, t=top_t, by_box=shares[:, :-1] + np.sum(np.abs(d.h[:, :-1]), axis=2) / size[:, None], by_angle=shares[:, -1],
+        s=top_s, t=top_t, by_box=by_box / size[:, None], by_angle=np.abs(d.g[:, -1]) / size,
         rest=sum(_left(item, powers) for (_, item), powers in parts) / size,
         towards=np.stack([slope_s[:, :-1], slope_t[:, :-1]]),
     )  # fmt: skip
 
 
 def _proper(controller: Controller, plant: Pulse) -> Bool[np.ndarray, " b"]:
-    """Tell which boxes' D keeps its degree, so that no pole comes from infinity: 1 + d d_c is not zero without delay."""
+    """Tell which boxes' D keeps its degree: 1 + d d_c is not zero without delay, and no pole comes from infinity."""
     last = plant.head[:, -1] * float(controller.measurement.num[0])
     return (controller.delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
 
 
 def _packed(item: Taylor, own: Int[np.ndarray, " p"]) -> Packed:
-    """Return every arc's coefficients to second order, centre, slopes and half curvatures in one axis; and their rests.
+    """Return every arc's coefficients to second order, and their rests.
 
-    Curvatures stand as a whole symmetric matrix.
+    Centre, slopes and half curvatures, as a whole symmetric matrix, are along one axis.
     """
     over, k = item.basis, item.basis.size
     second = np.array([[over.place(i, j) for j in range(k)] for i in range(k)], dtype=int).reshape(k, k)

@@ -170,9 +170,7 @@ def matrix(entries: Sequence[Entry], rows: int, count: int, over: Basis) -> Tayl
     models = [item if isinstance(item, Taylor) else constant(np.full(count, float(item)), over) for item in entries]
     whole = stacked(models)
     shape = (count, columns, rows)
-    return Taylor(
-        over, np.swapaxes(whole.a.reshape(-1, *shape), -1, -2), np.swapaxes(whole.r.reshape(shape), -1, -2)
-    )
+    return Taylor(over, np.swapaxes(whole.a.reshape(-1, *shape), -1, -2), np.swapaxes(whole.r.reshape(shape), -1, -2))
 
 
 def halvings(norm: Float[np.ndarray, " b"], reach: float) -> int:

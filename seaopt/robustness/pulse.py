@@ -3,9 +3,9 @@ r"""The sampled plant over boxes: numerator and denominator of its pulse transfe
 With :math:`F = e^{A T} - I = X \varphi(X)`, :math:`X = A T`, :math:`\varphi(X) = \sum_k X^k / (k + 1)!` and
 :math:`w = z - 1`, the plant is :math:`c\,\mathrm{adj}(wI - F)\,\Gamma / \det(wI - F)`, :math:`\Gamma = T \varphi(X) b`:
 in w, nothing cancels at low frequencies, where z is close to 1. The series is summed where X is small and doubled,
-:math:`\varphi(2X) = \varphi(X)(I + X\varphi(X)/2)`; adjugate and determinant are Leverrier's and Faddeev's. All of it is
-done in the modal basis of each box's centre, where F is diagonal but for what the box changes: the determinant is then
-no difference of large products. A basis does not change a transfer function.
+:math:`\varphi(2X) = \varphi(X)(I + X\varphi(X)/2)`; adjugate and determinant are Leverrier's and Faddeev's. All of it
+is done in the modal basis of each box's centre, where F is diagonal but for what the box changes: the determinant is
+then no difference of large products. A basis does not change a transfer function.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from seaopt.plants import Plant, jacobians
 from seaopt.robustness.enclosure import Entry, enclosed, halvings, matrix
 from seaopt.robustness.region import Boxes, Region
 from seaopt.robustness.rest import at_rest
-from seaopt.robustness.taylor import Basis, Taylor, basis, constant, kept, stacked
+from seaopt.robustness.taylor import Taylor, basis, constant, kept, stacked
 
 REACH, DEGREE = 0.25, 9  # of the series: 0.25^10 / 11! = 2e-14, which is enclosed too
 WORST_BASIS = 1e5  # condition of a modal basis, beyond which Schur's takes its place
@@ -67,12 +67,14 @@ def pulse(controller: Controller, plant: Plant, nominal: ParameterSet, within: R
     at: dict[str, Entry] = {**within.fixed, **{n: item for n, item in uncertain.items() if n not in plant.parameters}}
     delay = at.pop(DELAY, 0.0)
     x, u = at_rest(plant, p, at, count, over)
-    n, m = len(plant.states), len(plant.inputs)
+    n, outputs = len(plant.states), len(plant.outputs)
     found = enclosed(jacobians(plant), [x, u, p])
     row = list(plant.outputs).index(controller.spec.measured)
-    a, b, c, d = (matrix(item, rows, count, over) for item, rows in zip(found, (n, n, len(plant.outputs), len(plant.outputs)), strict=True))
+    a, b, c, d = (matrix(item, rows, count, over) for item, rows in zip(found, (n, n, outputs, outputs), strict=True))
     gain = controller.current_per_force_A_per_N
-    return _sampled(a, b[:, :, :1] * gain, c[:, row : row + 1], d[:, row : row + 1, :1] * gain, controller.sample_time_s, delay)
+    return _sampled(
+        a, b[:, :, :1] * gain, c[:, row : row + 1], d[:, row : row + 1, :1] * gain, controller.sample_time_s, delay
+    )
 
 
 def _sampled(a: Taylor, b: Taylor, c: Taylor, d: Taylor, period: float, delay: Entry) -> Pulse:

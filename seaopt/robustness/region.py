@@ -1,7 +1,7 @@
 r"""The set over which a bound is asked for, as boxes: what of an `Uncertainty` one plant depends on.
 
-The Gaussian part is an ellipsoid, the image :math:`p = \bar p + W y` of a ball; of the parameters that the plant has, it
-is again one, whose axes come from the singular values of their rows of W. Coordinates along it are fractions of its
+The Gaussian part is an ellipsoid, the image :math:`p = \bar p + W y` of a ball; of the parameters that the plant has,
+it is again one, whose axes come from the singular values of their rows of W. Coordinates along it are fractions of its
 half axes, so that it is the unit ball; those of the ranges run from -1 to 1.
 """
 
@@ -128,9 +128,11 @@ class Region:
         return np.hstack([inner / np.maximum(size, 1.0), np.clip(points[:, self.ball :], -1.0, 1.0)])
 
     def inside(self, points: Float[np.ndarray, "b k"]) -> Bool[np.ndarray, " b"]:
-        """Tell which points are inside the physical bounds."""
+        """Tell which points are in the set."""
         values = self.centre + points @ self.slopes.T
-        return np.all((values >= self.low) & (values <= self.high), axis=1)
+        edge = 1.0 + 1e-12
+        near = np.all(np.abs(points) <= edge, axis=1) & (np.linalg.norm(points[:, : self.ball], axis=1) <= edge)
+        return near & np.all((values >= self.low) & (values <= self.high), axis=1)
 
 
 def region(plant: Plant, unknown: Uncertainty) -> Region:
@@ -158,13 +160,12 @@ def region(plant: Plant, unknown: Uncertainty) -> Region:
     slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
     middle = [0.5 * (low + high) for low, high in wide.values()]
     nominal = {name: unknown.nominal[name].value for name in extra if name in unknown.nominal and name not in ends}
-    found = Region(
+    return Region(
         names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
         slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
         high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float), ball=ball,
         fixed=given | nominal,
     )  # fmt: skip
-    return found
 
 
 def _ends(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[float, float]:

@@ -59,7 +59,9 @@ class _Equations:
         a, b = (matrix(item, len(self.x), self.count, self.over) for item in found[:2])
         columns = list(self.loose)
         parts = ((a.a, b.a), (a.r, b.r))
-        return Taylor(self.over, *(np.concatenate([left[..., columns], right[..., :1]], axis=-1) for left, right in parts))
+        return Taylor(
+            self.over, *(np.concatenate([left[..., columns], right[..., :1]], axis=-1) for left, right in parts)
+        )
 
     def lower(self, degree: int) -> _Equations:
         """Return the equations on models of a lower degree."""
