@@ -17,7 +17,7 @@ from seaopt.robustness.worst import Witness, Worst
 
 __all__ = [
     "BatchFigures", "Bracket", "Budget", "Certificate", "JointTuning", "LargeSignal", "MonteCarlo", "Outcome", "Phase",
-    "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty", "Verification", "Witness",
-    "Worst", "batch_figures", "bracket", "certify", "check_ranges", "coupled_stability", "default_scenarios",
+    "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty", "Verification",
+    "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges", "coupled_stability", "default_scenarios",
     "failure_bound", "large_signal", "placed", "plant_margins", "simulated", "tune_certified", "uncertainty", "verify",
 ]  # fmt: skip

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loop import STABLE
@@ -112,7 +112,8 @@ class Bracket:
     def from_dict(cls, content: Mapping[str, Any]) -> Bracket:
         """Return what robustness.json keeps; bounds that are missing are infinite, as JSON has no infinity."""
         names = [item.name for item in fields(cls) if item.name != "parameters"]
-        return cls(**{name: np.inf if content[name] is None else content[name] for name in names})
+        kept: dict[str, Any] = {name: np.inf if content[name] is None else content[name] for name in names}
+        return cls(**kept)
 
     def __repr__(self) -> str:
         return f"Bracket(Ms from {self.ms_lower:.5g}, Mt from {self.mt_lower:.5g}; {self.statement})"
@@ -147,6 +148,7 @@ class _Search:
     parameters: dict[str, float] = field(default_factory=dict[str, float])
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is not proven
 def bracket(
     controller: Controller, plant: Plant, unknown: Uncertainty, worst: Worst | None = None, budget: Budget | None = None
 ) -> Bracket:
@@ -184,12 +186,10 @@ def bracket(
     try:
         found = _started(controller, plant, unknown, budget.tolerance, known, 0.0 if worst is None else worst.severity)
         while found.arcs.box.size and found.count < budget.boxes and time.perf_counter() < end:
-            if not (found.stable and np.all(np.isfinite(found.lower))):
-                break
-            if found.count and not found.within.size:
-                break  # nothing to halve
+            if not np.all(np.isfinite(found.lower)) or (found.count and not found.within.size):
+                break  # one is unstable, or there is nothing to halve
             _step(found)
-        _meet(found, found.boxes.centre, centres=True)
+        found.stable &= bool(np.all(_meet(found, found.boxes.centre)))
     except ControlError as error:
         return Bracket(
             ms_lower=float(known[0]), ms_upper=np.inf, mt_lower=float(known[1]), mt_upper=np.inf, proven_stable=False,
@@ -250,17 +250,22 @@ def _step(found: _Search) -> None:
     chosen, rest = np.sort(order[:BLOCK]), np.sort(order[BLOCK:])
     boxes, arcs = found.boxes.rows(chosen), _of(found.arcs, chosen, worst.size)
     waiting = _of(found.arcs, rest, worst.size)
-    _meet(found, boxes.centre, centres=True)
+    stable = _meet(found, boxes.centre)
     sampled = pulse(found.controller, found.plant, found.unknown.nominal, found.within, boxes)
-    left, influence = _bounded(found, sampled, boxes, arcs)
+    left, influence = _bounded(found, sampled, boxes, arcs, stable)
     found.count += chosen.size
     found.boxes, found.arcs = found.boxes.rows(rest), waiting
     if left.box.size:
         _halve(found, boxes, left, influence)
 
 
-def _bounded(found: _Search, sampled: Pulse, boxes: Boxes, arcs: Arcs) -> tuple[Arcs, Float[np.ndarray, "b k"]]:
-    """Return the arcs of which the box has to be halved, and how much each coordinate of it is to blame."""
+def _bounded(
+    found: _Search, sampled: Pulse, boxes: Boxes, arcs: Arcs, stable: Bool[np.ndarray, " b"]
+) -> tuple[Arcs, Float[np.ndarray, "b k"]]:
+    """Return the arcs of which the box has to be halved, and how much each coordinate of it is to blame.
+
+    A box whose centre is unstable, which is then outside the set, is halved whatever its bounds.
+    """
     hard = found.hardness * boxes.radius
     hard = hard / np.maximum(np.sum(hard, axis=1, keepdims=True), 1e-300)
     blame, left = np.zeros_like(hard), list[Arcs]()
@@ -270,10 +275,10 @@ def _bounded(found: _Search, sampled: Pulse, boxes: Boxes, arcs: Arcs) -> tuple[
         new = bounded(found.controller, sampled, boxes, found.within.ball, now)
         now = now.bounded(new.s, new.t)
         if first:
-            _meet(found, _corners(found, boxes, now, new), centres=False)
+            _meet(found, _corners(found, boxes, now, new))
             first = False
         goal = found.lower * (1.0 + found.tolerance)
-        done = (now.s <= goal[0]) & (now.t <= goal[1])
+        done = (now.s <= goal[0]) & (now.t <= goal[1]) & stable[now.box]
         found.upper = np.maximum(found.upper, [np.max(now.s[done], initial=0.0), np.max(now.t[done], initial=0.0)])
         by_box = np.maximum(np.max(new.by_box, axis=1, initial=0.0), new.rest)
         halved = ~done & (new.by_angle >= ARC_SHARE * by_box) & (new.by_angle > SHORTEST)
@@ -283,7 +288,7 @@ def _bounded(found: _Search, sampled: Pulse, boxes: Boxes, arcs: Arcs) -> tuple[
         # A rest does not say whose it is: the trial does.
         beyond = ~(new.rest <= np.max(new.by_box, axis=1, initial=0.0))
         share = np.where(beyond[:, None], hard[now.box], share)
-        np.add.at(blame, now.box[stuck], share[stuck])
+        np.add.at(blame, now.box[stuck], np.nan_to_num(share[stuck]))
         arcs = joined([arcs, now.rows(halved).halves()])
     return joined(left), blame
 
@@ -323,17 +328,15 @@ def _of(arcs: Arcs, boxes: Int[np.ndarray, " b"], count: int) -> Arcs:
     return moved.rows(moved.box >= 0)
 
 
-def _meet(found: _Search, points: Float[np.ndarray, "c k"], *, centres: bool) -> None:
-    """Measure plants at points: centres of boxes have to be stable, and those of the set bound the worst from below."""
+def _meet(found: _Search, points: Float[np.ndarray, "c k"]) -> Bool[np.ndarray, " c"]:
+    """Measure plants at points and tell which are stable; those of the set bound the worst from below."""
     within = found.within
     points = points if within.size else points[:1]
     if not points.shape[0]:
-        return
+        return np.ones(0, dtype=bool)
     fixed = {name: np.full(len(points), value) for name, value in within.fixed.items()}
     every = within.at(points) | fixed
     figures = batch_figures(found.controller, found.plant, found.unknown.nominal, every)
-    if centres:
-        found.stable &= bool(np.all(figures.spectral_radius < STABLE))
     inside = within.inside(points)
     for k, item in enumerate((figures.ms, figures.mt)):
         found.lower[k] = max(found.lower[k], np.max(item[inside], initial=0.0))
@@ -342,6 +345,7 @@ def _meet(found: _Search, points: Float[np.ndarray, "c k"], *, centres: bool) ->
     if severity[worst] > found.severity * (1.0 + SLACK):
         found.severity = float(severity[worst])
         found.parameters = {name: float(item[worst]) for name, item in every.items()}
+    return figures.spectral_radius < STABLE
 
 
 def joined(parts: list[Arcs]) -> Arcs:

@@ -161,7 +161,7 @@ def _packed(item: Taylor, own: Int[np.ndarray, " p"]) -> Packed:
 def _powers(
     law: Float[np.ndarray, " m"], late: Int[np.ndarray, " p"], arcs: Arcs, count: int
 ) -> Complex[np.ndarray, "p j 5"]:
-    r"""Return law(1/z) z^-late w^j for every j: value, first and second order in e_theta, bounds on the rest and on all.
+    r"""Return law(1/z) z^-late w^j for every j: value, first and second order, bounds on the rest and on all.
 
     Each is a product of functions of the angle, whose derivatives up to the third are bounded over the arc.
     """
@@ -204,7 +204,7 @@ def _bounds(
 
 def _modelled(parts: list[tuple[Packed, Complex[np.ndarray, "p j 5"]]]) -> Model:
     """Return the sum of polynomials whose coefficients are models, over the arcs."""
-    sums = sum(packed @ powers[:, :, :3] for (packed, _), powers in parts)
+    sums = np.sum([packed @ powers[:, :, :3] for (packed, _), powers in parts], axis=0)
     count, width = sums.shape[:2]
     k = round(np.sqrt(width - 0.75) - 0.5)
     rest = np.zeros(count)

@@ -55,8 +55,9 @@ def enclosed(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[E
 
 def _operated(op: int, given: list[Entry]) -> Entry:
     """Return one operation, on numbers or on models."""
-    if not any(isinstance(item, Taylor) for item in given):
-        operands = [ca.SX(item) for item in given]
+    numbers = [item for item in given if not isinstance(item, Taylor)]
+    if len(numbers) == len(given):
+        operands = [ca.SX(item) for item in numbers]
         return float((ca.SX.binary if len(operands) == 2 else ca.SX.unary)(op, *operands))
     known = BINARY if len(given) == 2 else UNARY
     if op not in known:
