@@ -5,7 +5,7 @@ its bounds on abs(S) and abs(T) are within a tolerance of the largest that any p
 halved, or the box, along the coordinate that its bounds suffer from most. A box whose loop has no pole on any arc for
 any of its plants, and is stable at its centre, is stable throughout: eigenvalues are continuous.
 
-Every bound is a theorem up to the rounding of double precision, for which a billionth is added.
+Every bound is a theorem but for rounding, which is estimated at every step and added, and a billionth besides.
 """
 
 from __future__ import annotations
@@ -211,6 +211,7 @@ def _started(
 ) -> _Search:  # fmt: skip
     within = region(plant, unknown)
     boxes = within.whole(controller.sample_time_s)
+    _check(controller, plant, unknown, within, boxes)
     hardness = _hardness(controller, plant, unknown, within, boxes)
     while boxes.centre.shape[0] < BLOCK and np.sum(hardness * boxes.radius[0]) > EASY:
         axis = int(np.argmax(hardness * boxes.radius[0]))
@@ -225,6 +226,20 @@ def _started(
         controller=controller, plant=plant, unknown=unknown, within=within, tolerance=tolerance, boxes=boxes, arcs=arcs,
         hardness=hardness, lower=known.copy(), upper=np.zeros(2), severity=severity,
     )  # fmt: skip
+
+
+def _check(controller: Controller, plant: Plant, unknown: Uncertainty, within: Region, boxes: Boxes) -> None:
+    """Refuse a loop that cannot be bounded even at a single plant and single angles, for all the digits it loses."""
+    one = Boxes(centre=boxes.centre[:1], radius=np.zeros_like(boxes.radius[:1]))
+    theta = 0.5 * (EDGES[1:] + EDGES[:-1])
+    open_bounds = np.full(theta.size, np.inf)
+    arcs = Arcs(box=np.zeros(theta.size, dtype=int), middle=theta, half=0.0 * theta, s=open_bounds, t=open_bounds)
+    found = bounded(controller, pulse(controller, plant, unknown.nominal, within, one), one, within.ball, arcs)
+    if not np.all(np.isfinite(found.s)):
+        raise ControlError(
+            f"{plant.name} cannot be told from a plant with a pole on the unit circle: its {len(plant.states)} states "
+            "lose too many digits, or the pole is there"
+        )
 
 
 def _hardness(

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.robustness.pulse import Pulse
 from seaopt.robustness.region import Boxes
-from seaopt.robustness.taylor import Taylor
+from seaopt.robustness.taylor import ROUNDING, Taylor
 
 MULTIPLIERS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0])
 
@@ -187,7 +187,7 @@ def _powers(
     (a0, a1, a2, a3), (b0, b1, b2, b3) = first_bounds, second_bounds
     rest = a3 * b0 + 3.0 * a2 * b1 + 3.0 * a1 * b2 + a0 * b3
     step = half[:, None]
-    rest = rest * step**3 / 6.0
+    rest = rest * step**3 / 6.0 + ROUNDING * np.sum(np.abs(law)) * b0
     slope, curve = slope * step, 0.5 * curve * step**2
     return np.stack([value, slope, curve, rest, np.abs(value) + np.abs(slope) + np.abs(curve) + rest], axis=2)
 
@@ -209,7 +209,8 @@ def _modelled(parts: list[tuple[Packed, Complex[np.ndarray, "p j 5"]]]) -> Model
     k = round(np.sqrt(width - 0.75) - 0.5)
     rest = np.zeros(count)
     for (packed, left), powers in parts:
-        rest += _left(left, powers) + np.sum(np.real(powers[:, :, 3]) * np.sum(np.abs(packed), axis=1), axis=1)
+        open_ends = np.real(powers[:, :, 3]) + ROUNDING * np.real(powers[:, :, 4])
+        rest += _left(left, powers) + np.sum(open_ends * np.sum(np.abs(packed), axis=1), axis=1)
     rest += np.sum(np.abs(sums[:, 1 : k + 1, 2]), axis=1) + np.sum(np.abs(sums[:, k + 1 :, 1:]), axis=(1, 2))
     h = np.zeros((count, k + 1, k + 1), dtype=complex)
     h[:, :k, :k] = sums[:, k + 1 :, 0].reshape(count, k, k)

@@ -24,7 +24,7 @@ from seaopt.robustness.region import Boxes, Region
 from seaopt.robustness.rest import at_rest
 from seaopt.robustness.taylor import Taylor, basis, constant, kept, stacked
 
-REACH, DEGREE = 0.25, 9  # of the series: 0.25^10 / 11! = 2e-14, which is enclosed too
+REACH, DEGREE = 0.25, 12  # of the series: 0.25^13 / 14! = 2e-19, which is enclosed too
 WORST_BASIS = 1e5  # condition of a modal basis, beyond which Schur's takes its place
 DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 3 of more
 

@@ -8,7 +8,8 @@ Sums and products of models enclose sums and products of what they enclose: what
 into r. A function of one model is expanded about its centre, with Lagrange's bound on the rest (Makino, Berz,
 International Journal of Pure and Applied Mathematics 4, 2003). Terms that cancel, cancel in the polynomial: what
 interval arithmetic (Moore, Interval Analysis, 1966) loses where a parameter occurs twice is lost in order q + 1 only.
-Rounding is not enclosed.
+Rounding is estimated, not
+enclosed by directed rounding: every product adds some units in the last place of its size to the rest.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 Array = Float[np.ndarray, "..."]
+ROUNDING = 2e-15  # of the size of a product, its rounding and that of the sums it is in
 SPARSE = 8  # monomials up to which a product goes through them one by one
 
 
@@ -226,7 +228,8 @@ def _product(a: Taylor, b: Taylor, times: Callable[[Array, Array], Array]) -> Ta
             own = others[: np.searchsorted(others, over.until[over.degree - over.degrees[i]])]
             whole[over.target[i, own]] += times(a.a[i], b.a[own])
     parts, every = a.sizes(), np.cumsum(b.sizes()[::-1], axis=0)  # entry k: the parts of the k + 1 highest degrees
-    rest = times(np.sum(parts, axis=0) + a.r, b.r) + times(a.r, every[-1])
+    own = b.r + ROUNDING * (every[-1] + b.r)
+    rest = times(np.sum(parts, axis=0) + a.r, own) + times(a.r, every[-1])
     if over.degree:
         rest = rest + np.sum(times(parts[1:], every[:-1]), axis=0)
     return _finite(Taylor(over, whole, rest))
