@@ -27,7 +27,8 @@ from seaopt.robustness.circle import Arcs, Found, bounded
 from seaopt.robustness.draws import Uncertainty
 from seaopt.robustness.pulse import Pulse, pulse
 from seaopt.robustness.region import Boxes, Region, region
-from seaopt.robustness.worst import Worst, severities
+from seaopt.robustness.severity import severities
+from seaopt.robustness.worst import Worst
 
 SLACK = 1e-9
 EDGES = np.pi * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 31)])  # of the arcs at the start
