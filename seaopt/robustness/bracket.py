@@ -297,7 +297,7 @@ def _bounded(
         done = (now.s <= goal[0]) & (now.t <= goal[1]) & stable[now.box]
         found.upper = np.maximum(found.upper, [np.max(now.s[done], initial=0.0), np.max(now.t[done], initial=0.0)])
         by_box = np.maximum(np.max(new.by_box, axis=1, initial=0.0), new.rest)
-        halved = ~done & (new.by_angle >= ARC_SHARE * by_box) & (new.by_angle > SHORTEST)
+        halved = ~done & stable[now.box] & (new.by_angle >= ARC_SHARE * by_box) & (new.by_angle > SHORTEST)
         stuck = ~done & ~halved
         left.append(now.rows(stuck))
         share = new.by_box / np.maximum(np.sum(new.by_box, axis=1, keepdims=True), 1e-300)
