@@ -347,8 +347,9 @@ def _of(arcs: Arcs, boxes: Int[np.ndarray, " b"], count: int) -> Arcs:
 def _meet(found: _Search, points: Float[np.ndarray, "c k"]) -> Bool[np.ndarray, " c"]:
     """Measure plants at points and tell which are stable; those of the set bound the worst from below."""
     within = found.within
+    count = points.shape[0]
     points = points if within.size else points[:1]
-    if not points.shape[0]:
+    if not count:
         return np.ones(0, dtype=bool)
     fixed = {name: np.full(len(points), value) for name, value in within.fixed.items()}
     every = within.at(points) | fixed
@@ -361,7 +362,7 @@ def _meet(found: _Search, points: Float[np.ndarray, "c k"]) -> Bool[np.ndarray, 
     if severity[worst] > found.severity * (1.0 + SLACK):
         found.severity = float(severity[worst])
         found.parameters = {name: float(item[worst]) for name, item in every.items()}
-    return figures.spectral_radius < STABLE
+    return np.broadcast_to(figures.spectral_radius < STABLE, count)
 
 
 def joined(parts: list[Arcs]) -> Arcs:
