@@ -172,7 +172,8 @@ def bracket(
     Examples
     --------
     >>> import seaopt as so
-    >>> from seaopt.robustness import bracket, uncertainty
+    >>> from seaopt.robustness import uncertainty
+    >>> from seaopt.robustness.bracket import bracket
     >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
     >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     >>> unknown = uncertainty(thor, so.ParameterSet(), {"eta": (0.8, 1.0)}, {"stand": stand})
