@@ -26,7 +26,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, read_problem
 from seaopt.reporting import verdict, write_frontier_figure, write_report
-from seaopt.robustness import Certificate, certify, tune_certified
+from seaopt.robustness import Budget, Certificate, certify, tune_certified
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
@@ -307,7 +307,7 @@ class Session:
         self._design_values(*plants.values())
         result = certify(
             controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
-            others=self.problem.parameters,
+            others=self.problem.parameters, bounds=Budget() if table.bounds else None,
             progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
         )  # fmt: skip
         tell("simulating scenarios")

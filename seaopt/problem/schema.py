@@ -251,6 +251,7 @@ class RobustnessTable(_Strict):
     samples: Annotated[Whole, Field(ge=1, le=10_000_000)] = 1375
     seed: Annotated[Whole, Field(ge=0)] = 1
     retune: Annotated[Whole, Field(ge=0, le=20)] = 0
+    bounds: bool = False
     sensors: SensorsTable = SensorsTable()
     current_step_A: NotNegative = 0.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import resting_on
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.robustness.bracket import Bracket
 from seaopt.robustness.draws import Varied
 from seaopt.robustness.nominal import PlantMargins, plant_margins
 from seaopt.robustness.simulated import Simulated, simulated
@@ -104,6 +105,8 @@ class Certificate:
         What it was certified on, at `parameters`.
     simulated : Simulated or None
         What `with_simulation` found.
+    brackets : mapping of name to Bracket
+        What the worst case is proven to be below; empty if bounds were not asked for.
 
     """
 
@@ -118,6 +121,7 @@ class Certificate:
     parameters: ParameterSet
     varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
+    brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
 
     def with_simulation(
         self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1
@@ -194,6 +198,11 @@ class Certificate:
                 models=models,
                 parameters=parameters,
                 varied=tuple(_varied(item) for item in content.get("varied", [])),
+                brackets={
+                    name: Bracket.from_dict(item["worst"])
+                    for name, item in content["plants"].items()
+                    if "ms_upper" in item["worst"]
+                },
             )
             played = content.get("simulation")
             if played is None:
@@ -212,7 +221,7 @@ class Certificate:
             "plants": {
                 name: {key: getattr(item, key) for key in _REPORTED}
                 | self.margins[name].to_dict()
-                | {"worst": _fields(self.worst[name].witness)}
+                | {"worst": _fields(self.worst[name].witness) | self._bounds(name)}
                 for name, item in self.plants.items()
             },
             "monte_carlo": _fields(self.monte_carlo),
@@ -233,6 +242,9 @@ class Certificate:
             if item.outside
         )
         return (*resting_on(self.parameters, used), *outside)
+
+    def _bounds(self, name: str) -> dict[str, Any]:
+        return self.brackets[name].to_dict() if name in self.brackets else {}
 
     def __repr__(self) -> str:
         lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]
@@ -266,6 +278,8 @@ class Certificate:
         if worst.parameters:
             where = ", ".join(f"{key} = {value:.4g}" for key, value in worst.parameters.items())
             lines.append(f"    worst case at {where}")
+        if name in self.brackets:
+            lines.append(f"    {self.brackets[name].statement}")
         return lines
 
     def _repr_html_(self) -> str:

@@ -95,12 +95,17 @@ def test_a_simulation_that_fails_exits_1_with_its_witness(folder):
 def test_retune_tunes_until_certified(folder):
     text = (
         DESIGN.replace("I_p = [0.2, 0.6]", "I_p = [0.2, 0.6], eta = [0.9, 1.0], delay_s = [0.0, 2e-4]") + "retune = 4\n"
+        "bounds = true\n"
     )
     (folder / "retune.toml").write_text(text.replace('robust_to = ["swing"]', ""), encoding="utf-8")
     out = seaopt("run", "retune.toml", "-o", "retune", cwd=folder)
     assert out.returncode == 0, out.stdout + out.stderr
     assert "Joint tuning: certified in 2 rounds" in out.stdout
     assert "Certificate: passed" in out.stdout
+    worst = json.loads((folder / "retune" / "robustness.json").read_text(encoding="utf-8"))["plants"]["swing"]["worst"]
+    assert worst["proven_stable"]
+    assert worst["ms"] <= worst["ms_upper"] <= 1.012 * worst["ms"]
+    assert "swing: proven: all stable" in (folder / "retune" / "report.html").read_text(encoding="utf-8")
     held = json.loads((folder / "retune" / "controller.json").read_text(encoding="utf-8"))["spec"]["robust_to"]
     assert any("round 1" in name for name in held)
 

@@ -1,0 +1,249 @@
+"""Bounds from above: never below any draw, near the worst case found, and nothing proven that is not so."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control.law import TransferFunction
+from seaopt.errors import ControlError
+from seaopt.parameters import Parameter
+from seaopt.robustness import Bracket, Budget, batch_figures, bracket, uncertainty
+from seaopt.robustness.region import region
+from seaopt.robustness.worst import LEVEL, find_worst
+
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+
+
+@pytest.fixture(scope="module")
+def controller(stand, swing, thor):
+    return so.tune(stand, thor, SPEC, robust_to={"swing": swing})
+
+
+def of(plant, params, ranges):
+    return uncertainty(params, so.ParameterSet(), ranges, {"plant": plant})
+
+
+def draws(unknown, count, seed=0):
+    """Return points of the set: inside the ellipsoid, on its edge, and at the corners of the ranges."""
+    from scipy.stats import chi2
+
+    rng = np.random.default_rng(seed)
+    g, k = len(unknown.names), len(unknown.ranges)
+    x = rng.normal(size=(count, g))
+    if g:
+        size = np.sqrt(chi2.ppf(LEVEL, g)) * rng.uniform(size=count) ** (1.0 / g)
+        size[::2] = np.sqrt(chi2.ppf(LEVEL, g))
+        x *= (size / np.linalg.norm(x, axis=1))[:, None]
+    t = rng.uniform(-1.0, 1.0, (count, k))
+    t[::3] = np.sign(t[::3])
+    points = np.hstack([x, t])
+    return points[unknown.inside(points)]
+
+
+CASES = {  # plant, standard deviations, ranges, draws
+    "stand, fit": ("stand", {"J": 3.3e-8, "b_r": 2e-6, "eta": 0.01}, {}, 20_000),
+    "swing, fit and inertia": ("swing", {"J": 3.3e-8, "b_r": 2e-6, "eta": 0.01}, {"I_p": (0.3, 0.5)}, 20_000),
+    "swing, damping": ("swing", {}, {"I_p": (0.3, 0.5), "d": (0.0, 0.1)}, 2000),
+    "swing, delay": ("swing", {}, {"I_p": (0.3, 0.5), "delay_s": (0.0, 2.4e-3)}, 2000),
+    "swing, angle": ("swing", {}, {"phi": (-0.2, 0.6)}, 2000),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_draw_is_above_the_bound_and_the_bound_is_near(case, controller, thor, request):
+    name, priors, ranges, count = CASES[case]
+    plant = request.getfixturevalue(name)
+    unknown = of(plant, thor.prior(**priors) if priors else thor, ranges)
+    found = bracket(controller, plant, unknown)
+    figures = batch_figures(controller, plant, unknown.nominal, unknown.values(draws(unknown, count)))
+    assert found.proven_stable
+    assert np.max(figures.spectral_radius) < 1.0
+    assert np.max(figures.ms) <= found.ms_upper <= 1.012 * found.ms_lower
+    assert np.max(figures.mt) <= found.mt_upper <= 1.012 * found.mt_lower
+
+
+def test_what_was_met_is_no_worse_than_what_the_search_finds(controller, stand, thor):
+    """Centres of boxes that reach beyond the ellipsoid are no plants of the set."""
+    unknown = of(stand, thor.prior(J=3.3e-7, b_r=2e-5, eta=0.03), {})
+    worst = find_worst(controller, stand, unknown, np.zeros((1, 3)), np.zeros(1))
+    found = bracket(controller, stand, unknown, budget=Budget(tolerance=0.05))
+    assert 0.95 * worst.ms <= found.ms_lower <= worst.ms * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("part", "ranges"),
+    [
+        ("current_loop", {"current_loop_hz": (150.0, 250.0)}),
+        ("screw_mode", {"screw_mode_hz": (70.0, 80.0)}),
+        ("measurement_delay", {"eta": (0.9, 1.0)}),
+    ],
+)
+def test_parts_are_bounded_too(part, ranges, controller, thor):
+    plant = so.plants.moving_output(parts=[part])
+    unknown = of(plant, thor, ranges)
+    found = bracket(controller, plant, unknown)
+    figures = batch_figures(controller, plant, unknown.nominal, unknown.values(draws(unknown, 500)))
+    assert found.proven_stable
+    assert np.max(figures.ms) <= found.ms_upper <= 1.012 * found.ms_lower
+    assert np.max(figures.mt) <= found.mt_upper <= 1.012 * found.mt_lower
+
+
+def first_order(controller, params):
+    """Return a lag with an uncertain gain, closed by proportional feedback without delay."""
+    plant = so.Plant(
+        name="lag", states={"x": "N"}, inputs={"I": "A"}, outputs={"F1": "N"},
+        parameters={
+            "K": Parameter(name="K", value=1.0, unit="N/A"), "tau": Parameter(name="tau", value=0.01, unit="s"),
+        },
+        f=lambda t, x, u, p: {"x": (p.K * u.I - x.x) / p.tau}, h=lambda t, x, u, p: {"F1": x.x},
+    )  # fmt: skip
+    law = TransferFunction(num=np.array([3.0]), den=np.array([1.0]))
+    return plant, replace(
+        controller, reference=law, measurement=law, delay_samples=0, current_per_force_A_per_N=1.0,
+        spec=so.ControllerSpec(bandwidth_hz=30),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("tolerance", [0.1, 0.01, 0.001])
+def test_a_lag_with_uncertain_gain_has_its_closed_form(tolerance, controller, thor):
+    """x+ = a x + K (1 - a) u, u = -3 m: abs(S) peaks at z = -1, as (1 + a)/(1 + a - 3 K (1 - a))."""
+    plant, lag = first_order(controller, thor)
+    unknown = of(plant, so.ParameterSet(plant.defaults.values()), {"K": (1.0, 4.0)})
+    found = bracket(lag, plant, unknown, budget=Budget(tolerance=tolerance))
+    a = np.exp(-lag.sample_time_s / 0.01)
+    exact = (1 + a) / (1 + a - 12.0 * (1 - a))
+    assert found.proven_stable
+    assert exact <= found.ms_upper <= exact * (1.0 + tolerance + 1e-6)
+    assert found.ms_lower == pytest.approx(exact, rel=1e-6)
+
+
+def test_feedthrough_without_delay_is_bounded(controller, thor):
+    """y = K u and u = -3 m: S = 1/(1 + 3 K), and a pole comes from infinity where 1 + 3 K = 0."""
+    plant, lag = first_order(controller, thor)
+    direct = so.Plant(
+        name="direct", states=plant.states, inputs=plant.inputs, outputs=plant.outputs, parameters=plant.parameters,
+        f=plant.f, h=lambda t, x, u, p: {"F1": p.K * u.I + 1e-3 * x.x},
+    )  # fmt: skip
+    unknown = of(direct, so.ParameterSet(plant.defaults.values()), {"K": (0.5, 2.0)})
+    found = bracket(lag, direct, unknown)
+    assert found.proven_stable
+    assert found.ms_upper == pytest.approx(0.4, rel=0.02)
+    unknown = of(direct, so.ParameterSet(plant.defaults.values()), {"K": (-0.6, 0.5)})
+    assert not bracket(lag, direct, unknown, budget=Budget(boxes=300)).proven_stable
+
+
+def test_a_jump_at_a_whole_sample_of_delay_is_covered(controller, stand, thor):
+    """F2 follows the command at once: read before the command changes, it is a sample late for any delay above none."""
+    on_f2 = replace(controller, spec=so.ControllerSpec(bandwidth_hz=30, measured="F2"))
+    unknown = of(stand, thor, {"delay_s": (0.0, 1e-6)})
+    figures = batch_figures(on_f2, stand, thor, {"delay_s": np.array([0.0, 1e-9])})
+    assert figures.ms[0] > 1.002 * figures.ms[1]
+    found = bracket(on_f2, stand, unknown, budget=Budget(tolerance=5e-4))
+    assert figures.ms[0] <= found.ms_upper <= 1.001 * figures.ms[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges"),
+    [("swing", {"delay_s": (0.0, 1e-2)}), ("stand", {"eta": (0.01, 20.0)}), ("swing", {"delay_s": (6.6e-3, 6.7e-3)})],
+)
+def test_an_unstable_set_is_never_proven_stable(name, ranges, controller, thor, request):
+    plant = request.getfixturevalue(name)
+    found = bracket(controller, plant, of(plant, thor, ranges), budget=Budget(boxes=200))
+    assert not found.proven_stable
+    assert (found.ms_upper, found.mt_upper) == (np.inf, np.inf)
+    assert "no bound" in repr(found)
+
+
+def test_a_budget_that_runs_out_leaves_bounds_that_hold(controller, swing, thor):
+    unknown = of(swing, thor.prior(J=3.3e-7, b_r=2e-5), {"I_p": (0.3, 0.5)})
+    figures = batch_figures(controller, swing, unknown.nominal, unknown.values(draws(unknown, 5000)))
+    last = np.inf
+    for boxes in (1, 130, 400):
+        found = bracket(controller, swing, unknown, budget=Budget(boxes=boxes))
+        assert np.max(figures.ms) <= found.ms_upper <= last
+        last = found.ms_upper
+    assert last < 2.0
+
+
+def test_nothing_uncertain_is_the_nominal_loop(controller, stand, thor):
+    found = bracket(controller, stand, of(stand, thor, {}))
+    nominal = controller.close(stand, thor).figures()
+    assert nominal.ms <= found.ms_upper <= 1.011 * nominal.ms
+    assert found.ms_lower == pytest.approx(nominal.ms, rel=1e-9)
+
+
+def test_the_set_of_a_plant_is_the_shadow_of_the_fits(swing, stand, thor):
+    """Every draw's parameters lie in the region, and its half axes are as long as the ellipsoid's."""
+    unknown = of(swing, thor.prior(J=3.3e-8, b_r=2e-6, I_p=0.02), {"eta": (0.9, 1.0)})
+    within = region(stand, unknown)
+    assert set(within.names) == {"J", "b_r", "eta"}
+    assert (within.ball, within.size) == (2, 3)
+    values = unknown.values(draws(unknown, 3000))
+    shape = within.slopes[:2, :2]
+    y = np.linalg.solve(shape, np.array([values[n] for n in within.names[:2]]) - within.centre[:2, None])
+    assert np.max(np.linalg.norm(y, axis=0)) == pytest.approx(1.0, abs=5e-3)
+
+
+def test_physical_bounds_cut_the_set(stand, thor):
+    """Half of the ellipsoid has negative friction, which no draw has: no box goes there."""
+    within = region(stand, of(stand, thor.prior(b_r=1e-4), {}))
+    boxes = within.whole(1e-3)
+    low = within.at(boxes.centre - boxes.radius)["b_r"]
+    assert np.min(low) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_certificate_states_and_keeps_the_bounds(controller, swing, thor, tmp_path):
+    ranges = {"I_p": (0.3, 0.5)}
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50, bounds=Budget())
+    found = certificate.brackets["swing"]
+    assert certificate.worst["swing"].ms <= found.ms_upper < 1.011 * certificate.worst["swing"].ms
+    assert "proven: all stable, Ms below 1.5" in repr(certificate)
+    content = json.loads(json.dumps(certificate.to_dict(), default=lambda item: item.tolist()))
+    assert content["plants"]["swing"]["worst"]["proven_stable"] is True
+    again = so.robustness.Certificate.from_dict(content, controller, {"swing": swing}, thor)
+    assert again.brackets == certificate.brackets
+    plain = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50)
+    assert plain.brackets == {}
+    assert "ms_upper" not in plain.to_dict()["plants"]["swing"]["worst"]
+
+
+def test_a_worse_plant_met_on_the_way_is_the_worst_case(controller, swing, thor):
+    unknown = of(swing, thor, {"I_p": (0.1, 0.6)})
+    from seaopt.robustness.worst import witnessed
+
+    mild = witnessed(controller, swing, thor, {"I_p": 0.36})
+    found = bracket(controller, swing, unknown, mild)
+    assert found.ms_lower > mild.ms
+    again = witnessed(controller, swing, thor, found.parameters)
+    assert again.ms == pytest.approx(found.ms_lower, rel=1e-9)
+
+
+def test_what_cannot_be_enclosed_is_left_out(controller, stand, thor):
+    import casadi as ca
+
+    plant = so.Plant(
+        name="odd", states=stand.states, inputs=stand.inputs, outputs=stand.outputs, parameters=stand.parameters,
+        f=lambda t, x, u, p: stand.f(t, x, u, p) | {"q": x.qd * (1.0 + ca.erf(p.eta - 1.0))}, h=stand.h,
+    )  # fmt: skip
+    found = bracket(controller, plant, of(plant, thor, {"eta": (0.9, 1.0)}))
+    assert "erf" in found.left_out
+    assert not found.proven_stable
+    assert "no bound: " in found.statement
+
+
+def test_figures_are_rounded_up():
+    found = Bracket(
+        ms_lower=1.5, ms_upper=1.54401, mt_lower=1.2, mt_upper=12.3450001, proven_stable=True, boxes=3
+    )  # fmt: skip
+    assert found.statement == "proven: all stable, Ms below 1.545, Mt below 12.35"
+
+
+@pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"boxes": 0}, {"seconds": -1.0}])
+def test_bad_budgets(wrong):
+    with pytest.raises(ControlError, match="not positive"):
+        Budget(**wrong)
