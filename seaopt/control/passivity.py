@@ -179,7 +179,7 @@ def passivity(
     law = controller.measurement
     impedance, angle = _curves(port, law, ts, controller.delay_samples)
     f = with_minima(angle, with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
-    stable = _held_stable(port, controller)
+    stable = held_stable(port, controller)
     bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
     least = int(np.argmin(np.real(z)))
@@ -246,7 +246,7 @@ def passivity_rows(
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 
-def _held_stable(port: Port, controller: Controller) -> bool:
+def held_stable(port: Port, controller: Controller) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
     a, b, c, d = port.link_held()
     late = np.array([port.delay_s])
