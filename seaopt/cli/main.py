@@ -70,6 +70,8 @@ def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) 
             session.run("report")
             break
         session.run(stage)
+    for what in session.left_out(stages):
+        session.say(f"left out: {what}")
     _finish(session, json, stages)
 
 

@@ -91,6 +91,19 @@ class Session:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them")
         return [*stages, "report"]
 
+    def left_out(self, stages: list[str]) -> list[str]:
+        """Return what the file, or the fit, gives reason to expect of a whole run and does not get, and why."""
+        source, table = self.problem.source, self.problem.table
+        if table.robustness is not None and table.controller is None:
+            return [f"tuning and certifying: {source} has [robustness] but no [controller]; add one"]
+        if table.controller is not None and "tune" not in stages:
+            return ["tuning and certifying: they need a fit that has converged; mend it first"]
+        return []
+
+    def say(self, text: str) -> None:
+        """Write one line on stderr."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
     def designable(self) -> bool:
         """Tell whether the fit of this run can be designed with: it converged, or there was none."""
         found = self.results.get("fit")
@@ -116,7 +129,7 @@ class Session:
         if not self._console.is_terminal:
             notes = [""]
             yield lambda note: notes.__setitem__(0, note)
-            self._console.print(f"{label}: {notes[0] or 'done'}", highlight=False, markup=False, soft_wrap=True)
+            self.say(f"{label}: {notes[0] or 'done'}")
             return
         columns = (
             SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<22}"),
@@ -261,7 +274,7 @@ class Session:
         try:
             return Fit.from_dict(self._read("fit"))
         except ProblemError as error:
-            self._console.print(f"left out: {error}", highlight=False, markup=False, soft_wrap=True)
+            self.say(f"left out: {error}")
             return None
 
     def _tune(self, tell: Callable[[str], None]) -> None:
@@ -300,10 +313,10 @@ class Session:
         self.written += write_frontier_figure(result, self.folder / "frontier")
 
     def _certify(self, tell: Callable[[str], None]) -> None:
+        plants = self.problem.certified_plants()
         controller, source = self.controller(), self.parameters()
         table = self.problem.robustness
         tell(f"{table.samples} draws")
-        plants = self.problem.certified_plants()
         self._design_values(*plants.values())
         result = certify(
             controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
