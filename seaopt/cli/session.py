@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from collections.abc import Callable, Generator
@@ -16,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from seaopt.cli.frontier import show_frontier
+from seaopt.cli.provenance import FILES, made_from
 from seaopt.cli.responses import responses
 from seaopt.control import Controller, sweep, tune
 from seaopt.errors import ProblemError
@@ -37,13 +37,6 @@ SCHEMAS = {
     "sweep": "seaopt/frontier/1",
     "certify": "seaopt/robustness/1",
 }
-FILES = {
-    "fit": "fit.json",
-    "frf": "frf.json",
-    "tune": "controller.json",
-    "sweep": "frontier.json",
-    "certify": "robustness.json",
-}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",
@@ -53,11 +46,6 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 class Session:
@@ -180,7 +168,9 @@ class Session:
 
     def _write(self, stage: str, content: dict[str, Any]) -> None:
         """Write a result with the digest of what it was made from."""
-        self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": self._made_from(stage)}))
+        self.written.append(
+            write_json(self.folder / FILES[stage], content | {"made_from": made_from(self.problem, stage, self.folder)})
+        )
 
     def _read(self, stage: str) -> dict[str, Any]:
         """Read an earlier stage's result; one made from something else than what is there now is refused.
@@ -191,27 +181,10 @@ class Session:
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
         content = read_json(path, SCHEMAS[stage])
-        made_from = self._made_from(stage)
-        if content.get("made_from", made_from) != made_from:
+        expected = made_from(self.problem, stage, self.folder)
+        if content.get("made_from", expected) != expected:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         return content
-
-    def _made_from(self, stage: str) -> dict[str, str]:
-        """Return digests of the parts of the problem that a stage reads, and of the result before it, by its file."""
-        table = self.problem.table.model_dump(mode="json")
-        parts = ["parameters", "plant", "experiment", "fit"]
-        earlier = {"fit": None, "frf": None, "tune": "fit.json", "sweep": "fit.json", "certify": "controller.json"}[
-            stage
-        ]
-        if stage not in ("fit", "frf"):
-            parts += ["controller", "robustness"]
-        if earlier == "fit.json" and not self.problem.table.experiment:
-            earlier = None
-        text = json.dumps({part: table[part] for part in parts}, sort_keys=True)
-        made_from = {"problem": hashlib.sha256(text.encode()).hexdigest()}
-        if earlier and (self.folder / earlier).exists():
-            made_from[earlier] = digest(self.folder / earlier)
-        return made_from
 
     def _simulate(self, tell: Callable[[str], None]) -> None:
         if not self.problem.table.experiment:

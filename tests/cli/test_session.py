@@ -6,6 +6,7 @@ import pytest
 
 import seaopt as so
 from seaopt.cli.main import run
+from seaopt.cli.provenance import made_from
 from seaopt.cli.session import Session
 
 BENCH = """
@@ -45,3 +46,82 @@ def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsy
     for stage in ("tune", "certify"):
         with pytest.raises(so.SeaoptError, match=r"has no \[controller\]; add one to tune or certify"):
             Session(path, tmp_path / "out").run(stage)
+
+
+DESIGN = """
+schema = 1
+[parameters]
+J = { value = 3.31e-6, prior_std = 1e-8, min = 1e-8, max = 1e-4 }
+eta = { value = 0.95, max = 2.0 }
+[plant.stand]
+kind = "high_impedance"
+[plant.swing]
+kind = "moving_output"
+[[experiment]]
+name = "lines"
+plant = "stand"
+virtual = { seed = 1, duration_s = 2, rate_hz = 400, excitation = { noise = { std = 1.0, band_hz = 50 } } }
+[controller]
+plant = "stand"
+bandwidth_hz = 30
+max_sensitivity = 1.6
+[robustness]
+plants = ["swing"]
+parameters = { I_p = [0.3, 0.5] }
+samples = 60
+"""
+CORNERS = DESIGN.replace("max_sensitivity", 'robust_to = ["swing"]\nmax_sensitivity')
+DRAWS = DESIGN.replace("max_sensitivity", "draws = 4\nmax_sensitivity")
+RETUNE = DESIGN + "retune = 2\n"
+MORE = '\n[plant.heavy]\nkind = "moving_output"\nparts = ["load_cell"]\n[[experiment]]'
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "changed"),
+    [
+        (DESIGN, "samples = 60", "samples = 70", "certify"),
+        (DESIGN, "samples = 60", "samples = 60\nseed = 9", "certify"),
+        (DESIGN, "[0.3, 0.5]", "[0.2, 0.5]", "certify"),
+        (DESIGN, "samples = 60", "samples = 60\ncurrent_step_A = 0.01", "certify"),
+        (DESIGN, '["swing"]', "[]", "certify"),
+        (DESIGN, "\n[[experiment]]", MORE, ""),
+        (DESIGN, "schema = 1", 'schema = 1\ntitle = "another"', ""),
+        (DESIGN, "max_sensitivity = 1.6", "max_sensitivity = 1.5", "tune"),
+        (DESIGN, "J = ", "m_l = 0.7\nJ = ", "fit tune certify"),
+        (DESIGN, "J = ", "I_p = 0.4\nJ = ", "certify"),
+        (DESIGN, "duration_s = 2", "duration_s = 3", "fit"),
+        (DESIGN, "samples = 60", "samples = 60\nretune = 2", "tune"),
+        (CORNERS, "samples = 60", "samples = 60\nseed = 9", "certify"),
+        (CORNERS, "[0.3, 0.5]", "[0.2, 0.5]", "tune certify"),
+        (CORNERS, "J = ", "I_p = 0.4\nJ = ", "tune certify"),
+        (DRAWS, "samples = 60", "samples = 70", "certify"),
+        (DRAWS, "samples = 60", "samples = 60\nseed = 9", "tune certify"),
+        (DRAWS, "prior_std = 1e-8", "prior_std = 2e-8", "fit tune certify"),
+        (RETUNE, "samples = 60", "samples = 70", "tune certify"),
+        (RETUNE, "retune = 2", "retune = 3", "tune"),
+        (RETUNE, '["swing"]', "[]", "tune certify"),
+    ],
+)
+def test_a_result_counts_what_it_depends_on(write, tmp_path, text, old, new, changed):
+    assert old in text
+    before, after = so.read_problem(write(text)), so.read_problem(write(text.replace(old, new, 1), "after.toml"))
+    stages = ("fit", "tune", "certify")
+    moved = [stage for stage in stages if made_from(before, stage, tmp_path) != made_from(after, stage, tmp_path)]
+    assert moved == changed.split()
+
+
+def test_one_controller_answers_new_questions_and_no_others(write, tmp_path):
+    """Without experiments, so that nothing is fitted; a certificate of an old controller is refused too."""
+    text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
+    folder = tmp_path / "out"
+    Session(write(text), folder).run("tune")
+    held = (folder / "controller.json").read_bytes()
+    for old, new in (("samples = 60", "samples = 20"), ("[0.3, 0.5]", "[0.35, 0.4]")):
+        session = Session(write(text.replace(old, new)), folder)
+        session.run("certify")
+    assert session.results["certify"].monte_carlo.samples == 60
+    assert (folder / "controller.json").read_bytes() == held
+    with pytest.raises(so.SeaoptError, match=r"robustness.json: was made from another.*run seaopt certify"):
+        Session(write(text), folder).run("report")
+    with pytest.raises(so.SeaoptError, match=r"controller.json: was made from another.*run seaopt tune"):
+        Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.5")), folder).run("certify")
