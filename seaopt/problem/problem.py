@@ -272,7 +272,7 @@ def read_problem(path: Path | str) -> Problem:
     try:
         plants = {name: _plant(name, item.kind, item.model_extra or {}) for name, item in table.plant.items()}
         parameters = _parameters(table.parameters, plants)
-        check_references(table, plants)
+        check_references(table, plants, parameters)
         spec = _spec(table)
     except SeaoptError as error:
         raise type(error)(f"{source}: {error}") from error
