@@ -301,6 +301,8 @@ class Session:
             sensors=self.problem.sensors, current_step_A=table.current_step_A, seed=table.seed
         )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
+        for remark in self.problem.remarks(self.values()):
+            self.say(f"note: {remark}")
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 
@@ -358,6 +360,8 @@ class Session:
                 if stage == "tune" and "joint" in self.results:
                     console.print(repr(self.results["joint"]), highlight=False, markup=False)
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
+                for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
+                    console.print(f"  note: {remark}", highlight=False, markup=False)
         for stage in ["fit", "tune", "certify"] if "report" in stages else stages:
             for good, text in self._verdict(stage):
                 console.print("[green]met    [/]" if good else "[red]not met[/]", end="  ")

@@ -110,16 +110,20 @@ def test_a_result_counts_what_it_depends_on(write, tmp_path, text, old, new, cha
     assert moved == changed.split()
 
 
-def test_one_controller_answers_new_questions_and_no_others(write, tmp_path):
+def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, capsys):
     """Without experiments, so that nothing is fitted; a certificate of an old controller is refused too."""
     text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
     folder = tmp_path / "out"
     Session(write(text), folder).run("tune")
     held = (folder / "controller.json").read_bytes()
-    for old, new in (("samples = 60", "samples = 20"), ("[0.3, 0.5]", "[0.35, 0.4]")):
+    for old, new in (("samples = 60", "samples = 20"), ("[0.3, 0.5]", "[0.4, 0.5]")):
         session = Session(write(text.replace(old, new)), folder)
         session.run("certify")
     assert session.results["certify"].monte_carlo.samples == 60
+    session.show(False, ["certify"])
+    told = capsys.readouterr()
+    remark = "note: robustness.parameters.I_p = [0.4, 0.5] does not contain the nominal 0.36 kg m^2"
+    assert remark in " ".join(told.err.split()) and remark in " ".join(told.out.split())
     assert (folder / "controller.json").read_bytes() == held
     with pytest.raises(so.SeaoptError, match=r"robustness.json: was made from another.*run seaopt certify"):
         Session(write(text), folder).run("report")
