@@ -77,7 +77,7 @@ def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) 
 
 @app.command()
 def simulate(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
-    """Simulate every experiment with the file's values; write one CSV each."""
+    """Simulate every experiment with the file's values; write one CSV each, and the logs of virtual ones."""
     from seaopt.cli.session import Session
 
     session = Session(problem, output)

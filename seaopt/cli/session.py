@@ -46,6 +46,10 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
+SIMULATED = (
+    "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
+    "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
+)
 
 
 class Session:
@@ -190,10 +194,13 @@ class Session:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to simulate; add one")
         runs: dict[str, Log] = {}
-        for experiment in self.experiments():
-            tell(experiment.name)
-            runs[experiment.name] = self._simulated(experiment)
-            self.written.append(write_log(runs[experiment.name], self.folder / f"simulation_{experiment.name}.csv"))
+        for experiment, table in zip(self.experiments(), self.problem.table.experiment, strict=True):
+            name = experiment.name
+            tell(name)
+            runs[name] = self._simulated(experiment)
+            self.written.append(write_log(runs[name], self.folder / f"simulation_{name}.csv"))
+            if table.virtual is not None:
+                self.written.append(write_log(experiment.log, self.folder / f"virtual_{name}.csv"))
         self.results["simulate"] = runs
 
     def _simulated(self, experiment: Experiment) -> Log:
@@ -352,7 +359,10 @@ class Session:
             return
         console = Console(soft_wrap=True)
         for stage in stages:
-            if stage == "frf":
+            if stage == "simulate":
+                for line in SIMULATED[: 2 if any(item.virtual for item in self.problem.table.experiment) else 1]:
+                    console.print(line, highlight=False, markup=False)
+            elif stage == "frf":
                 self.results[stage].show(console)
             elif stage == "sweep":
                 show_frontier(self.results[stage], console)

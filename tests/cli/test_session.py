@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import seaopt as so
@@ -46,6 +47,25 @@ def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsy
     for stage in ("tune", "certify"):
         with pytest.raises(so.SeaoptError, match=r"has no \[controller\]; add one to tune or certify"):
             Session(path, tmp_path / "out").run(stage)
+
+
+def test_simulate_writes_the_model_and_the_virtual_log(write, tmp_path, capsys):
+    """The log has the true inertia and a noise of 2 N, the model the file's values and no noise."""
+    problem = so.read_problem(write(BENCH))
+    session = Session(write(BENCH), tmp_path / "out")
+    session.run("simulate")
+    session.show(False, ["simulate"])
+    told = capsys.readouterr().out
+    assert "simulation_NAME.csv: the plant with the values" in told and "virtual_NAME.csv: the log of" in told
+    channels = {"I": "I [A]", "F1": "F1 [N]"}
+    model, bench = (
+        so.read_log(tmp_path / "out" / f"{kind}_lines.csv", time="time [s]", channels=channels)
+        for kind in ("simulation", "virtual")
+    )
+    truth = so.simulate(problem.plants["stand"], problem.parameters.update(J=3.31e-6), bench)
+    assert np.std(bench["F1"] - truth["F1"]) == pytest.approx(2.0, rel=0.1)
+    first = so.simulate(problem.plants["stand"], problem.parameters, bench)
+    np.testing.assert_allclose(model["F1"], first["F1"], atol=1e-9)
 
 
 DESIGN = """
