@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -149,3 +151,16 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
         Session(write(text), folder).run("report")
     with pytest.raises(so.SeaoptError, match=r"controller.json: was made from another.*run seaopt tune"):
         Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.5")), folder).run("certify")
+
+
+def test_a_controller_that_ranges_shaped_is_taken_without_its_memory(write, tmp_path):
+    text = CORNERS[: CORNERS.index("[[experiment]]")] + CORNERS[CORNERS.index("[controller]") :]
+    folder = tmp_path / "out"
+    Session(write(text), folder).run("tune")
+    asked = write(text.replace("[0.3, 0.5]", "[0.1, 0.5]"))
+    with pytest.raises(so.SeaoptError, match="run seaopt tune"):
+        Session(asked, folder).controller()
+    content = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
+    del content["made_from"]
+    (folder / "controller.json").write_text(json.dumps(content), encoding="utf-8")
+    assert Session(asked, folder).controller().gains == content["gains"]
