@@ -324,12 +324,20 @@ class Session:
             results.append(self.controller())
             if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
                 plants = self.problem.certified_plants()
+                tell("simulating again")
                 self.results["certify"] = Certificate.from_dict(
                     self._read("certify"), self.controller(), plants, self.values()
                 )
             results += [self.results["certify"]] if "certify" in self.results else []
-        tell("figures")
-        page = write_report(results, self.folder / "report.html", title=self.problem.title)
+
+        def drawing(name: str, place: int, count: int) -> None:
+            note = f"figure {place} of {count}, {name}"
+            tell(note)
+            if not self._console.is_terminal:  # where a stage else is silent until it is done
+                self.say(f"{LABELS['report']}: {note}")
+
+        page = write_report(results, self.folder / "report.html", title=self.problem.title, progress=drawing)
+        tell("done")
         self.results["report"] = page
         self.written.append(page)
 

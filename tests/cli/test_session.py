@@ -45,6 +45,7 @@ def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsy
     path = write(BENCH + "[robustness]\nparameters = { f_c = [0.0, 0.01] }\n")
     run(path, tmp_path / "out")
     told = " ".join(capsys.readouterr().err.split())
+    assert "writing the report: figure 1 of 3, time_lines" in told
     assert f"left out: tuning and certifying: {path} has [robustness] but no [controller]; add one" in told
     for stage in ("tune", "certify"):
         with pytest.raises(so.SeaoptError, match=r"has no \[controller\]; add one to tune or certify"):
