@@ -308,7 +308,7 @@ class Session:
             sensors=self.problem.sensors, current_step_A=table.current_step_A, seed=table.seed
         )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
-        for remark in self.problem.remarks(self.values()):
+        for remark in (*result.notes, *self.problem.remarks(self.values())):
             self.say(f"note: {remark}")
         self.results["certify"] = result
         self._write("certify", result.to_dict())

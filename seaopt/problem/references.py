@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 from seaopt.control.digital import DELAY
@@ -73,7 +72,6 @@ def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 
 def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
     given = table.robustness.parameters if table.robustness else {}
-    angles = {name for plant in plants.values() for name, unit in plant.states.items() if unit == "rad"}
     for name, ends in given.items():
         place = f"robustness.parameters.{name}"
         try:
@@ -83,11 +81,6 @@ def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: 
         place += f" = [{ends[0]:g}, {ends[1]:g}]"
         if name in parameters:
             _check_own_bounds(place, ends, parameters[name])
-        if name in angles and max(map(abs, ends)) > math.pi:
-            low, high = (math.radians(end) for end in ends)
-            raise ProblemError(
-                f"{place} goes beyond half a turn, and angles are in rad; for degrees write [{low:.4g}, {high:.4g}]"
-            )
         if name == DELAY and table.controller is not None:
             _check_delay(place, ends[1], table.controller.sample_rate_hz)
     try:

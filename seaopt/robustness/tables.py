@@ -25,12 +25,19 @@ def certificate_html(found: Certificate) -> str:
     required = table(
         ("requirement", "where", "value", "limit", "met"),
         [
-            (item.name, item.where, figure(item.value), figure(item.limit), "yes" if item.met else "NO")
+            (
+                item.name,
+                item.where,
+                figure(item.value),
+                f"{item.sense} {figure(item.limit)}",
+                "yes" if item.met else "NO",
+            )
             for item in sorted(found.requirements, key=lambda item: item.met)
         ],
     )
+    varied = paragraph(f"varied: {'; '.join(map(str, found.varied))}") if found.varied else ""
     simulated = items(found.simulated.lines()) if found.simulated is not None else ""
-    return verdict + plants + draws_html(found.monte_carlo) + required + simulated
+    return verdict + items(found.notes) + plants + varied + draws_html(found.monte_carlo) + required + simulated
 
 
 def draws_html(found: Any) -> str:

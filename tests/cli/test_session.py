@@ -145,7 +145,7 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
     assert session.results["certify"].monte_carlo.samples == 60
     session.show(False, ["certify"])
     told = capsys.readouterr()
-    remark = "note: robustness.parameters.I_p = [0.4, 0.5] does not contain the nominal 0.36 kg m^2"
+    remark = "note: the nominal I_p = 0.36 lies outside its range of 0.4 to 0.5"
     assert remark in " ".join(told.err.split()) and remark in " ".join(told.out.split())
     assert (folder / "controller.json").read_bytes() == held
     with pytest.raises(so.SeaoptError, match=r"robustness.json: was made from another.*run seaopt certify"):

@@ -106,7 +106,7 @@ kind = "high_impedance"
             "bandwidth_hz = 30\nbandwidth_range_hz = 50",
             r"range_hz = 50 is not a range; give \[low",
         ),
-        ("I_p = [0.2, 0.6]", "phi = [-30, 30]", r"phi = \[-30, 30\] .* rad; for degrees write \[-0.5236, 0.5236\]"),
+        ("I_p = [0.2, 0.6]", "phi = [-30, 30]", r"parameters.phi: .* = \[-30, 30\] is more than half a turn; .* rad"),
         ("I_p = [0.2, 0.6]", "delay_s = [0, 0.5]", r"reaches 500 sample times .* at most 20 \(0.02 s\)"),
     ],
 )

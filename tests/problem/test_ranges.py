@@ -11,14 +11,11 @@ from seaopt.problem.ranges import range_remarks
 @pytest.mark.parametrize(
     ("ranges", "words"),
     [
-        ({"I_p": (0.5, 0.6)}, ["robustness.parameters.I_p = [0.5, 0.6] does not contain the nominal 0.36 kg m^2"]),
-        ({"eta": (0.5, 0.8)}, ["does not contain the nominal 1, which"]),
         ({"I_p": (0.3, 0.4), "delay_s": (0.0, 1e-3), "phi": (-0.5, 0.5)}, []),
-        ({"delay_s": (5e-4, 1e-3)}, ["does not contain the nominal 0, which"]),
         ({"phi": (-3.0, 3.0)}, ["is in rad: -171.9 to 171.9 degrees, beyond a right angle"]),
     ],
 )
-def test_what_leaves_out_the_nominal_plant_is_told(swing, thor, ranges, words):
+def test_an_angle_that_may_be_in_degrees_is_told(swing, thor, ranges, words):
     found = range_remarks(ranges, {"swing": swing}, thor)
     assert len(found) == len(words)
     for sentence, part in zip(found, words, strict=True):

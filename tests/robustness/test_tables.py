@@ -39,6 +39,7 @@ def test_a_certificate_shows_plants_draws_and_requirements(certificate):
     shown = certificate._repr_html_()
     assert "Certificate: passed" in shown and "<pre>" not in shown
     found = rows(shown)
+    assert "varied: " in shown and "I_p 0.3 to 0.5" in shown
     (plant,) = [row for row in found if row[:2] == ["swing", "yes"]]
     assert plant[2] == f"{certificate.plants['swing'].ms:.4g}"
     assert plant[-1].startswith("I_p = ")
