@@ -160,7 +160,7 @@ class Session:
         values = self.values()
         for note in resting_on(values, {name for plant in plants for name in plant.parameters}):
             if note not in self._warned:
-                self._console.print(f"warning: {note}", highlight=False, markup=False, soft_wrap=True)
+                self.say(f"warning: {note}")
             self._warned.add(note)
         return values
 
@@ -309,7 +309,8 @@ class Session:
         )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         for remark in (*result.notes, *self.problem.remarks(self.values())):
-            self.say(f"note: {remark}")
+            if remark not in self._warned:
+                self.say(f"note: {remark}")
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 
