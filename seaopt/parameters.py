@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from seaopt.errors import ParameterError, suggestion
-from seaopt.units import factor
+from seaopt.units import factor, unit_after
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,12 +51,14 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.value):
-            raise ParameterError(f"parameter {self.name} = {self.value} is not finite; give a number in {self.unit}")
+            unit = unit_after(self.unit)
+            what = f"a number in{unit}" if unit else "a number"
+            raise ParameterError(f"parameter {self.name} = {self.value} is not finite; give {what}")
         if not self.min <= self.max:
             raise ParameterError(f"parameter {self.name}: min = {self.min:g} is above max = {self.max:g}; swap them")
         if not self.min <= self.value <= self.max:
             raise ParameterError(
-                f"parameter {self.name} = {self.value:g} {self.unit} is outside its bounds "
+                f"parameter {self.name} = {self.value:g}{unit_after(self.unit)} is outside its bounds "
                 f"[{self.min:g}, {self.max:g}]; change the value or the bounds"
             )
         if self.prior_std is not None and not 0.0 < self.prior_std < math.inf:

@@ -117,3 +117,15 @@ def si_unit(unit: str) -> str:
 def same_dimension(first: str, second: str) -> bool:
     """Tell whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
     return bool(_parse(first).dimensionality == _parse(second).dimensionality)
+
+
+def unit_after(unit: str) -> str:
+    """Return a unit as it follows a number in a sentence: a space and the unit, or nothing for a pure number.
+
+    Examples
+    --------
+    >>> f"{0.3:g}{unit_after('m')}", f"{0.3:g}{unit_after('-')}"
+    ('0.3 m', '0.3')
+
+    """
+    return "" if unit.strip() in DIMENSIONLESS else f" {unit.strip()}"

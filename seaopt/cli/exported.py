@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from seaopt.cli.session import FILES, SCHEMAS, digest
+from seaopt.cli.provenance import FILES, digest
+from seaopt.cli.session import SCHEMAS
 from seaopt.control.export import export
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json

@@ -70,12 +70,14 @@ def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) 
             session.run("report")
             break
         session.run(stage)
+    for what in session.left_out(stages):
+        session.say(f"left out: {what}")
     _finish(session, json, stages)
 
 
 @app.command()
 def simulate(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
-    """Simulate every experiment with the file's values; write one CSV each."""
+    """Simulate every experiment with the file's values; write one CSV each, and the logs of virtual ones."""
     from seaopt.cli.session import Session
 
     session = Session(problem, output)

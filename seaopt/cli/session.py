@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from collections.abc import Callable, Generator
@@ -16,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from seaopt.cli.frontier import show_frontier
+from seaopt.cli.provenance import FILES, made_from
 from seaopt.cli.responses import responses
 from seaopt.control import Controller, sweep, tune
 from seaopt.errors import ProblemError
@@ -37,13 +37,6 @@ SCHEMAS = {
     "sweep": "seaopt/frontier/1",
     "certify": "seaopt/robustness/1",
 }
-FILES = {
-    "fit": "fit.json",
-    "frf": "frf.json",
-    "tune": "controller.json",
-    "sweep": "frontier.json",
-    "certify": "robustness.json",
-}
 LABELS = {
     "simulate": "simulating",
     "frf": "frequency responses",
@@ -53,11 +46,10 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+SIMULATED = (
+    "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
+    "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
+)
 
 
 class Session:
@@ -91,6 +83,19 @@ class Session:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them")
         return [*stages, "report"]
 
+    def left_out(self, stages: list[str]) -> list[str]:
+        """Return what the file, or the fit, gives reason to expect of a whole run and does not get, and why."""
+        source, table = self.problem.source, self.problem.table
+        if table.robustness is not None and table.controller is None:
+            return [f"tuning and certifying: {source} has [robustness] but no [controller]; add one"]
+        if table.controller is not None and "tune" not in stages:
+            return ["tuning and certifying: they need a fit that has converged; mend it first"]
+        return []
+
+    def say(self, text: str) -> None:
+        """Write one line on stderr."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
     def designable(self) -> bool:
         """Tell whether the fit of this run can be designed with: it converged, or there was none."""
         found = self.results.get("fit")
@@ -116,7 +121,7 @@ class Session:
         if not self._console.is_terminal:
             notes = [""]
             yield lambda note: notes.__setitem__(0, note)
-            self._console.print(f"{label}: {notes[0] or 'done'}", highlight=False, markup=False, soft_wrap=True)
+            self.say(f"{label}: {notes[0] or 'done'}")
             return
         columns = (
             SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<22}"),
@@ -155,7 +160,7 @@ class Session:
         values = self.values()
         for note in resting_on(values, {name for plant in plants for name in plant.parameters}):
             if note not in self._warned:
-                self._console.print(f"warning: {note}", highlight=False, markup=False, soft_wrap=True)
+                self.say(f"warning: {note}")
             self._warned.add(note)
         return values
 
@@ -167,7 +172,9 @@ class Session:
 
     def _write(self, stage: str, content: dict[str, Any]) -> None:
         """Write a result with the digest of what it was made from."""
-        self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": self._made_from(stage)}))
+        self.written.append(
+            write_json(self.folder / FILES[stage], content | {"made_from": made_from(self.problem, stage, self.folder)})
+        )
 
     def _read(self, stage: str) -> dict[str, Any]:
         """Read an earlier stage's result; one made from something else than what is there now is refused.
@@ -178,36 +185,22 @@ class Session:
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
         content = read_json(path, SCHEMAS[stage])
-        made_from = self._made_from(stage)
-        if content.get("made_from", made_from) != made_from:
+        expected = made_from(self.problem, stage, self.folder)
+        if content.get("made_from", expected) != expected:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         return content
-
-    def _made_from(self, stage: str) -> dict[str, str]:
-        """Return digests of the parts of the problem that a stage reads, and of the result before it, by its file."""
-        table = self.problem.table.model_dump(mode="json")
-        parts = ["parameters", "plant", "experiment", "fit"]
-        earlier = {"fit": None, "frf": None, "tune": "fit.json", "sweep": "fit.json", "certify": "controller.json"}[
-            stage
-        ]
-        if stage not in ("fit", "frf"):
-            parts += ["controller", "robustness"]
-        if earlier == "fit.json" and not self.problem.table.experiment:
-            earlier = None
-        text = json.dumps({part: table[part] for part in parts}, sort_keys=True)
-        made_from = {"problem": hashlib.sha256(text.encode()).hexdigest()}
-        if earlier and (self.folder / earlier).exists():
-            made_from[earlier] = digest(self.folder / earlier)
-        return made_from
 
     def _simulate(self, tell: Callable[[str], None]) -> None:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to simulate; add one")
         runs: dict[str, Log] = {}
-        for experiment in self.experiments():
-            tell(experiment.name)
-            runs[experiment.name] = self._simulated(experiment)
-            self.written.append(write_log(runs[experiment.name], self.folder / f"simulation_{experiment.name}.csv"))
+        for experiment, table in zip(self.experiments(), self.problem.table.experiment, strict=True):
+            name = experiment.name
+            tell(name)
+            runs[name] = self._simulated(experiment)
+            self.written.append(write_log(runs[name], self.folder / f"simulation_{name}.csv"))
+            if table.virtual is not None:
+                self.written.append(write_log(experiment.log, self.folder / f"virtual_{name}.csv"))
         self.results["simulate"] = runs
 
     def _simulated(self, experiment: Experiment) -> Log:
@@ -261,7 +254,7 @@ class Session:
         try:
             return Fit.from_dict(self._read("fit"))
         except ProblemError as error:
-            self._console.print(f"left out: {error}", highlight=False, markup=False, soft_wrap=True)
+            self.say(f"left out: {error}")
             return None
 
     def _tune(self, tell: Callable[[str], None]) -> None:
@@ -300,10 +293,10 @@ class Session:
         self.written += write_frontier_figure(result, self.folder / "frontier")
 
     def _certify(self, tell: Callable[[str], None]) -> None:
+        plants = self.problem.certified_plants()
         controller, source = self.controller(), self.parameters()
         table = self.problem.robustness
         tell(f"{table.samples} draws")
-        plants = self.problem.certified_plants()
         self._design_values(*plants.values())
         result = certify(
             controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
@@ -315,6 +308,9 @@ class Session:
             sensors=self.problem.sensors, current_step_A=table.current_step_A, seed=table.seed
         )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
+        for remark in (*result.notes, *self.problem.remarks(self.values())):
+            if remark not in self._warned:
+                self.say(f"note: {remark}")
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 
@@ -329,12 +325,20 @@ class Session:
             results.append(self.controller())
             if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
                 plants = self.problem.certified_plants()
+                tell("simulating again")
                 self.results["certify"] = Certificate.from_dict(
                     self._read("certify"), self.controller(), plants, self.values()
                 )
             results += [self.results["certify"]] if "certify" in self.results else []
-        tell("figures")
-        page = write_report(results, self.folder / "report.html", title=self.problem.title)
+
+        def drawing(name: str, place: int, count: int) -> None:
+            note = f"figure {place} of {count}, {name}"
+            tell(note)
+            if not self._console.is_terminal:  # where a stage else is silent until it is done
+                self.say(f"{LABELS['report']}: {note}")
+
+        page = write_report(results, self.folder / "report.html", title=self.problem.title, progress=drawing)
+        tell("done")
         self.results["report"] = page
         self.written.append(page)
 
@@ -364,7 +368,10 @@ class Session:
             return
         console = Console(soft_wrap=True)
         for stage in stages:
-            if stage == "frf":
+            if stage == "simulate":
+                for line in SIMULATED[: 2 if any(item.virtual for item in self.problem.table.experiment) else 1]:
+                    console.print(line, highlight=False, markup=False)
+            elif stage == "frf":
                 self.results[stage].show(console)
             elif stage == "sweep":
                 show_frontier(self.results[stage], console)
@@ -372,6 +379,8 @@ class Session:
                 if stage == "tune" and "joint" in self.results:
                     console.print(repr(self.results["joint"]), highlight=False, markup=False)
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
+                for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
+                    console.print(f"  note: {remark}", highlight=False, markup=False)
         for stage in ["fit", "tune", "certify"] if "report" in stages else stages:
             for good, text in self._verdict(stage):
                 console.print("[green]met    [/]" if good else "[red]not met[/]", end="  ")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -15,6 +14,7 @@ from seaopt.control.loop import Loop, LoopFigures
 from seaopt.control.spec import ControllerSpec
 from seaopt.control.stored import stored
 from seaopt.estimation import resting_on
+from seaopt.markup import figure, items, paragraph, table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
@@ -252,7 +252,44 @@ class Controller:
         return [f"  {limit:g} A allow a reference of {slow:.4g} N at rest and {fast:.4g} N at {band:g} Hz"]
 
     def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+        head, *_ = repr(self).splitlines()
+        current = {
+            name.split("_A")[0]: f"{value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
+        }
+        gains = [
+            (name, f"{value:.5g} {UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
+            for name, value in self.gains.items()
+        ]
+        told = [] if self.feasible else [self.explanation]
+        return (
+            paragraph(head) + table(("gain", "", "as current"), gains)
+            + table(("on the design plant", "achieved", "asked"), self._achieved_rows())
+            + items([*told, *(line.strip() for line in self._force_lines())])
+        )  # fmt: skip
+
+    def _achieved_rows(self) -> list[tuple[str, str, str]]:
+        a, s = self.achieved, self.spec
+        band, delay = a.tracking_band_hz, a.delay_margin_s
+        return [
+            ("bandwidth", figure(a.bandwidth_hz, "Hz"), f"{s.bandwidth_hz:g} Hz"),
+            ("tracking band", "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", ""),
+            (
+                "sensitivity bandwidth", figure(a.sensitivity_bandwidth_hz, "Hz"),
+                f"at least {s.sensitivity_bandwidth_limit_hz:g} Hz",
+            ),
+            ("Ms", figure(a.ms), _limited("at most", s.max_sensitivity)),
+            ("Mt", figure(a.mt), _limited("at most", s.max_complementary)),
+            ("reference peak", figure(a.reference_peak), _limited("at most", s.max_reference_peak)),
+            ("noise gain", figure(a.noise_gain, "N/N"), _limited("at most", s.max_noise_gain)),
+            ("disk margin", figure(a.disk_margin), _limited("at least", s.min_disk_margin)),
+            ("gain margin", figure(a.gain_margin_db, "dB"), ""),
+            ("phase margin", figure(a.phase_margin_deg, "deg"), ""),
+            ("delay margin", figure(None if delay is None else 1e3 * delay, "ms"), ""),
+        ]  # fmt: skip
+
+
+def _limited(sense: str, limit: float | None) -> str:
+    return "" if limit is None else f"{sense} {limit:g}"
 
 
 def _shown(value: float | None) -> str:

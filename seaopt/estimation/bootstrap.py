@@ -36,6 +36,7 @@ from seaopt.estimation.losses import Linear, pull_of
 from seaopt.estimation.normal import inverse
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit, Minimum
+from seaopt.units import unit_after
 
 LEAST = 20  # draws, below which a covariance says nothing
 
@@ -102,7 +103,7 @@ class Bootstrap:
         for name, unit, value in zip(self.names, self.units, self.estimates, strict=True):
             low, high = self.interval(name)
             lines.append(
-                f"  {name} = {value:.6g} {unit}: std {self.std(name):.2g} "
+                f"  {name} = {value:.6g}{unit_after(unit)}: std {self.std(name):.2g} "
                 f"(the fit says {self.reference.std(name):.2g}), 95 % of the draws {low:.6g} to {high:.6g}"
             )
         return "\n".join(lines)

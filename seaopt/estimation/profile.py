@@ -29,6 +29,7 @@ from seaopt.estimation.least_squares import minimise
 from seaopt.estimation.losses import Linear
 from seaopt.estimation.normal import inverse, solved
 from seaopt.estimation.result import Fit, Minimum
+from seaopt.units import unit_after
 
 CLOSE = 2e-3  # of tau: near enough for an end of the interval to be interpolated
 MOST = 40  # refits an end
@@ -100,7 +101,7 @@ class Profile:
         low, high = self.interval
         ends = [f"{end:.6g}" + ("" if shut else " (open)") for end, shut in zip((low, high), self.closed, strict=True)]
         lines = [
-            f"Profile of {self.name}: {self.estimate:.6g} {self.unit}, {100 * self.level:g} % interval "
+            f"Profile of {self.name}: {self.estimate:.6g}{unit_after(self.unit)}, {100 * self.level:g} % interval "
             f"{ends[0]} to {ends[1]}",
             f"  from the std alone: {self.wald[0]:.6g} to {self.wald[1]:.6g}",
             f"  {self.refits} refits; the cost's rise is divided by {self.scale:.3g} for the residuals' colour",

@@ -20,6 +20,7 @@ from seaopt.estimation.leftover import Errors, errors
 from seaopt.estimation.residuals import Residuals
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.simulation import Clock, Point, make_model, run_passes
+from seaopt.units import unit_after
 
 SCHEMA = "seaopt/fit/1"
 STATUSES = ("converged", "max_iterations", "stalled", "not_identifiable")
@@ -224,7 +225,10 @@ class Fit:
         lines.append(f"  {self.samples} samples, {self.iterations} iterations, {self.wall_s:.2f} s")
         shown = ParameterSet(item for item in self.parameters.values() if item.free)
         lines += [f"  {line}" for line in repr(shown).splitlines()]
-        lines += [f"  {name} = {item.value:.5g} ± {item.std:.2g} {item.unit}" for name, item in self.derived.items()]
+        lines += [
+            f"  {name} = {item.value:.5g} ± {item.std:.2g}{unit_after(item.unit)}"
+            for name, item in self.derived.items()
+        ]
         for name, own in self.nuisance.items():
             lines += [f"  {name}: {line}" for line in own.told]
             if len(own.initial_state) > 1:
@@ -236,7 +240,7 @@ class Fit:
                 held += "" if item.one_step_fit_percent is None else f", one step {item.one_step_fit_percent:.2f} %"
                 lines.append(
                     f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
-                    f"rms residual {item.rms_residual:.4g} {item.unit}"
+                    f"rms residual {item.rms_residual:.4g}{unit_after(item.unit)}"
                 )
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)

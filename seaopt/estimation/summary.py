@@ -29,6 +29,7 @@ from seaopt.estimation.steps import MAX_SUBSTEPS, StepError
 from seaopt.estimation.unknowns import Locals, Unknowns
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.units import unit_after
 
 CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
 ANOTHER_SIZE = 100.0  # times the start, which hints at a unit rather than at a bad guess
@@ -184,7 +185,7 @@ def _marked(fitted: ParameterSet, names: Sequence[str]) -> ParameterSet:
 def _open(fitted: ParameterSet, given: ParameterSet, message: str) -> tuple[ParameterSet, str]:
     """Call those parameters not identified that are less certain than their size: the log hardly shows them."""
     vague = {
-        name: f"{name} = {item.value:.3g} ± {item.std:.2g} {item.unit}"
+        name: f"{name} = {item.value:.3g} ± {item.std:.2g}{unit_after(item.unit)}"
         for name, item in fitted.items()
         if item.free and item.std is not None and item.std > VAGUE * max(abs(item.value), abs(given[name].value))
     }

@@ -18,7 +18,7 @@ import casadi as ca
 
 from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.units import DIMENSIONLESS, factor, si_unit
+from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
@@ -143,7 +143,8 @@ class Plant:
             elif name in defaults:
                 items.append(defaults[name])
             else:
-                raise ParameterError(f'parameter "{name}" of plant {self.name} has no value; give one in {unit}')
+                what = f"one in{unit_after(unit)}" if unit_after(unit) else "one"
+                raise ParameterError(f'parameter "{name}" of plant {self.name} has no value; give {what}')
         return ParameterSet(items)
 
     def derived_values(self) -> dict[str, tuple[Any, str]]:

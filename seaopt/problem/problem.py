@@ -27,6 +27,7 @@ from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
 from seaopt.problem.columns import column_of, log_files, rule_of
+from seaopt.problem.ranges import range_remarks
 from seaopt.problem.references import check_references
 from seaopt.problem.schema import (
     ColumnTable,
@@ -113,6 +114,10 @@ class Problem:
         names = [self.table.controller.plant]
         names += self.table.controller.robust_to
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
+
+    def remarks(self, parameters: ParameterSet) -> list[str]:
+        """Return what is worth a word about the ranges before certifying at nominal parameters."""
+        return range_remarks(self.ranges, self.certified_plants(), parameters)
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
         """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges."""
@@ -272,7 +277,7 @@ def read_problem(path: Path | str) -> Problem:
     try:
         plants = {name: _plant(name, item.kind, item.model_extra or {}) for name, item in table.plant.items()}
         parameters = _parameters(table.parameters, plants)
-        check_references(table, plants)
+        check_references(table, plants, parameters)
         spec = _spec(table)
     except SeaoptError as error:
         raise type(error)(f"{source}: {error}") from error

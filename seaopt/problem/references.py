@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from seaopt.control.digital import DELAY
 from seaopt.errors import ProblemError, SeaoptError, suggestion
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.columns import check_inside
 from seaopt.problem.schema import ExperimentTable, ProblemTable, SensorsTable
 from seaopt.robustness import check_ranges
+from seaopt.units import unit_after
+
+MOST_DELAY_SAMPLES = 20
 
 
-def check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    """Refuse names of plants, inputs, outputs and ranges that the file's plants do not have.
+def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
+    """Refuse names of plants, inputs, outputs and ranges that the file's plants do not have, and ranges out of bounds.
 
     Raises
     ------
@@ -30,7 +35,7 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         if name not in plants:
             raise ProblemError(f'{place} = "{name}" is no [plant] of this file; {suggestion(name, plants)}')
     _check_measured(table, plants)
-    _check_ranges(table, plants)
+    _check_ranges(table, plants, parameters)
     _check_sensors(table, plants)
     seen: set[str] = set()
     for item in table.experiment:
@@ -65,11 +70,41 @@ def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
                 raise ProblemError(f'robustness.sensors.{kind} names "{name}"; {suggestion(name, known)}')
 
 
-def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
+    given = table.robustness.parameters if table.robustness else {}
+    for name, ends in given.items():
+        place = f"robustness.parameters.{name}"
+        try:
+            check_ranges({name: ends}, plants)
+        except SeaoptError as error:
+            raise ProblemError(f"{place}: {error}") from error
+        place += f" = [{ends[0]:g}, {ends[1]:g}]"
+        if name in parameters:
+            _check_own_bounds(place, ends, parameters[name])
+        if name == DELAY and table.controller is not None:
+            _check_delay(place, ends[1], table.controller.sample_rate_hz)
     try:
-        check_ranges(table.robustness.parameters if table.robustness else {}, plants)
+        check_ranges(given, plants)
     except SeaoptError as error:
         raise ProblemError(f"robustness.parameters: {error}") from error
+
+
+def _check_own_bounds(place: str, ends: tuple[float, float], item: Parameter) -> None:
+    if ends[0] < item.min or ends[1] > item.max:
+        raise ProblemError(
+            f"{place}{unit_after(item.unit)} leaves the bounds [{item.min:g}, {item.max:g}] that this file gives "
+            f"{item.name}; keep inside, or change min and max of parameters.{item.name}"
+        )
+
+
+def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
+    """Refuse a delay of many samples: each is a state of every draw's plant, and takes its time."""
+    if longest_s * rate_hz > MOST_DELAY_SAMPLES * (1.0 + 1e-9):
+        raise ProblemError(
+            f"{place} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
+            f"takes at most {MOST_DELAY_SAMPLES} ({MOST_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and whole "
+            "samples that are always there belong in controller.delay_samples"
+        )
 
 
 def _check_experiment(item: ExperimentTable, plant: Plant) -> None:

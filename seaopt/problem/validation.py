@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +40,24 @@ def validated(source: Path) -> ProblemTable:
         if first["type"] == "extra_forbidden":
             known = _known_keys(first["loc"])
             raise ProblemError(f"{source}: unknown key {place}; {suggestion(str(first['loc'][-1]), known)}") from error
+        if _of_a_pair(first):
+            at = _place(first["loc"][:-1] if first["type"] == "missing" else first["loc"])
+            raise ProblemError(f"{source}: {at} = {_shown(first['input'])} is not a range; give [low, high]") from error
         if first["type"] == "missing":
             raise ProblemError(f"{source}: key {place} is missing; add it") from error
-        value = repr(first["input"])
-        shown = value if len(value) <= 60 else value[:57] + "..."
-        raise ProblemError(f"{source}: {place} = {shown}: {first['msg']}") from error
+        raise ProblemError(f"{source}: {place} = {_shown(first['input'])}: {first['msg']}") from error
+
+
+def _of_a_pair(error: Mapping[str, Any]) -> bool:
+    """Tell whether an error is that of two numbers that are not two; every tuple of the schema is a range."""
+    return error["type"] in ("tuple_type", "too_long", "too_short") or (
+        error["type"] == "missing" and isinstance(error["loc"][-1], int)
+    )
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _toml(source: Path) -> dict[str, Any]:

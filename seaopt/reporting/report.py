@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -39,9 +39,16 @@ _CAPTIONS = {
     "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
     "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
 }
+DPI = 130
 
 
-def write_report(results: Sequence[Result], path: Path | str, *, title: str = "Series elastic actuator") -> Path:
+def write_report(
+    results: Sequence[Result],
+    path: Path | str,
+    *,
+    title: str = "Series elastic actuator",
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Path:
     """Write an HTML page, and its figures beside it as SVG and PNG.
 
     Parameters
@@ -53,6 +60,9 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
         The page; figures go to the folder ``figures`` beside it.
     title : str
         Heading of the page.
+    progress : callable, optional
+        Called before each figure is drawn, which takes the most time, with its name, its number from 1 and how many
+        there are.
 
     Returns
     -------
@@ -95,7 +105,9 @@ def write_report(results: Sequence[Result], path: Path | str, *, title: str = "S
     figures |= simulated
     target = Path(path)
     drawn: list[dict[str, str]] = []
-    for name, figure in figures.items():
+    for place, (name, figure) in enumerate(figures.items(), start=1):
+        if progress is not None:
+            progress(name, place, len(figures))
         svg = rendered(figure, "svg")
         write_bytes(target.parent / "figures" / f"{name}.svg", svg)
         write_bytes(target.parent / "figures" / f"{name}.png", rendered(figure, "png"))
@@ -210,9 +222,18 @@ def rendered(figure: Any, kind: str) -> bytes:
     stream = io.BytesIO()
     metadata = {"Date": None} if kind == "svg" else None
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "seaopt", "font.size": 9.0}):
-        figure.savefig(stream, format=kind, dpi=130, metadata=metadata)
-    figure.set_layout_engine("none")  # laying out takes as long as drawing: once is enough
+        _lay_out(figure)
+        figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
     return stream.getvalue()
+
+
+def _lay_out(figure: Any) -> None:
+    """Lay a figure out, once, and leave it without an engine: for one, even an idle one, `savefig` draws twice."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.set_dpi(DPI)
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def _inline(svg: str, name: str) -> str:

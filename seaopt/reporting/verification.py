@@ -114,6 +114,7 @@ def stability_figure(found: StabilityMap) -> Figure:
         axis.set_title(f"damper {damping:g} N s/m: stable in {share:.3g} %", fontsize="medium", loc="left")
         axis.set_xscale("log")
         axis.set_yscale("log")
+        axis.minorticks_off()  # hundreds over these decades, behind the map, and slow to draw
     for axis in axes.ravel()[found.damping.size :]:
         axis.set_visible(False)
     for axis in axes[-1]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -19,6 +18,7 @@ from seaopt.robustness.bracket import Bracket
 from seaopt.robustness.draws import Varied
 from seaopt.robustness.nominal import PlantMargins, plant_margins
 from seaopt.robustness.simulated import Simulated, simulated
+from seaopt.robustness.tables import certificate_html, draws_html
 from seaopt.robustness.verification import witness
 from seaopt.robustness.worst import Worst, witnessed
 
@@ -77,6 +77,9 @@ class MonteCarlo:
             f"{head}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
             f"{_confidence(self.confidence)}"
         )
+
+    def _repr_html_(self) -> str:
+        return draws_html(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -283,7 +286,7 @@ class Certificate:
         return lines
 
     def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+        return certificate_html(self)
 
 
 def _simulation_requirements(found: Simulated) -> list[Requirement]:

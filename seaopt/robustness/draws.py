@@ -284,7 +284,8 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
         raise ControlError(f"ranges is a {type(ranges).__name__}; give a mapping of name to (low, high)")
     for name, given in ranges.items():
         if name not in known:
-            raise ControlError(f'range of "{name}": no plant has it; {suggestion(str(name), known)}')
+            what = 'add parts = ["screw_mode"] to one' if name == SCREW_MODE else suggestion(str(name), known)
+            raise ControlError(f'range of "{name}": no plant has it; {what}')
         low, high = _ends(name, given)
         if not (np.isfinite(low) and np.isfinite(high)):
             raise ControlError(f"range of {name} = [{low:g}, {high:g}] is not finite; give [low, high]")

@@ -24,6 +24,7 @@ from seaopt.plants import Plant
 from seaopt.robustness.batch import BatchFigures, batch_figures
 from seaopt.robustness.draws import Uncertainty
 from seaopt.robustness.severity import limits, severities, severity_slopes
+from seaopt.robustness.tables import worst_html
 
 LEVEL = 0.999
 STARTS = 8
@@ -105,6 +106,9 @@ class Worst(tuple[Plant, ParameterSet]):
         return (
             f"Worst(Ms {self.ms:.5g}, Mt {self.mt:.5g}, spectral radius {self.witness.spectral_radius:.6g} at {where})"
         )
+
+    def _repr_html_(self) -> str:
+        return worst_html(self)
 
 
 def find_worst(

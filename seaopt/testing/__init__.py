@@ -9,6 +9,7 @@ import numpy as np
 from seaopt.errors import SeaoptError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
+from seaopt.units import unit_after
 
 
 def assert_recovered(
@@ -54,7 +55,7 @@ def assert_recovered(
         good = distance <= sigmas and np.isfinite(std) and (within is None or relative <= within)
         failed |= not good
         rows.append(
-            f"  {name:<12} found {item.value:.6g} ± {std:.2g} {item.unit}, true {true:.6g}: "
+            f"  {name:<12} found {item.value:.6g} ± {std:.2g}{unit_after(item.unit)}, true {true:.6g}: "
             f"{distance:.1f} std, {relative:.2%} off{'' if good else '   <-- TOO FAR'}"
         )
     if failed:

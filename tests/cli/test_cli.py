@@ -155,6 +155,7 @@ def test_an_unidentifiable_fit_exits_1_with_a_report(folder):
     out = seaopt("run", "open.toml", "-o", "open", cwd=folder)
     assert out.returncode == 1
     assert "enter only together" in out.stdout
+    assert "left out: tuning and certifying: they need a fit that has converged" in out.stderr
     assert (folder / "open" / "report.html").exists()
     assert not (folder / "open" / "controller.json").exists()
 

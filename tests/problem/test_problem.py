@@ -93,7 +93,21 @@ kind = "high_impedance"
         ("delay_samples = 1", "delay_samples = 5000", "from 0 to 1000"),
         ('measured = "F1"', 'measured = "F9"', 'did you mean "F1"|F9'),
         ("I_p = [0.2, 0.6]", "I_q = [0.2, 0.6]", "I_q"),
-        ("I_p = [0.2, 0.6]", "I_p = [0.6, 0.2]", "empty"),
+        ("I_p = [0.2, 0.6]", "I_p = [0.6, 0.2]", "robustness.parameters.I_p: .*empty"),
+        ("I_p = [0.2, 0.6]", "eta = [0.5, 3.0]", r"robustness.parameters.eta = \[0.5, 3\] leaves the bounds \[0, 2\]"),
+        ("I_p = [0.2, 0.6]", "J = [1e-9, 1e-6]", r"J = \[1e-09, 1e-06\] kg m\^2 leaves .* change min and max"),
+        ("value = 0.7, free = true", "value = 2.5, free = true", r"eta = 2.5 is outside its bounds \[0, 2\]"),
+        ("I_p = [0.2, 0.6]", "I_p = 0.3", r"robustness.parameters.I_p = 0.3 is not a range; give \[low, high\]"),
+        ("I_p = [0.2, 0.6]", 'I_p = "0.2..0.6"', r"I_p = '0.2..0.6' is not a range; give \[low, high\]"),
+        ("I_p = [0.2, 0.6]", "I_p = [0.2]", r"I_p = \[0.2\] is not a range; give \[low, high\]"),
+        ("I_p = [0.2, 0.6]", "I_p = [0.2, 0.4, 0.6]", r"I_p = \[0.2, 0.4, 0.6\] is not a range; give \[low, high\]"),
+        (
+            "bandwidth_hz = 30",
+            "bandwidth_hz = 30\nbandwidth_range_hz = 50",
+            r"range_hz = 50 is not a range; give \[low",
+        ),
+        ("I_p = [0.2, 0.6]", "phi = [-30, 30]", r"parameters.phi: .* = \[-30, 30\] is more than half a turn; .* rad"),
+        ("I_p = [0.2, 0.6]", "delay_s = [0, 0.5]", r"reaches 500 sample times .* at most 20 \(0.02 s\)"),
     ],
 )
 def test_mistakes_are_one_clear_line(write, old, new, words):

@@ -8,7 +8,10 @@ import seaopt as so
 
 def test_text_from_problems_is_escaped(stand, thor, tmp_path):
     controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    page = so.write_report([controller], tmp_path / "r.html", title="<script>alert(1)</script>")
+    told: list[tuple[str, int, int]] = []
+    title = "<script>alert(1)</script>"
+    page = so.write_report([controller], tmp_path / "r.html", title=title, progress=lambda *each: told.append(each))
+    assert told == [("loop", 1, 1)]
     text = page.read_text(encoding="utf-8")
     assert "<script>" not in text
     assert "&lt;script&gt;" in text

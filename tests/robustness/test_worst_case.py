@@ -193,7 +193,7 @@ def test_progress_runs_to_the_end(controller, swing, thor):
     ("ranges", "words"),
     [
         ({"delay_s": (-1e-3, 1e-3)}, "bounds"),
-        ({"screw_mode_hz": (70.0, 80.0)}, "no plant has it"),
+        ({"screw_mode_hz": (70.0, 80.0)}, r'no plant has it; add parts = \["screw_mode"\] to one'),
         ({"phi": (0.0, np.inf)}, "not finite"),
         ({"phi": (0.0, 0.3), "q": (0.0, 1e-3)}, "rests at one"),
     ],

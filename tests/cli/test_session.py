@@ -1,0 +1,167 @@
+"""What stages say, refuse and take from each other, asked in this process: quicker than the command."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.cli.main import run
+from seaopt.cli.provenance import made_from
+from seaopt.cli.session import Session
+
+BENCH = """
+schema = 1
+[parameters]
+J = { value = 3e-6, free = true, min = 1e-8, max = 1e-4 }
+[plant.stand]
+kind = "high_impedance"
+[[experiment]]
+name = "lines"
+plant = "stand"
+[experiment.virtual]
+seed = 1
+duration_s = 2
+rate_hz = 400
+noise_std = { F1 = 2.0 }
+truth = { J = 3.31e-6 }
+excitation = { multisine = { amplitudes = [1.0, 1.0], frequencies_hz = [5.0, 15.0] } }
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def _write(text, name="problem.toml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return _write
+
+
+def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsys):
+    path = write(BENCH + "[robustness]\nparameters = { f_c = [0.0, 0.01] }\n")
+    run(path, tmp_path / "out")
+    told = " ".join(capsys.readouterr().err.split())
+    assert "writing the report: figure 1 of 3, time_lines" in told
+    assert f"left out: tuning and certifying: {path} has [robustness] but no [controller]; add one" in told
+    for stage in ("tune", "certify"):
+        with pytest.raises(so.SeaoptError, match=r"has no \[controller\]; add one to tune or certify"):
+            Session(path, tmp_path / "out").run(stage)
+
+
+def test_simulate_writes_the_model_and_the_virtual_log(write, tmp_path, capsys):
+    """The log has the true inertia and a noise of 2 N, the model the file's values and no noise."""
+    problem = so.read_problem(write(BENCH))
+    session = Session(write(BENCH), tmp_path / "out")
+    session.run("simulate")
+    session.show(False, ["simulate"])
+    told = capsys.readouterr().out
+    assert "simulation_NAME.csv: the plant with the values" in told and "virtual_NAME.csv: the log of" in told
+    channels = {"I": "I [A]", "F1": "F1 [N]"}
+    model, bench = (
+        so.read_log(tmp_path / "out" / f"{kind}_lines.csv", time="time [s]", channels=channels)
+        for kind in ("simulation", "virtual")
+    )
+    truth = so.simulate(problem.plants["stand"], problem.parameters.update(J=3.31e-6), bench)
+    assert np.std(bench["F1"] - truth["F1"]) == pytest.approx(2.0, rel=0.1)
+    first = so.simulate(problem.plants["stand"], problem.parameters, bench)
+    np.testing.assert_allclose(model["F1"], first["F1"], atol=1e-9)
+
+
+DESIGN = """
+schema = 1
+[parameters]
+J = { value = 3.31e-6, prior_std = 1e-8, min = 1e-8, max = 1e-4 }
+eta = { value = 0.95, max = 2.0 }
+[plant.stand]
+kind = "high_impedance"
+[plant.swing]
+kind = "moving_output"
+[[experiment]]
+name = "lines"
+plant = "stand"
+virtual = { seed = 1, duration_s = 2, rate_hz = 400, excitation = { noise = { std = 1.0, band_hz = 50 } } }
+[controller]
+plant = "stand"
+bandwidth_hz = 30
+max_sensitivity = 1.6
+[robustness]
+plants = ["swing"]
+parameters = { I_p = [0.3, 0.5] }
+samples = 60
+"""
+CORNERS = DESIGN.replace("max_sensitivity", 'robust_to = ["swing"]\nmax_sensitivity')
+DRAWS = DESIGN.replace("max_sensitivity", "draws = 4\nmax_sensitivity")
+RETUNE = DESIGN + "retune = 2\n"
+MORE = '\n[plant.heavy]\nkind = "moving_output"\nparts = ["load_cell"]\n[[experiment]]'
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new", "changed"),
+    [
+        (DESIGN, "samples = 60", "samples = 70", "certify"),
+        (DESIGN, "samples = 60", "samples = 60\nseed = 9", "certify"),
+        (DESIGN, "[0.3, 0.5]", "[0.2, 0.5]", "certify"),
+        (DESIGN, "samples = 60", "samples = 60\ncurrent_step_A = 0.01", "certify"),
+        (DESIGN, '["swing"]', "[]", "certify"),
+        (DESIGN, "\n[[experiment]]", MORE, ""),
+        (DESIGN, "schema = 1", 'schema = 1\ntitle = "another"', ""),
+        (DESIGN, "max_sensitivity = 1.6", "max_sensitivity = 1.5", "tune"),
+        (DESIGN, "J = ", "m_l = 0.7\nJ = ", "fit tune certify"),
+        (DESIGN, "J = ", "I_p = 0.4\nJ = ", "certify"),
+        (DESIGN, "duration_s = 2", "duration_s = 3", "fit"),
+        (DESIGN, "samples = 60", "samples = 60\nretune = 2", "tune"),
+        (CORNERS, "samples = 60", "samples = 60\nseed = 9", "certify"),
+        (CORNERS, "[0.3, 0.5]", "[0.2, 0.5]", "tune certify"),
+        (CORNERS, "J = ", "I_p = 0.4\nJ = ", "tune certify"),
+        (DRAWS, "samples = 60", "samples = 70", "certify"),
+        (DRAWS, "samples = 60", "samples = 60\nseed = 9", "tune certify"),
+        (DRAWS, "prior_std = 1e-8", "prior_std = 2e-8", "fit tune certify"),
+        (RETUNE, "samples = 60", "samples = 70", "tune certify"),
+        (RETUNE, "retune = 2", "retune = 3", "tune"),
+        (RETUNE, '["swing"]', "[]", "tune certify"),
+    ],
+)
+def test_a_result_counts_what_it_depends_on(write, tmp_path, text, old, new, changed):
+    assert old in text
+    before, after = so.read_problem(write(text)), so.read_problem(write(text.replace(old, new, 1), "after.toml"))
+    stages = ("fit", "tune", "certify")
+    moved = [stage for stage in stages if made_from(before, stage, tmp_path) != made_from(after, stage, tmp_path)]
+    assert moved == changed.split()
+
+
+def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, capsys):
+    """Without experiments, so that nothing is fitted; a certificate of an old controller is refused too."""
+    text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
+    folder = tmp_path / "out"
+    Session(write(text), folder).run("tune")
+    held = (folder / "controller.json").read_bytes()
+    for old, new in (("samples = 60", "samples = 20"), ("[0.3, 0.5]", "[0.4, 0.5]")):
+        session = Session(write(text.replace(old, new)), folder)
+        session.run("certify")
+    assert session.results["certify"].monte_carlo.samples == 60
+    session.show(False, ["certify"])
+    told = capsys.readouterr()
+    remark = "note: the nominal I_p = 0.36 lies outside its range of 0.4 to 0.5"
+    assert remark in " ".join(told.err.split()) and remark in " ".join(told.out.split())
+    assert (folder / "controller.json").read_bytes() == held
+    with pytest.raises(so.SeaoptError, match=r"robustness.json: was made from another.*run seaopt certify"):
+        Session(write(text), folder).run("report")
+    with pytest.raises(so.SeaoptError, match=r"controller.json: was made from another.*run seaopt tune"):
+        Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.5")), folder).run("certify")
+
+
+def test_a_controller_that_ranges_shaped_is_taken_without_its_memory(write, tmp_path):
+    text = CORNERS[: CORNERS.index("[[experiment]]")] + CORNERS[CORNERS.index("[controller]") :]
+    folder = tmp_path / "out"
+    Session(write(text), folder).run("tune")
+    asked = write(text.replace("[0.3, 0.5]", "[0.1, 0.5]"))
+    with pytest.raises(so.SeaoptError, match="run seaopt tune"):
+        Session(asked, folder).controller()
+    content = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
+    del content["made_from"]
+    (folder / "controller.json").write_text(json.dumps(content), encoding="utf-8")
+    assert Session(asked, folder).controller().gains == content["gains"]

@@ -1,0 +1,28 @@
+"""Remarks on ranges that may stand."""
+
+from __future__ import annotations
+
+import pytest
+
+import seaopt as so
+from seaopt.problem.ranges import range_remarks
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({"I_p": (0.3, 0.4), "delay_s": (0.0, 1e-3), "phi": (-0.5, 0.5)}, []),
+        ({"phi": (-3.0, 3.0)}, ["is in rad: -171.9 to 171.9 degrees, beyond a right angle"]),
+    ],
+)
+def test_an_angle_that_may_be_in_degrees_is_told(swing, thor, ranges, words):
+    found = range_remarks(ranges, {"swing": swing}, thor)
+    assert len(found) == len(words)
+    for sentence, part in zip(found, words, strict=True):
+        assert part in sentence
+
+
+@pytest.mark.parametrize(("low", "high", "outside"), [(78.0, 82.0, False), (60.0, 75.0, True), (85.0, 90.0, True)])
+def test_the_nominal_screw_mode_is_at_80_hz(thor, low, high, outside):
+    plant = so.plants.high_impedance(parts=["screw_mode"])
+    assert bool(range_remarks({"screw_mode_hz": (low, high)}, {"stand": plant}, thor)) == outside
