@@ -2,7 +2,7 @@
 
 What every run is judged by:
 
-- it stays finite, and the current within the limit;
+- it stays finite, and the current within the limit: the last whole step of the amplifier within it;
 - nothing grows: in the last phase, where the reference is constant, the largest energy of the second half (after a
   fifth of settling) is no more than that of the first, with 5 % and a thousandth of the whole run's to spare. With the
   force held, the loop works on the link like a constant force, which is conservative: over a swing the energy of link
@@ -16,6 +16,7 @@ What every run is judged by:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.closed_loop import ENERGY
+from seaopt.control.sampled_loop import largest_current
 from seaopt.parameters import ParameterSet
 from seaopt.robustness.oscillation import oscillation
 from seaopt.robustness.playback import Stage, Trace
@@ -119,19 +121,20 @@ def _extremes(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _
     force = float(trace.peaks[controller.spec.measured][run])
     angles = [float(trace.peaks[name][run]) for name, unit in plant.outputs.items() if unit == "rad"]
     current, limit = np.abs(trace.current[run]), controller.spec.current_limit_A
+    most = largest_current(math.inf if limit is None else limit, stage.current_step_A)
     hits = trace.contacts
     hardest = max(hits, key=lambda item: abs(item.impulse[run]), default=None)
     found.figures.update(
         peak_force_N=force,
         peak_current_A=float(np.max(current)),
         peak_angle_rad=max(angles) if angles else None,
-        saturated=float(np.mean(current >= limit * (1 - 1e-9))) if limit is not None else 0.0,
+        saturated=float(np.mean(current >= most * (1 - 1e-9))),
         peak_energy_J=float(trace.peaks[ENERGY][run]) if ENERGY in trace.peaks else None,
         contact_impulse=None if hardest is None else float(hardest.impulse[run]),
         contact_loss_J=None if hardest is None else float(hardest.loss_J[run]),
     )
-    if limit is not None and np.max(current) > limit * (1 + 1e-9) + 0.5 * stage.current_step_A:
-        found.faults.append(f"the current reaches {np.max(current):.4g} A, above its limit of {limit:g} A")
+    if np.max(current) > most * (1 + 1e-9):
+        found.faults.append(f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
     for what, value, allowed, unit in (
         (controller.spec.measured, force, scenario.max_force_N, "N"),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
