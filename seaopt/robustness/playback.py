@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from seaopt.control.digital import conditions_of
 from seaopt.control.equilibrium import Equilibrium, equilibrium
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.impacts import caught, position, released, struck
 from seaopt.plants.linear import point
@@ -194,7 +194,13 @@ def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], lon
 
 
 def _scaled(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
-    return params.update(**{name: factor * params[name].value for name, factor in scale.items()})
+    """Return the parameters with a load on: their bounds say what is known of them, not what may be carried."""
+    changed: list[Parameter] = []
+    for name, factor in scale.items():
+        value = factor * params[name].value
+        low, high = min(params[name].min, value), max(params[name].max, value)
+        changed.append(replace(params[name], value=value, min=low, max=high))
+    return params.with_parameters(*changed)
 
 
 def _reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:

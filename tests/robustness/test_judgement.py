@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,3 +43,12 @@ def test_an_amplifier_that_rounds_stays_within_the_limit(controller, stand, thor
 def test_a_step_above_the_limit_leaves_no_current(controller, stand, thor):
     with pytest.raises(SimulationError, match="every current but zero"):
         verify(controller, {"stand": stand}, thor, current_step_A=9.5)
+
+
+def test_a_load_is_no_bound_on_what_is_known(controller, stand, swing, thor):
+    """The same run, sample by sample, whether the inertia's bounds hold 1.5 times its value or not."""
+    bounded = thor.with_parameters(replace(thor["I_p"], min=0.3, max=0.5))
+    stage = Stage(controller=controller, plant=swing, partner=stand)
+    loaded = [play(stage, chosen(controller, swing, "payload"), [params]) for params in (thor, bounded)]
+    np.testing.assert_array_equal(loaded[0].outputs["phi"], loaded[1].outputs["phi"])
+    assert verify(controller, {"swing": swing}, bounded, scenarios=[chosen(controller, swing, "payload")]).passed
