@@ -65,6 +65,19 @@ class Stage:
         )
 
 
+    @property
+    def ideal(self) -> Stage:
+        """The stage with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""
+        return replace(self, sensors=Sensors(saturation=self.sensors.saturation), current_step_A=0.0)
+
+    @property
+    def is_ideal(self) -> bool:
+        """Sensor and amplifier do nothing of their own."""
+        sensors, name = self.sensors, self.controller.spec.measured
+        own = (getattr(sensors, what).get(name, 0.0) for what in ("noise_std", "offset", "quantisation"))
+        return not (self.current_step_A or any(own))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contact:
     """A link that is caught: when (s), the impulse that stops it and the energy (J) it loses, one a run."""
@@ -165,7 +178,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     contacts: list[Contact] = []
     begin_s = 0.0
     for number, phase in enumerate(scenario.phases):
-        values = [_scaled(item, phase.scale) for item in values]
+        values = [loaded(item, phase.scale) for item in values]
         if phase.held and grip is None:
             now, grip, contact = _catch(stage, values, now, begin_s)
             contacts.append(contact)
@@ -193,7 +206,7 @@ def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], lon
     return start
 
 
-def _scaled(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
+def loaded(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
     """Return the parameters with a load on: their bounds say what is known of them, not what may be carried."""
     changed: list[Parameter] = []
     for name, factor in scale.items():

@@ -24,6 +24,8 @@ LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # blows that are tried
 NOMINAL_FORCE_N = 100.0
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
+JUDGED_PERIODS = 100.0  # of the bandwidth: after a fifth of settling, eight periods of a tenth of it
+LONGEST_SLOW_S = 200.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,12 +244,13 @@ def _blow(controller: Controller, plant: Plant, force: float) -> float:
 
 
 def _tail(controller: Controller, plant: Plant) -> float:
-    """Return how long a last phase lasts: some periods of the loop's slowest oscillation, a second at least."""
+    """Return how long a last phase lasts: long enough for the loop's slowest swing, and for slow limit cycles."""
     loop = controller.close(plant, _design(controller)[1])
     poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
     swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0
-    return float(np.clip(max(SWINGS * slowest, 30.0 / controller.spec.bandwidth_hz), 1.0, LONGEST_S))
+    judged = max(np.clip(SWINGS * slowest, 1.0, LONGEST_S), JUDGED_PERIODS / controller.spec.bandwidth_hz)
+    return float(min(judged, LONGEST_SLOW_S))
 
 
 def _small_step(force: float, lasting: float, tail: float, plant: Plant) -> Scenario:

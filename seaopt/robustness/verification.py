@@ -187,9 +187,11 @@ def verify(
         simulated = wall = 0.0
         for item in played[name]:
             trace = play(stage, item, sets[name], seed=seed)
-            rows += [judged(stage, name, item, trace, k, sets[name]) for k in range(len(sets[name]))]
-            simulated += len(sets[name]) * trace.time.size * controller.sample_time_s
-            wall, error = wall + trace.wall_s, max(error, trace.error)
+            ideal = trace if stage.is_ideal else play(stage.ideal, item, sets[name], seed=seed)
+            rows += [judged(stage, name, item, trace, k, sets[name], ideal) for k in range(len(sets[name]))]
+            for one in (trace,) if ideal is trace else (trace, ideal):
+                simulated += len(sets[name]) * one.time.size * controller.sample_time_s
+                wall, error = wall + one.wall_s, max(error, one.error)
         speeds[name] = simulated / wall if wall else math.nan
     return Verification(
         passed=bool(rows) and all(row.passed for row in rows), rows=tuple(rows), skipped=tuple(skipped),
