@@ -124,8 +124,8 @@ class Certificate:
     ) -> Certificate:
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
-        Each scenario that fails is a requirement that is not met. Large signals, passivity and coupled stability are
-        found on the design plant, and require nothing.
+        Each scenario that fails is a requirement that is not met. Large signals, on every plant, passivity and coupled
+        stability, on the design plant, require nothing.
 
         Parameters
         ----------
