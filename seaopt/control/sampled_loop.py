@@ -69,8 +69,8 @@ class SampledLoop:
                 raise SimulationError(f"{what} of {self.measured} is negative; give zero or more")
         if self.current_step_A and not self.most_A:
             raise SimulationError(
-                f"current_step_A = {self.current_step_A:g} is above the limit of {self.law.current_limit_A:g} A, so that "
-                "every current but zero is; give the amplifier's step"
+                f"current_step_A = {self.current_step_A:g} is above the limit of {self.law.current_limit_A:g} A, so "
+                "that every current but zero is; give the amplifier's step"
             )
         row = plant.output[list(plant.outputs).index(self.measured)]
         if self.delay_samples == 0 and ca.depends_on(row, plant.u[0]):

@@ -46,6 +46,7 @@ LINE = 4.0  # standard deviations of noise that a line in the spectrum stays bel
 MEAN = 4.0  # standard deviations of a mean
 WINDOW_S = 3.0
 SLOWER, PERIODS = 10.0, 8.0  # how far below the bandwidth oscillations are looked for, and how many periods of them
+SHORTER = 4.0
 STILL_PERIODS = 4.0  # where no link moves: the slowest that a window tells from a drift
 NOMINAL = "nominal"
 
@@ -186,7 +187,9 @@ def _growth(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Fi
         level, what = trace.outputs[ENERGY][run] - base, "the energy"
     else:
         name = stage.controller.spec.measured
-        level, what = _error(scenario, trace, run, trace.outputs[name][run]) ** 2, f"the square of the error of {name}"
+        with np.errstate(over="ignore"):
+            level = _error(scenario, trace, run, trace.outputs[name][run]) ** 2
+        what = f"the square of the error of {name}"
     level = np.abs(level[np.isfinite(level)])
     last = level[-(trace.edges[-1] - trace.edges[-2]) :]
     last = last[int(SETTLE * last.size) :]
@@ -213,30 +216,38 @@ def _outbreak(
 
 def _ringing(
     stage: Stage, scenario: Scenario, trace: Trace, run: int, view: LinearView, found: _Findings
-) -> None:
+) -> None:  # fmt: skip
+    """Find an oscillation that lasts: a slow one in a long window, one whose phase noise moves in a short one."""
     spec, period = stage.controller.spec, stage.controller.sample_time_s
     if not scenario.quiet:
         return
-    window = _window(stage, trace)
-    lasting = period * (window.stop - window.start)
     free = moves(stage.plant) and not scenario.phases[-1].held
-    lowest = max(spec.bandwidth_hz / SLOWER, PERIODS / lasting) if free else STILL_PERIODS / lasting
-    floor = _floor(stage, trace, run)
-    if not view.instability:
-        floor = max(floor, LINE * view.force_std(lowest))
-    seen = oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
-    if seen is None or not (seen.sustained or seen.growing):
-        return
-    found.figures.update(limit_cycle_N=seen.amplitude, limit_cycle_hz=seen.frequency_hz)
-    what = "sustains itself" if seen.sustained else f"grows {seen.growth:.3g} times"
-    found.faults.append(f"an oscillation of {seen.amplitude:.3g} N at {seen.frequency_hz:.4g} Hz {what}")
+    for window in _windows(stage, trace):
+        lasting = period * (window.stop - window.start)
+        lowest = max(spec.bandwidth_hz / SLOWER, PERIODS / lasting) if free else STILL_PERIODS / lasting
+        floor = _floor(stage, trace, run)
+        if not view.instability:
+            floor = max(floor, LINE * view.force_std(lowest))
+        seen = oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
+        if seen is not None and (seen.sustained or seen.growing):
+            found.figures.update(limit_cycle_N=seen.amplitude, limit_cycle_hz=seen.frequency_hz)
+            what = "sustains itself" if seen.sustained else f"grows {seen.growth:.3g} times"
+            found.faults.append(f"an oscillation of {seen.amplitude:.3g} N at {seen.frequency_hz:.4g} Hz {what}")
+            return
 
 
-def _window(stage: Stage, trace: Trace) -> slice:
-    last, controller = trace.last, stage.controller
-    start = last.start + int(SETTLE * (last.stop - last.start))
-    longest = max(WINDOW_S, PERIODS * SLOWER / controller.spec.bandwidth_hz)
-    return slice(max(start, last.stop - math.ceil(longest / controller.sample_time_s)), last.stop)
+def judged_window(trace: Trace) -> slice:
+    """Return the samples of the last phase that growth and oscillations are looked for in."""
+    last = trace.last
+    return slice(last.start + int(SETTLE * (last.stop - last.start)), last.stop)
+
+
+def _windows(stage: Stage, trace: Trace) -> tuple[slice, slice]:
+    last, controller = judged_window(trace), stage.controller
+    slow = max(WINDOW_S, PERIODS * SLOWER / controller.spec.bandwidth_hz)
+    found = (max(last.start, last.stop - math.ceil(item / controller.sample_time_s)) for item in (slow, slow / SHORTER))
+    long, short = (slice(start, last.stop) for start in found)
+    return long, short
 
 
 def _floor(stage: Stage, trace: Trace, run: int) -> float:

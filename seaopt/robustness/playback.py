@@ -64,7 +64,6 @@ class Stage:
             longest_delay_s=longest_delay_s,
         )
 
-
     @property
     def ideal(self) -> Stage:
         """The stage with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""

@@ -110,6 +110,25 @@ class Scenario:
         if self.on not in ("any", "held", "free"):
             raise ControlError(f'scenario "{self.name}": on = "{self.on}" is not known; use "any", "held" or "free"')
 
+    @property
+    def size(self) -> str:
+        """How large it is, in short: forces, blows, loads, and where it starts.
+
+        Examples
+        --------
+        >>> Scenario(name="knock", phases=(Phase(duration_s=1.0, force_N=50.0), Phase(duration_s=1.0))).size
+        '50 N'
+
+        """
+        forces = [abs(phase.force_N) for phase in self.phases if phase.force_N]
+        waves = [item.amplitude for phase in self.phases for item in phase.excitation if isinstance(item, Chirp)]
+        blows = [abs(phase.impulse_Ns) for phase in self.phases if phase.impulse_Ns]
+        loads = {n: f for phase in reversed(self.phases) for n, f in phase.scale.items()}
+        parts = [f"{max(found):.4g} {unit}" for found, unit in ((forces + waves, "N"), (blows, "N s")) if found]
+        parts += [f"{factor:.3g} {name}" for name, factor in loads.items()]
+        parts += [f"{name} = {value:.4g}" for name, value in self.initial_state.items()]
+        return ", ".join(parts)
+
     def obstacle(self, plant: Plant, partner: Plant | None) -> str | None:
         """Return why the scenario cannot be played on a plant, or None."""
         free = moves(plant)
