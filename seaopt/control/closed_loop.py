@@ -2,8 +2,8 @@ r"""The loop as it will run: a continuous nonlinear plant and a law that acts on
 
 At sample k the load cell reads :math:`m_k = Q(y_k + n_k)`, noise :math:`n_k` and quantisation Q as `Sensors` says; the
 law `RunnableLaw` makes of it and of the reference a motor force, limited, with its anti-windup; the current
-:math:`I = g\,\mathrm{sat}(F)` may be rounded to the amplifier's step, waits `delay_samples` samples (and
-`delay_s` more, where a run's parameters hold that) and is then held for one. In between
+:math:`I = g\,\mathrm{sat}(F)` may be rounded to the amplifier's step, but never to one above the limit, waits
+`delay_samples` samples (and `delay_s` more, where a run's parameters hold that) and is then held for one. In between
 
 .. math:: \dot x = f(t, x, u, p), \qquad u \text{ constant},
 

@@ -79,7 +79,7 @@ def _sample_function(loop: SampledLoop) -> Any:
     size = n * n
     a = ca.reshape(c[:size], n, n)
     b_r, b_y, out, windup = (ca.reshape(c[size + i * n : size + (i + 1) * n], n, 1) for i in range(4))
-    d_r, d_y, limit, gain, offset, highest, quantum, step = ca.vertsplit(c[size + 4 * n :])
+    d_r, d_y, limit, gain, offset, highest, quantum, step, most = ca.vertsplit(c[size + 4 * n :])
     reading = reading + offset
     if loop.sensors.saturation.get(loop.measured) is not None:
         reading = ca.fmin(ca.fmax(reading, -highest), highest)
@@ -92,6 +92,8 @@ def _sample_function(loop: SampledLoop) -> Any:
     current = gain * limited
     if loop.current_step_A:
         current = step * ca.floor(current / step + 0.5)
+        if math.isfinite(loop.law.current_limit_A):
+            current = ca.fmin(ca.fmax(current, -most), most)
     moved = ca.vertcat(after, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
     known = ca.vertcat(current, behind)
     u, late = ca.vertcat(ca.dot(first, known), e), ca.dot(second, known)
@@ -101,10 +103,11 @@ def _sample_function(loop: SampledLoop) -> Any:
 
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     law, sensors, name = loop.law, loop.sensors, loop.measured
-    limit = law.force_limit_N if math.isfinite(law.current_limit_A) else 0.0
+    limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.current_limit_A) else (0.0, 0.0)
     numbers = [
         law.d_reference, law.d_measurement, limit, law.current_per_force_A_per_N, sensors.offset.get(name, 0.0),
         sensors.saturation.get(name, 0.0), sensors.quantisation.get(name, 0.0), loop.current_step_A,
+        most,
     ]  # fmt: skip
     return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
 

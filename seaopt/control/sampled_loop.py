@@ -35,7 +35,7 @@ class SampledLoop:
     sensors : Sensors
         Noise, offset, range and quantisation of the measured output.
     current_step_A : float
-        What the current is rounded to; 0 for not at all.
+        What the current is rounded to; 0 for not at all. The largest is the last whole step within the law's limit.
     longest_delay_s : float
         The longest `delay_s` that a run's parameters hold: delay besides `delay_samples`, of any length.
 
@@ -67,6 +67,11 @@ class SampledLoop:
         for what in ("noise_std", "quantisation", "saturation"):
             if not getattr(self.sensors, what).get(self.measured, 0.0) >= 0.0:
                 raise SimulationError(f"{what} of {self.measured} is negative; give zero or more")
+        if self.current_step_A and not self.most_A:
+            raise SimulationError(
+                f"current_step_A = {self.current_step_A:g} is above the limit of {self.law.current_limit_A:g} A, so "
+                "that every current but zero is; give the amplifier's step"
+            )
         row = plant.output[list(plant.outputs).index(self.measured)]
         if self.delay_samples == 0 and ca.depends_on(row, plant.u[0]):
             raise SimulationError(
@@ -80,6 +85,11 @@ class SampledLoop:
         if not self.longest_delay_s:
             return self.delay_samples
         return self.delay_samples + whole_samples(self.longest_delay_s, self.law.sample_time_s)[0] + 1
+
+    @property
+    def most_A(self) -> float:
+        """The largest current: the law's limit, or the last whole step of the amplifier within it."""
+        return largest_current(self.law.current_limit_A, self.current_step_A)
 
     @property
     def watched(self) -> tuple[str, ...]:
@@ -113,3 +123,17 @@ def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
     whole = math.floor(delay_s / sample_time_s + 1e-9)
     rest = delay_s - whole * sample_time_s
     return whole, rest if rest > 1e-9 * sample_time_s else 0.0
+
+
+def largest_current(limit_A: float, step_A: float) -> float:
+    """Return the last whole step within a current limit; the limit itself without a step.
+
+    Examples
+    --------
+    >>> round(largest_current(9.0, 0.07), 9), largest_current(9.0, 0.0)
+    (8.96, 9.0)
+
+    """
+    if not step_A or math.isinf(limit_A):
+        return limit_A
+    return step_A * math.floor(limit_A / step_A * (1.0 + 1e-12))

@@ -35,7 +35,7 @@ _CAPTIONS = {
     "residual": "Residuals and their correlations; shaded: what one lag of a hundred exceeds by chance",
     "ranking": "Residuals of the fits that are compared, octave by octave",
     "loop": "The closed loop on every plant",
-    "simulation": "Force and current of each scenario; shaded: link 2 is held",
+    "simulation": "Force and current of each scenario; grey: link 2 is held; yellow: the judged window of a failed run",
     "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
     "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
 }
@@ -96,7 +96,7 @@ def write_report(
         found = certificate.simulated
         if found is not None:
             verification, coupled = verification or found.verification, coupled or found.environments
-            large = large or ([found.large_signal] if found.large_signal is not None else [])
+            large = large or list(found.large_signal)
     surveys = fit_surveys(fit) if fit is not None else {}
     diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None else None
     figures = all_figures(fit, surveys, controller, _plants(controller, certificate))

@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.reporting.figures import MEASURED, MODEL, PLANT_COLOURS, panels
 from seaopt.robustness.environments import StabilityMap
-from seaopt.robustness.judgement import NOMINAL, Outcome
+from seaopt.robustness.judgement import NOMINAL, Outcome, judged_window
 from seaopt.robustness.large_signal import LargeSignal
 from seaopt.robustness.playback import Trace
 from seaopt.robustness.simulated import Simulated
@@ -20,19 +20,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHOWN_S = 0.6  # of the last phase, where the others are shorter: what happens there is over soon
-HELD = "#f1f1f1"
+SHOWN_S = 0.6  # of the last phase of a run that passed, where the others are shorter: what happens is over soon
+HELD, JUDGED = "#f1f1f1", "#fdf3d8"
 
 
 def verification_figure(verification: Verification, plant: str) -> Figure:
-    """Draw force and current of each scenario on one plant: the run that failed, or has the largest force."""
+    """Draw force and current of each scenario on one plant: the run that failed, or has the largest force.
+
+    Of a run that passed the end of the last phase is left out; a run that failed is drawn whole, with the window that
+    it is judged in.
+    """
     rows = [row for row in verification.worst() if row.plant == plant]
     controller = verification.stages[plant].controller
     name, limit = controller.spec.measured, controller.spec.current_limit_A
     figure, axes = panels(len(rows), 2, 0.5 + 1.5 * len(rows))
     for (left, right), row in zip(axes, rows, strict=True):
         trace = verification.replay(row)
-        shown = trace.time <= _until(trace)
+        shown = trace.time <= (_until(trace) if row.passed else trace.time[-1])
         time = trace.time[shown]
         left.plot(time, trace.reference[0][shown], color=MEASURED, linewidth=1.6, label="reference")
         left.plot(time, trace.outputs[name][0][shown], color=MODEL, linewidth=0.9, label=name)
@@ -42,7 +46,8 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
                 right.axhline(side, color="#444444", linestyle=":", linewidth=0.9)
         _phases((left, right), trace, float(time[-1]), verification, row)
         drawn = "" if row.draw == NOMINAL else f", draw {row.draw}"
-        verdict = "" if row.passed else ": FAILED"
+        cut = "" if shown.all() else f", {time[-1]:.2g} of {trace.time[-1]:.3g} s"
+        verdict = cut if row.passed else ": FAILED"
         left.set_title(f"{row.scenario}{drawn}{verdict}", fontsize="medium", loc="left")
         left.set_ylabel(f"{name} [N]")
         right.set_ylabel("current [A]")
@@ -61,8 +66,11 @@ def _until(trace: Trace) -> float:
 
 
 def _phases(axes: tuple[Axes, Axes], trace: Trace, until: float, verification: Verification, row: Outcome) -> None:
-    (scenario,) = (item for item in verification.scenarios[row.plant] if item.name == row.scenario)
-    for phase, start, stop in zip(scenario.phases, trace.edges[:-1], trace.edges[1:], strict=True):
+    if not row.passed:
+        window = judged_window(trace)
+        for axis in axes:
+            axis.axvspan(float(trace.time[window.start]), float(trace.time[window.stop - 1]), color=JUDGED, zorder=0)
+    for phase, start, stop in zip(verification.scenario(row).phases, trace.edges[:-1], trace.edges[1:], strict=True):
         if phase.held:
             for axis in axes:
                 axis.axvspan(trace.time[start], min(trace.time[stop - 1], until), color=HELD, zorder=0)
@@ -160,4 +168,5 @@ def verification_section(
         verification=verification, large=large, coupled=coupled, svgs=svgs,
         passivity=None if simulated is None else simulated.passivity,
         left_out={} if simulated is None else simulated.left_out,
+        certified=simulated is not None and simulated.verification is verification,
     )  # fmt: skip

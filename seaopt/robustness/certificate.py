@@ -131,8 +131,8 @@ class Certificate:
     ) -> Certificate:
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
-        Each scenario that fails is a requirement that is not met. Large signals, passivity and coupled stability are
-        found on the design plant, and require nothing.
+        Each scenario that fails is a requirement that is not met. Large signals, on every plant, passivity and coupled
+        stability, on the design plant, require nothing.
 
         Parameters
         ----------
@@ -327,8 +327,12 @@ def _confidence(value: float) -> str:
 
 def _varied(item: Mapping[str, Any]) -> Varied:
     """Return what is varied; JSON has no infinity, so that a missing bound is one."""
-    low, high = (-np.inf if item["low"] is None else item["low"]), (np.inf if item["high"] is None else item["high"])
-    return Varied(**{**item, "low": low, "high": high})
+    ends = {
+        "low": -np.inf if item["low"] is None else item["low"],
+        "high": np.inf if item["high"] is None else item["high"],
+    }
+    given: dict[str, Any] = {**item, **ends}
+    return Varied(**given)
 
 
 def _infinite(item: Mapping[str, Any]) -> dict[str, Any]:

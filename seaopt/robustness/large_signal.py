@@ -68,6 +68,7 @@ class LargeSignal:
     def to_dict(self) -> dict[str, Any]:
         """Return amplitudes, bandwidths and the saturation map, for robustness.json."""
         return {
+            "plant": self.plant,
             "amplitude_N": self.amplitude_N.tolist(),
             "bandwidth_hz": list(self.bandwidth_hz),
             "saturation_map": {"frequency_hz": self.frequency_hz.tolist(), "amplitude_N": self.onset_N.tolist()},
@@ -114,7 +115,8 @@ def large_signal(
     Raises
     ------
     ControlError
-        The controller has no current limit, or an amplitude or frequency is out of range.
+        The controller has no current limit, its linear loop on the plant is unstable, or an amplitude or frequency is
+        out of range.
 
     Examples
     --------
@@ -129,6 +131,8 @@ def large_signal(
     limit, period, band = controller.spec.current_limit_A, controller.sample_time_s, controller.spec.bandwidth_hz
     if limit is None:
         raise ControlError("the controller has no current_limit_A, so that nothing saturates; give one in its spec")
+    if not controller.close(plant, parameters).figures().stable:
+        raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )

@@ -70,16 +70,19 @@ def oscillation(
     False
 
     """
-    fast = _above(signal, sample_time_s, lowest_hz)
+    size = float(np.max(np.abs(signal)))
+    if not size:
+        return None
+    fast = _above(signal / size, sample_time_s, lowest_hz)  # of an unstable loop the squares would overflow
     n = fast.size
     f = _frequency(fast, sample_time_s)
     time = sample_time_s * np.arange(n)
     halves = (slice(0, n // 2), slice(n // 2, n))
     first, last = (_amplitude(fast[part], time[part], f) for part in halves)
     power = 2.0 * float(np.mean(fast[halves[1]] ** 2))
-    if last <= floor or last**2 < COHERENT * power:
+    if last <= floor / size or last**2 < COHERENT * power:
         return None
-    return Oscillation(frequency_hz=f, amplitude=last, growth=last / max(first, 1e-300))
+    return Oscillation(frequency_hz=f, amplitude=size * last, growth=last / max(first, 1e-300))
 
 
 def _above(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:

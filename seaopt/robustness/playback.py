@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from seaopt.control.digital import conditions_of
 from seaopt.control.equilibrium import Equilibrium, equilibrium
 from seaopt.control.realisation import runnable
 from seaopt.errors import ControlError
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.impacts import caught, position, released, struck
 from seaopt.plants.linear import point
@@ -63,6 +63,18 @@ class Stage:
             current_step_A=self.current_step_A,
             longest_delay_s=longest_delay_s,
         )
+
+    @property
+    def ideal(self) -> Stage:
+        """The stage with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""
+        return replace(self, sensors=Sensors(saturation=self.sensors.saturation), current_step_A=0.0)
+
+    @property
+    def is_ideal(self) -> bool:
+        """Sensor and amplifier do nothing of their own."""
+        sensors, name = self.sensors, self.controller.spec.measured
+        own = (getattr(sensors, what).get(name, 0.0) for what in ("noise_std", "offset", "quantisation"))
+        return not (self.current_step_A or any(own))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -165,7 +177,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     contacts: list[Contact] = []
     begin_s = 0.0
     for number, phase in enumerate(scenario.phases):
-        values = [_scaled(item, phase.scale) for item in values]
+        values = [loaded(item, phase.scale) for item in values]
         if phase.held and grip is None:
             now, grip, contact = _catch(stage, values, now, begin_s)
             contacts.append(contact)
@@ -193,8 +205,14 @@ def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], lon
     return start
 
 
-def _scaled(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
-    return params.update(**{name: factor * params[name].value for name, factor in scale.items()})
+def loaded(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
+    """Return the parameters with a load on: their bounds say what is known of them, not what may be carried."""
+    changed: list[Parameter] = []
+    for name, factor in scale.items():
+        value = factor * params[name].value
+        low, high = min(params[name].min, value), max(params[name].max, value)
+        changed.append(replace(params[name], value=value, min=low, max=high))
+    return params.with_parameters(*changed)
 
 
 def _reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:

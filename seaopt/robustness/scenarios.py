@@ -24,6 +24,8 @@ LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # blows that are tried
 NOMINAL_FORCE_N = 100.0
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
+JUDGED_PERIODS = 100.0  # of the bandwidth: after a fifth of settling, eight periods of a tenth of it
+LONGEST_SLOW_S = 200.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,6 +109,25 @@ class Scenario:
             raise ControlError(f'scenario "{self.name}" has no phases; give at least one')
         if self.on not in ("any", "held", "free"):
             raise ControlError(f'scenario "{self.name}": on = "{self.on}" is not known; use "any", "held" or "free"')
+
+    @property
+    def size(self) -> str:
+        """How large it is, in short: forces, blows, loads, and where it starts.
+
+        Examples
+        --------
+        >>> Scenario(name="knock", phases=(Phase(duration_s=1.0, force_N=50.0), Phase(duration_s=1.0))).size
+        '50 N'
+
+        """
+        forces = [abs(phase.force_N) for phase in self.phases if phase.force_N]
+        waves = [item.amplitude for phase in self.phases for item in phase.excitation if isinstance(item, Chirp)]
+        blows = [abs(phase.impulse_Ns) for phase in self.phases if phase.impulse_Ns]
+        loads = {n: f for phase in reversed(self.phases) for n, f in phase.scale.items()}
+        parts = [f"{max(found):.4g} {unit}" for found, unit in ((forces + waves, "N"), (blows, "N s")) if found]
+        parts += [f"{factor:.3g} {name}" for name, factor in loads.items()]
+        parts += [f"{name} = {value:.4g}" for name, value in self.initial_state.items()]
+        return ", ".join(parts)
 
     def obstacle(self, plant: Plant, partner: Plant | None) -> str | None:
         """Return why the scenario cannot be played on a plant, or None."""
@@ -242,12 +263,13 @@ def _blow(controller: Controller, plant: Plant, force: float) -> float:
 
 
 def _tail(controller: Controller, plant: Plant) -> float:
-    """Return how long a last phase lasts: some periods of the loop's slowest oscillation, a second at least."""
+    """Return how long a last phase lasts: long enough for the loop's slowest swing, and for slow limit cycles."""
     loop = controller.close(plant, _design(controller)[1])
     poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
     swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0
-    return float(np.clip(max(SWINGS * slowest, 30.0 / controller.spec.bandwidth_hz), 1.0, LONGEST_S))
+    judged = max(np.clip(SWINGS * slowest, 1.0, LONGEST_S), JUDGED_PERIODS / controller.spec.bandwidth_hz)
+    return float(min(judged, LONGEST_SLOW_S))
 
 
 def _small_step(force: float, lasting: float, tail: float, plant: Plant) -> Scenario:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,14 +25,14 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Simulated:
-    """Scenarios on every plant; large signals, passivity and coupled stability on the design plant.
+    """Scenarios and large signals on every plant; passivity and coupled stability on the design plant.
 
     Parameters
     ----------
     verification : Verification or None
         None if a plant cannot be simulated.
-    large_signal : LargeSignal or None
-        None without a current limit.
+    large_signal : tuple of LargeSignal
+        One a plant, the design plant first; empty without a current limit.
     passivity, environments : Passivity and StabilityMap, or None
         None for a plant without a port at link 2.
     left_out : mapping of what to reason
@@ -41,7 +42,7 @@ class Simulated:
     """
 
     verification: Verification | None
-    large_signal: LargeSignal | None
+    large_signal: tuple[LargeSignal, ...]
     passivity: Passivity | None
     environments: StabilityMap | None
     left_out: Mapping[str, str]
@@ -58,7 +59,7 @@ class Simulated:
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
         return {"passed": self.passed} | played | {
-            "large_signal": None if self.large_signal is None else self.large_signal.to_dict(),
+            "large_signal": [item.to_dict() for item in self.large_signal],
             "sensors": asdict(self.sensors),
             "current_step_A": self.current_step_A,
             "seed": self.seed,
@@ -77,8 +78,8 @@ class Simulated:
         if self.verification is not None:
             failed, count = len(self.verification.failures), len(self.verification.rows)
             out.append(f"simulation: {f'{failed} of {count} runs FAILED' if failed else f'{count} runs passed'}")
-        if self.large_signal is not None:
-            out.append(f"large signals: {_large(self.large_signal)}")
+            out += self.verification.following()
+        out += [f"large signals on {item.plant}: {_large(item)}" for item in self.large_signal]
         if self.passivity is not None:
             out.append(f"port at link 2: passive {_bands(self.passivity)}")
         if self.environments is not None:
@@ -86,7 +87,7 @@ class Simulated:
         return [*out, *(f"no {what}: {reason}" for what, reason in self.left_out.items())]
 
     def __repr__(self) -> str:
-        found = (self.verification, self.large_signal, self.passivity, self.environments)
+        found = (self.verification, *self.large_signal, self.passivity, self.environments)
         left_out = [f"No {what}: {reason}" for what, reason in self.left_out.items()]
         return "\n".join([*(repr(item) for item in found if item is not None), *left_out])
 
@@ -140,15 +141,35 @@ def simulated(
             left_out[what] = f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
         return None
 
+    swept = [
+        had(what, partial(_swept, controller, name, *on)) for name, on, what in _sweeps(controller, plants, parameters)
+    ]
     return Simulated(
         verification=had("simulation", lambda: verify(
             controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed
         )),
-        large_signal=had("large signals", lambda: large_signal(controller, plant, values)),
+        large_signal=tuple(item for item in swept if item is not None),
         passivity=had("passivity", lambda: passivity(controller, plant, values)),
         environments=had("environments", lambda: coupled_stability(controller, plant, values)),
         left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
     )  # fmt: skip
+
+
+def _sweeps(
+    controller: Controller, plants: Mapping[str, Plant], parameters: ParameterSet
+) -> list[tuple[str, tuple[Plant, ParameterSet], str]]:
+    """Return what is swept: a name, plant and parameters, and what to call it where it cannot be had."""
+    assert controller.design is not None
+    design, values = controller.design
+    if controller.spec.current_limit_A is None:  # one reason for all of them
+        return [(design.name, (design, values), "large signals")]
+    known = next((name for name, plant in plants.items() if plant is design), design.name)
+    on = {known: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != known}
+    return [(name, item, f"large signals on {name}") for name, item in on.items()]
+
+
+def _swept(controller: Controller, name: str, plant: Plant, parameters: ParameterSet) -> LargeSignal:
+    return replace(large_signal(controller, plant, parameters), plant=name)
 
 
 def _large(found: LargeSignal) -> str:

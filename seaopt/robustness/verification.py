@@ -40,6 +40,9 @@ class Verification:
     scenarios : mapping of plant name to tuple of Scenario
     draws : mapping of plant name to tuple of ParameterSet
         Nominal first: what `replay` plays again.
+    follows_hz : mapping of plant name to (lo, hi) or None
+        Where the linear loop's force is within 3 dB of its reference, at nominal parameters. On a link that swings that
+        does not begin at 0 Hz, and a step does not come to its reference.
 
     """
 
@@ -52,10 +55,15 @@ class Verification:
     stages: Mapping[str, Stage]
     scenarios: Mapping[str, tuple[Scenario, ...]]
     draws: Mapping[str, tuple[ParameterSet, ...]]
+    follows_hz: Mapping[str, tuple[float, float] | None]
+
+    def scenario(self, row: Outcome) -> Scenario:
+        """Return the scenario of a row."""
+        return next(item for item in self.scenarios[row.plant] if item.name == row.scenario)
 
     def replay(self, row: Outcome) -> Trace:
         """Return the trace of a row, played again."""
-        (scenario,) = (item for item in self.scenarios[row.plant] if item.name == row.scenario)
+        scenario = self.scenario(row)
         drawn = self.draws[row.plant][0 if row.draw == NOMINAL else int(row.draw)]
         return play(self.stages[row.plant], scenario, [drawn], seed=self.seed)
 
@@ -73,6 +81,28 @@ class Verification:
                 best[key] = row
         return tuple(best.values())
 
+    def drawn(self) -> list[str]:
+        """Return what each draw is: where it differs from nominal, a line each."""
+        rows = {(row.plant, row.draw): row for row in self.rows if row.draw != NOMINAL}
+        return [
+            f"draw {row.draw} on {row.plant}: "
+            + (", ".join(f"{name} = {value:.6g}" for name, value in row.parameters.items()) or "nominal")
+            for row in rows.values()
+        ]
+
+    def following(self) -> list[str]:
+        """Return, a line each, on which plants slow references are not followed."""
+        lines: list[str] = []
+        for name, band in self.follows_hz.items():
+            if band is None:
+                lines.append(f"{name} follows no reference within 3 dB: steps do not come to theirs")
+            elif band[0] > 0.0:
+                lines.append(
+                    f"{name} follows from {band[0]:.3g} to {band[1]:.3g} Hz only (within 3 dB): steps do not come to "
+                    "their reference, and need not"
+                )
+        return lines
+
     def to_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
         return {
@@ -80,6 +110,7 @@ class Verification:
             "seed": self.seed,
             "real_time_factor": dict(self.real_time_factor),
             "integration_error": self.error,
+            "follows_hz": {name: None if band is None else list(band) for name, band in self.follows_hz.items()},
             "rows": [{f.name: _plain(getattr(row, f.name)) for f in fields(Outcome)} for row in self.rows],
             "skipped": [dict(zip(("scenario", "plant", "reason"), item, strict=True)) for item in self.skipped],
         }
@@ -88,7 +119,7 @@ class Verification:
         failed = len(self.failures)
         verdict = "passed" if self.passed else (f"FAILED in {failed} of {len(self.rows)} runs" if failed else "EMPTY")
         lines = [f"Verification by simulation: {verdict}"]
-        lines += [f"  {line}" for line in _table(self.worst())]
+        lines += [f"  {line}" for line in (*_table(self), *self.drawn(), *self.following())]
         lines += [
             f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{witness(row)}"
             for row in self.failures
@@ -187,13 +218,18 @@ def verify(
         simulated = wall = 0.0
         for item in played[name]:
             trace = play(stage, item, sets[name], seed=seed)
-            rows += [judged(stage, name, item, trace, k, sets[name]) for k in range(len(sets[name]))]
-            simulated += len(sets[name]) * trace.time.size * controller.sample_time_s
-            wall, error = wall + trace.wall_s, max(error, trace.error)
+            ideal = trace if stage.is_ideal else play(stage.ideal, item, sets[name], seed=seed)
+            rows += [judged(stage, name, item, trace, k, sets[name], ideal) for k in range(len(sets[name]))]
+            for one in (trace,) if ideal is trace else (trace, ideal):
+                simulated += len(sets[name]) * one.time.size * controller.sample_time_s
+                wall, error = wall + one.wall_s, max(error, one.error)
         speeds[name] = simulated / wall if wall else math.nan
     return Verification(
         passed=bool(rows) and all(row.passed for row in rows), rows=tuple(rows), skipped=tuple(skipped),
         real_time_factor=speeds, error=error, seed=seed, stages=stages, scenarios=played, draws=sets,
+        follows_hz={
+            name: controller.close(plant, parameters).figures().tracking_band_hz for name, plant in plants.items()
+        },
     )  # fmt: skip
 
 
@@ -227,15 +263,23 @@ def witness(row: Outcome) -> str:
     return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
 
 
-def _table(rows: Sequence[Outcome]) -> list[str]:
-    head = ("plant", "scenario", "", "force N", "current A", "angle deg", "energy J", "at limit", "draw")
+def _table(found: Verification) -> list[str]:
+    head = (
+        "plant", "scenario", "size", "", "force N", "current A", "angle deg", "energy J", "at limit", "ends off N",
+        "allowed N", "draw",
+    )  # fmt: skip
     cells: list[tuple[str, ...]] = [head]
-    for row in rows:
-        angle = "" if row.peak_angle_rad is None else f"{math.degrees(row.peak_angle_rad):.3g}"
-        energy = "" if row.peak_energy_J is None else f"{row.peak_energy_J:.3g}"
+    for row in found.worst():
+        angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)
+        scenario = found.scenario(row)
         cells.append((
-            row.plant, row.scenario, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
-            f"{row.peak_current_A:.3g}", angle, energy, f"{100 * row.saturated:.3g} %", row.draw,
+            row.plant, row.scenario, scenario.size, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
+            f"{row.peak_current_A:.3g}", _shown(angle), _shown(row.peak_energy_J), f"{100 * row.saturated:.3g} %",
+            _shown(row.final_error_N), _shown(scenario.final_error), row.draw,
         ))  # fmt: skip
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
     return ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+
+
+def _shown(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.errors import SeaoptError
+from seaopt.reporting.verification import verification_figure
 from seaopt.robustness.environments import coupled_stability
 from seaopt.robustness.large_signal import large_signal
 from seaopt.robustness.scenarios import Phase, Scenario
@@ -31,5 +33,39 @@ def test_the_page_names_what_failed_and_shows_every_figure(stand, swing, thor, t
     assert "&lt;knock&gt;" in page and "<knock>" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
     assert "Simulation: failed" in page and "are allowed" in page
     assert "Not played: &lt;knock&gt; on stand" in page
+    assert '<td class="s">1 N s</td>' in page
+    assert "Hz only (within 3 dB): steps do not come to their reference" in page
     with pytest.raises(SeaoptError, match="2 results of kind Verification"):
         so.write_report([found, found], tmp_path / "s.html")
+
+
+def test_a_run_that_failed_is_drawn_whole_and_what_is_cut_is_said(stand, thor):
+    """A scenario of 0.1 and 2 s, twice: the title says how much is shown, or the figure goes to 2.1 s."""
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6))
+    for allowed, end, title in ((1e6, 0.7, "step, 0.7 of 2.1 s"), (1.0, 2.1, "step: FAILED")):
+        step = Scenario(
+            name="step", phases=(Phase(duration_s=0.1), Phase(duration_s=2.0, force_N=50.0)), max_force_N=allowed
+        )
+        found = verify(controller, {"stand": stand}, thor, scenarios=[step])
+        left = verification_figure(found, "stand").axes[0]
+        assert left.get_title(loc="left") == title
+        assert left.lines[0].get_xdata()[-1] == pytest.approx(end, abs=2e-3)
+        judged = [patch.get_x() for patch in left.patches]
+        assert judged == ([] if found.passed else pytest.approx([0.5]))  # a fifth of 2 s after 0.1 s
+
+
+def test_the_table_says_how_large_and_how_far_off(stand, swing, thor):
+    """A constant 50 N on the pendulum; the linear loop's own response at the edge of its tracking band."""
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6), robust_to={"s": swing})
+    step = Scenario(name="step", phases=(Phase(duration_s=4.0, force_N=50.0),))
+    found = verify(controller, {"swing": swing}, thor, scenarios=[step], draws={"swing": [thor.update(I_p=0.3)]})
+    low = found.follows_hz["swing"][0]
+    f = np.array([0.99 * low, 1.01 * low])
+    below, above = np.abs(controller.close(swing, thor).tracking(f))
+    assert below < 10 ** (-0.15) < above
+    (row,) = found.worst()
+    error = 50.0 - found.replay(row).outputs["F1"][0, -800:].mean()
+    line = next(line for line in repr(found).splitlines() if "step" in line and "passed" in line)
+    assert "50 N" in line and f"{error:.3g}" in line.split()
+    assert f"swing follows from {low:.3g} to " in repr(found)
+    assert "draw 1 on swing: I_p = 0.3" in repr(found)

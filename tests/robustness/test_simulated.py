@@ -46,6 +46,20 @@ def test_every_plant_and_the_worst_draw_are_played(certificate, linear):
     assert named == {"stand: 8 runs", "swing: 14 runs"}
 
 
+def test_large_signals_are_swept_on_every_plant(certificate, controller, swing, thor):
+    """On the swing too: small ones reach as far as the linear loop follows, large ones less far."""
+    stand, found = certificate.simulated.large_signal
+    assert (stand.plant, found.plant) == ("stand", "swing")
+    f = np.linspace(20.0, 60.0, 4001)
+    follows = f[np.abs(controller.close(swing, thor).tracking(f)) >= np.sqrt(0.5)]
+    assert found.bandwidth_hz[0] == pytest.approx(follows[-1], rel=0.02)
+    assert found.bandwidth_hz[0] > found.bandwidth_hz[3] > found.bandwidth_hz[4]
+    assert not found.saturated[0].any() and found.saturated[4].any()
+    written = certificate.to_dict()["simulation"]["large_signal"]
+    assert [item["plant"] for item in written] == ["stand", "swing"]
+    assert "large signals on swing: " in repr(certificate)
+
+
 def test_the_certificate_without_is_as_it_was(linear):
     assert linear.simulated is None
     assert (linear.to_dict()["simulation"], linear.to_dict()["passivity"]) == (None, None)
@@ -89,7 +103,7 @@ def test_a_run_that_fails_is_a_requirement_with_its_witness(controller, stand, t
 def test_what_cannot_be_had_is_said(stand, thor):
     unlimited = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     found = simulated(unlimited, {"stand": stand}, thor)
-    assert found.large_signal is None
+    assert found.large_signal == ()
     assert "current_limit_A" in found.left_out["large signals"]
     closed = replace(unlimited, design=(replace(stand, port=None), thor))
     found = simulated(closed, {"stand": stand}, thor)

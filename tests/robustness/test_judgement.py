@@ -1,0 +1,148 @@
+"""What is allowed: no false alarm from noise, no cycle that is missed, no current above the limit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import Gains, TransferFunction
+from seaopt.control.realisation import runnable
+from seaopt.errors import SimulationError
+from seaopt.robustness.linear import linear_view
+from seaopt.robustness.playback import Stage, play
+from seaopt.robustness.scenarios import Phase, Scenario, default_scenarios
+from seaopt.robustness.verification import verify
+
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+
+
+@pytest.fixture(scope="module")
+def controller(stand, swing, thor):
+    return so.tune(stand, thor, SPEC, robust_to={"swing": swing})
+
+
+def chosen(controller, plant, name):
+    (found,) = [item for item in default_scenarios(controller, plant) if item.name == name]
+    return found
+
+
+def test_an_amplifier_that_rounds_stays_within_the_limit(controller, stand, thor):
+    """The law's own commands, rounded by NumPy to whole steps and cut at 8.96 A = 128 steps of 0.07 A."""
+    stage = Stage(controller=controller, plant=stand, current_step_A=0.07)
+    trace = play(stage, chosen(controller, stand, "saturating doublet"), [thor])
+    commands, _ = runnable(controller).run(trace.reference[0], trace.outputs["F1"][0])
+    rounded = np.clip(0.07 * np.round(commands / 0.07), -8.96, 8.96)
+    np.testing.assert_allclose(trace.current[0, 1:], rounded[:-1], atol=1e-9)
+    assert np.max(np.abs(commands)) == 9.0 and np.max(np.abs(trace.current)) == pytest.approx(8.96)
+    found = verify(controller, {"stand": stand}, thor, current_step_A=0.07)
+    assert max(row.peak_current_A for row in found.rows) <= 9.0
+    assert next(row for row in found.rows if row.scenario == "saturating hold").saturated > 0.1
+
+
+def test_a_step_above_the_limit_leaves_no_current(controller, stand, thor):
+    with pytest.raises(SimulationError, match="every current but zero"):
+        verify(controller, {"stand": stand}, thor, current_step_A=9.5)
+
+
+def test_a_load_is_no_bound_on_what_is_known(controller, stand, swing, thor):
+    """The same run, sample by sample, whether the inertia's bounds hold 1.5 times its value or not."""
+    bounded = thor.with_parameters(replace(thor["I_p"], min=0.3, max=0.5))
+    stage = Stage(controller=controller, plant=swing, partner=stand)
+    loaded = [play(stage, chosen(controller, swing, "payload"), [params]) for params in (thor, bounded)]
+    np.testing.assert_array_equal(loaded[0].outputs["phi"], loaded[1].outputs["phi"])
+    assert verify(controller, {"swing": swing}, bounded, scenarios=[chosen(controller, swing, "payload")]).passed
+
+
+def test_noise_on_a_healthy_loop_is_no_fault(stand, swing, thor):
+    """60 Hz, and a load cell of 2 N and of 20 N, more than half of the small step."""
+    spec = replace(SPEC, bandwidth_hz=60)
+    healthy = so.tune(stand, thor, spec, robust_to={"swing": swing})
+    names = ("small step", "chirp")
+    for std in (2.0, 20.0):
+        for plant in (stand, swing):
+            scenarios = [chosen(healthy, plant, name) for name in names]
+            for seed in range(8 if plant is stand else 2):
+                cell = so.Sensors(noise_std={"F1": std})
+                found = verify(healthy, {"p": plant}, thor, scenarios=scenarios, sensors=cell, seed=seed)
+                assert found.passed, (std, seed, found)
+
+
+@pytest.mark.parametrize("cell", [so.Sensors(), so.Sensors(noise_std={"F1": 60.0}, quantisation={"F1": 5.0})])
+@pytest.mark.parametrize(("factor", "late"), [(9.5, 0), (40.0, 0), (-0.05, 0), (1.0, 8)])
+def test_every_run_of_an_unstable_loop_fails_and_says_so(controller, stand, thor, cell, factor, late):
+    """Radius and frequency from the eigenvalues of loop matrices written out here."""
+    laws = {
+        name: TransferFunction(num=factor * getattr(controller, name).num, den=getattr(controller, name).den)
+        for name in ("reference", "measurement")
+    }
+    wild = replace(controller, **laws, delay_samples=1 + late)
+    plant, tf = wild.plant(stand, thor), wild.measurement
+    n, m, d = plant.b.size, tf.den.size - 1, wild.delay_samples
+    # States: plant, the last d commands (newest first), and the law's history of m measurements and m commands.
+    size = n + max(d, m) + m
+    a = np.zeros((size, size))
+    a[:n, :n], a[:n, n + d - 1] = plant.a, plant.b
+    num = np.pad(tf.num, (0, m + 1 - tf.num.size))
+    command = np.zeros(size)
+    command[:n] = -num[0] * plant.c
+    command[n : n + m] -= tf.den[1:]
+    command[n + max(d, m) :] -= num[1:]
+    a[n] = command
+    a[n + 1 : n + max(d, m), n : n + max(d, m) - 1] = np.eye(max(d, m) - 1)
+    a[n + max(d, m), :n] = plant.c
+    a[n + max(d, m) + 1 :, n + max(d, m) : -1] = np.eye(m - 1)
+    poles = np.linalg.eigvals(a)
+    fastest = poles[np.argmax(np.abs(poles))]
+    assert abs(fastest) > 1.0
+    found = verify(wild, {"stand": stand}, thor, sensors=cell)
+    for row in found.rows:
+        assert not row.passed
+        assert f"unstable: the linear loop's spectral radius is {abs(fastest):.6g}" in row.reason
+        assert f"at {abs(np.angle(fastest)) * 1e3 / (2 * np.pi):.4g} Hz" in row.reason
+
+
+def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, stand, thor):
+    """P = A P A' + B B' of noise and rounding, solved by SciPy, against the integral over frequency."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    stage = Stage(
+        controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}, quantisation={"F1": 3.0}),
+        current_step_A=0.1,
+    )  # fmt: skip
+    view = linear_view(stage, default_scenarios(controller, stand)[0], thor)
+    system = controller.close(stand, thor).system()
+    read = np.outer(system.b[:, 0], system.b[:, 0]) * (4.0 + 9.0 / 12.0)
+    c, d = system.c[0], (system.d[0, 0] - 1.0) ** 2 * (4.0 + 9.0 / 12.0)
+    expected = c @ solve_discrete_lyapunov(system.a, read) @ c + d
+    only_read = replace(view, step_N=0.0)
+    assert only_read.force_std() == pytest.approx(np.sqrt(expected), rel=2e-3)
+    a, b, y, _ = controller.close(stand, thor).plant.delayed()
+    f = np.arange(0.5, 500.0)
+    rounding = np.abs([y @ np.linalg.solve(np.exp(2j * np.pi * x * 1e-3) * np.eye(b.size) - a, b) for x in f])
+    rounding = rounding * np.abs(controller.close(stand, thor).sensitivity(f))
+    step = 0.1 / controller.current_per_force_A_per_N / np.sqrt(12.0)
+    assert view.force_std() ** 2 == pytest.approx(expected + step**2 * np.mean(rounding**2), rel=5e-3)
+
+
+def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(stand, thor):
+    """An integrator pushes against 300 N of static friction: 41 N at 4.75 Hz by the spectrum of the last 8 s."""
+    hunter = so.tune(stand, thor, replace(SPEC, max_noise_gain=None))
+    gains = Gains(**{**{k: hunter.gains[k] for k in ("k_p", "k_d", "T_f", "k_ff")}, "k_i": hunter.gains["k_i"] + 1.0})
+    reference, measurement = gains.transfer_functions("pid", hunter.sample_time_s)
+    hunter = replace(hunter, reference=reference, measurement=measurement)
+    plant = so.plants.high_impedance(parts=["stribeck"])
+    params = plant.complete(thor).update(f_c=100.0, v_s=1e-5, f_s=300.0, v_st=3e-4)
+    assert hunter.close(plant, params).figures().stable
+    slow = Scenario(name="hold", phases=(Phase(duration_s=0.2), Phase(duration_s=12.0, force_N=50.0)))
+    found = verify(hunter, {"stand": plant}, params, scenarios=[slow, chosen(hunter, plant, "small step")])
+    force = found.replay(found.rows[0]).outputs["F1"][0, -8192:]
+    spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(8192))) / 2048.0
+    top = int(np.argmax(spectrum))
+    assert spectrum[top] > 30.0 and 3.0 < top / 8.192 < 6.0
+    for row in found.rows:
+        assert "sustains itself" in row.reason
+        assert row.limit_cycle_hz == pytest.approx(top / 8.192, abs=0.15)
+        assert row.limit_cycle_N == pytest.approx(spectrum[top], rel=0.1)
