@@ -251,7 +251,8 @@ class RobustnessTable(_Strict):
     samples: Annotated[Whole, Field(ge=1, le=10_000_000)] = 1375
     seed: Annotated[Whole, Field(ge=0)] = 1
     retune: Annotated[Whole, Field(ge=0, le=20)] = 0
-    bounds: bool = False
+    bounds: Flag = False
+    max_failure_probability: Annotated[Number, Field(gt=0, le=1)] | None = None
     sensors: SensorsTable = SensorsTable()
     current_step_A: NotNegative = 0.0
 

@@ -24,6 +24,7 @@ from seaopt.robustness.worst import Worst, witnessed
 
 SCHEMA = "seaopt/robustness/1"
 SIMULATION = "simulation_failures"
+FEW = 0.1  # failure probability above which no failure in the draws is noted to say little
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
@@ -244,7 +245,10 @@ class Certificate:
             for item in self.varied
             if item.outside
         )
-        return (*resting_on(self.parameters, used), *outside)
+        few = self.monte_carlo.samples and not self.monte_carlo.failures
+        bound = self.monte_carlo.failure_probability_bound
+        little = (f"so few draws say little: a failure probability below {bound:.2g}",) if few and bound > FEW else ()
+        return (*resting_on(self.parameters, used), *outside, *little)
 
     def _bounds(self, name: str) -> dict[str, Any]:
         return self.brackets[name].to_dict() if name in self.brackets else {}

@@ -77,6 +77,7 @@ def certify(
     samples: int = 1375,
     seed: int = 1,
     confidence: float = CONFIDENCE,
+    max_failure_probability: float | None = None,
     bounds: Budget | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
@@ -105,6 +106,8 @@ def certify(
         whose worst cases the law was tuned with.
     confidence : float
         Of the bound (Clopper-Pearson).
+    max_failure_probability : float, optional
+        Required of that bound, so that too few draws are no certificate; left out, it is stated and requires nothing.
     bounds : Budget, optional
         Also bound the worst case from above, with this much work on each plant; not at all if left out. What is proven
         requires nothing; a plant met on the way that is worse than the worst case found takes its place.
@@ -132,7 +135,7 @@ def certify(
     (True, 0, ['design', 'swing'])
 
     """
-    _check(controller, plants, samples, seed, confidence)
+    _check(controller, plants, samples, seed, confidence, max_failure_probability)
     plants, others = _with_design(controller, plants, others or ParameterSet())
     unknown = uncertainty(parameters, others, ranges or {}, plants)
     _check_delay(controller, unknown.ranges)
@@ -159,7 +162,7 @@ def certify(
     requirements = (
         *_design_requirements(controller, nominal),
         *(item for name in plants for item in plant_requirements(controller, name, figures[name])),
-        *draw_requirements(monte_carlo, worst),
+        *draw_requirements(monte_carlo, worst, max_failure_probability),
     )
     return Certificate(
         passed=all(item.met for item in requirements), requirements=requirements, plants=figures,
@@ -170,7 +173,10 @@ def certify(
     )  # fmt: skip
 
 
-def _check(controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float) -> None:
+def _check(
+    controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
+    max_failure_probability: float | None,
+) -> None:  # fmt: skip
     if not isinstance(plants, Mapping):
         raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
     if not plants:
@@ -180,6 +186,8 @@ def _check(controller: Controller, plants: Mapping[str, Plant], samples: int, se
             raise ControlError(f"{name} = {value!r} is not a {what}; give a whole number, {least} or more")
     if not 0.0 < confidence < 1.0:
         raise ControlError(f"confidence = {confidence:g} is not between 0 and 1")
+    if max_failure_probability is not None and not 0.0 < max_failure_probability <= 1.0:
+        raise ControlError(f"max_failure_probability = {max_failure_probability:g} is no probability; give 0.01, say")
     if controller.design is None:
         raise ControlError(
             "the controller does not know its design plant; tune it, or read it with Controller.from_dict"

@@ -81,10 +81,13 @@ def _lower(name: str, limit: float | None, value: float, where: str) -> list[Req
     return [Requirement(name=name, limit=limit, value=value, met=bool(value >= limit * (1 - ROUNDING)), where=where)]
 
 
-def draw_requirements(result: MonteCarlo, worst: Mapping[str, Worst]) -> list[Requirement]:
+def draw_requirements(
+    result: MonteCarlo, worst: Mapping[str, Worst], max_failure_probability: float | None = None
+) -> list[Requirement]:
     """Return what the draws require; where none fails, that the worst case found by search does not either."""
+    bound = _bound(result, max_failure_probability)
     if not result.samples:
-        return []
+        return bound
     name = max(worst, key=lambda key: worst[key].severity)
     found = worst[name]
     where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
@@ -98,7 +101,21 @@ def draw_requirements(result: MonteCarlo, worst: Mapping[str, Worst]) -> list[Re
     ]  # fmt: skip
     if not result.failures:
         rows += [row for key, item in worst.items() for row in _worst_requirements(key, item)]
-    return rows
+    return rows + bound
+
+
+def _bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
+    """Return that the stated failure probability is low enough, where that is asked for."""
+    if limit is None:
+        return []
+    value = result.failure_probability_bound if result.samples else 1.0
+    fewest = int(np.ceil(np.log(1.0 - result.confidence) / np.log1p(-limit))) if limit < 1.0 else 1
+    where = f"{result.failures} failures in {result.samples} draws" + (
+        "" if value <= limit else f"; {fewest} draws without a failure would do"
+    )
+    return [
+        Requirement(name="max_failure_probability", limit=limit, value=value, met=bool(value <= limit), where=where)
+    ]
 
 
 def _worst_requirements(name: str, found: Worst) -> list[Requirement]:

@@ -295,3 +295,16 @@ def test_a_range_beyond_the_given_sets_own_bounds(controller, swing, thor):
     narrow = thor.with_parameters(replace(thor["I_p"], max=0.5))
     with pytest.raises(ControlError, match="of the given parameters"):
         so.certify(controller, {"swing": swing}, narrow, ranges={"I_p": (0.2, 0.6)}, samples=5)
+
+
+def test_the_bound_is_required_where_it_is_asked_for(controller, swing, thor):
+    """1375 draws without a failure bound it by 1 % (ln(1e6)/ln(1/0.99) = 1374.6); 50 by 24 %, which is noted."""
+    options = {"ranges": {"I_p": (0.3, 0.5)}, "max_failure_probability": 0.01}
+    few = so.certify(controller, {"swing": swing}, thor, samples=50, **options)
+    (row,) = [item for item in few.requirements if not item.met]
+    assert (row.name, row.limit) == ("max_failure_probability", 0.01)
+    assert row.value == pytest.approx(1.0 - 1e-6 ** (1 / 50), rel=1e-9)
+    assert "1375 draws without a failure would do" in row.where
+    assert "below 0.24" in few.notes[-1]
+    assert so.certify(controller, {"swing": swing}, thor, samples=1375, **options).passed
+    assert not so.certify(controller, {"swing": swing}, thor, max_failure_probability=0.01).passed  # nothing is drawn
