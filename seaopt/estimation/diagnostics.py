@@ -21,6 +21,7 @@ from seaopt.estimation.leftover import Errors, leftover
 from seaopt.estimation.leverage import Leverage, leverage
 from seaopt.estimation.residuals import Residuals
 from seaopt.estimation.result import Fit, Minimum
+from seaopt.units import unit_after
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -84,8 +85,8 @@ class Diagnostics:
                     for u, found in item.inputs.items()
                 ]
         lines += [
-            f"  {name} = {item.value:.6g} {item.unit} held fixed: chi-square {item.chi2:.3g}, one step with it free "
-            f"goes to {item.preferred:.4g}"
+            f"  {name} = {item.value:.6g}{unit_after(item.unit)} held fixed: chi-square {item.chi2:.3g}, one step with "
+            f"it free goes to {item.preferred:.4g}"
             for name, item in self.held.items()
             if item.p < CHANCE
         ]

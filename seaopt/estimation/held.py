@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Int
 from seaopt.estimation.correlation import cross_correlation
 from seaopt.estimation.covariance import coloured, robust_bread
 from seaopt.estimation.identifiability import listed
+from seaopt.estimation.least_squares import held_by_bounds
 from seaopt.estimation.leftover import Errors, leftover
 from seaopt.estimation.losses import Linear
 from seaopt.estimation.methods import Method, MultipleShooting, OutputError, PredictionError
@@ -36,6 +37,7 @@ from seaopt.estimation.solve import settle
 from seaopt.estimation.summary import summarise
 from seaopt.estimation.unknowns import collect
 from seaopt.simulation import make_model
+from seaopt.units import unit_after
 
 CHANCE = 0.01  # a test that fails with less than this probability by chance is told in words
 UNSEEN = 1e-7  # of what a parameter does to the outputs: less of it left, and the free ones do the same
@@ -107,7 +109,7 @@ class Culprit:
     def first(self) -> str:
         """The best with its value, in words."""
         name = next(iter(self.values))
-        return f"{name} = {self.values[name]:.6g} {self.tests[name].unit}".removesuffix(" -")
+        return f"{name} = {self.values[name]:.6g}{unit_after(self.tests[name].unit)}"
 
     def explains(self, e: int, o: int) -> bool:
         """Tell whether the residual of an output is explained: nothing of it follows an input, or little is left."""
@@ -119,13 +121,13 @@ class Culprit:
         name, (test, *_) = next(iter(self.values)), self.tests.values()
         chi2 = f"chi-square {test.chi2:.3g} on one degree of freedom"
         if len(self.values) == 1:
-            unit = "" if test.unit == "-" else f" {test.unit}"
+            unit = unit_after(test.unit)
             return (
                 f"{name} = {test.value:.6g}{unit} is held fixed, and the logs prefer {self.values[name]:.6g} ± "
                 f"{self.std:.2g}{unit} ({chi2}): check the value, or free it"
             )
         each = [
-            f"{name} = {value:.6g} in place of {self.tests[name].value:.6g} {self.tests[name].unit}".removesuffix(" -")
+            f"{name} = {value:.6g} in place of {self.tests[name].value:.6g}{unit_after(self.tests[name].unit)}"
             for name, value in self.values.items()
         ]
         return (
@@ -234,8 +236,7 @@ def _scores(
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return scores, their information, and their variances with the residuals as coloured as they are."""
     unknowns, z = trial.unknowns, here.z
-    width = 1e-9 * np.maximum(np.abs(z), 1e-300)
-    held = (z - unknowns.low <= width) | (unknowns.high - z <= width)  # a bound takes the place of a zero gradient
+    held = held_by_bounds(here, unknowns.low, unknowns.high)  # a bound takes the place of a zero gradient
     held[places] = True
     rest = np.flatnonzero(~held)
     hessian = here.hessian

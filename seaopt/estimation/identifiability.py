@@ -19,6 +19,7 @@ from seaopt.estimation.normal import RANK, eliminated
 from seaopt.estimation.residuals import Residuals
 from seaopt.parameters import ParameterSet
 from seaopt.simulation import Segment, run_passes
+from seaopt.units import unit_after
 
 WEAK = 1e-5  # eigenvalues below this part of the largest: standard deviations a few hundred times those of one alone
 RICH = 600  # samples of made-up input
@@ -147,7 +148,7 @@ def resting_on(params: ParameterSet, used: Container[str] | None = None) -> tupl
     names = [name for name in params.unidentified_names if used is None or name in used]
     if not names:
         return ()
-    values = ", ".join(f"{name} = {params[name].value:.4g} {params[name].unit}" for name in names)
+    values = ", ".join(f"{name} = {params[name].value:.4g}{unit_after(params[name].unit)}" for name in names)
     return (
         f"the fit does not identify {listed(names)}: {values} {'is' if len(names) == 1 else 'are'} one choice among "
         "others that fit as well, and what follows at these values holds for no other; excite more, or give a value, a "

@@ -95,7 +95,7 @@ def minimise(
     scale = _norms(here)
     radius = reach * max(float(np.linalg.norm(scale * here.z)), 1.0)
     for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
-        held = _held(here, low, high)
+        held = held_by_bounds(here, low, high)
         distance = _decrement(here, held) + 2.0 * here.pending
         if distance <= decrement + RELATIVE * here.cost:
             return Solution(
@@ -117,13 +117,15 @@ def minimise(
             )  # fmt: skip
         whole = damping == 0.0 and bool(np.all(trial == here.z + step))
         if follow is not None and whole and _straight(distance, before, decrement + RELATIVE * here.cost):
-            here = follow(here, trial)
-            if callback is not None:
-                callback(iteration, here.cost)
-            return Solution(
-                z=here.z, evaluation=here, status="converged", iterations=iteration,
-                message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
-            )  # fmt: skip
+            there = follow(here, trial)
+            # A bound that held so far need not hold there.
+            if _decrement(there, held_by_bounds(there, low, high)) <= decrement + RELATIVE * there.cost:
+                if callback is not None:
+                    callback(iteration, there.cost)
+                return Solution(
+                    z=there.z, evaluation=there, status="converged", iterations=iteration,
+                    message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
+                )  # fmt: skip
         predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved) + here.pending
         there = evaluate(trial, here, damping)
         ratio = (here.cost - there.cost) / predicted if predicted > 0.0 and np.isfinite(there.cost) else -1.0
@@ -160,7 +162,9 @@ def _norms(here: Evaluation) -> Float[np.ndarray, " n"]:
     return np.sqrt(np.maximum(np.diag(here.hessian), 1e-300))
 
 
-def _held(here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def held_by_bounds(
+    here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
     """Tell which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
     near = 1e-4 / _norms(here)
     return ((here.z - low <= near) & (here.gradient > 0.0)) | ((high - here.z <= near) & (here.gradient < 0.0))

@@ -16,7 +16,8 @@ Process noise is an unknown through :math:`\lambda`, the logarithm of its standa
 the residuals follow its variance :math:`w = e^{2\lambda}`, so that
 :math:`c_{\lambda\lambda} = 4 w^2 c_{ww} + 2 c_\lambda`; where it rules they follow 1/w, which turns the sign of the
 last term. Gauss and Newton see the first term alone, which dies out on either side: :math:`2 |c_\lambda|` is added, or
-steps overshoot and the region shrinks for all unknowns.
+steps overshoot and the region shrinks for all unknowns. It stays in the Hessian that the covariance inverts:
+where noise is hardly there it is the true second derivative.
 """
 
 from __future__ import annotations

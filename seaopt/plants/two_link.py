@@ -340,6 +340,7 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
 
     Examples
     --------
+    >>> from seaopt.plants import thor
     >>> model = high_impedance().linearize(thor())
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True

@@ -31,6 +31,7 @@ from seaopt.robustness.severity import severities
 from seaopt.robustness.worst import Worst
 
 SLACK = 1e-9
+AGREE = 1e-6  # of the figures met, which are computed another way
 EDGES = np.pi * np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 31)])  # of the arcs at the start
 BLOCK = 128  # boxes at a time
 ARCS = 4096  # arcs at a time: bounds the memory
@@ -52,13 +53,13 @@ class Budget:
     boxes : int
         Boxes after which to stop, for each plant.
     seconds : float
-        The same in time; what is then found depends on the machine.
+        The same in time, looked at between blocks of boxes; what is then found depends on the machine.
 
     """
 
     tolerance: float = 0.01
     boxes: int = 1000
-    seconds: float = np.inf
+    seconds: float = 60.0
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "boxes", "seconds"):
@@ -101,6 +102,8 @@ class Bracket:
         """What is proven, in words; its figures are rounded up."""
         if self.left_out:
             return f"no bound: {self.left_out}"
+        if not np.isfinite(self.ms_lower):
+            return "no bound: a plant of the set is unstable"
         if not self.proven_stable:
             return f"no bound in {self.boxes} boxes"
         return f"proven: all stable, Ms below {_above(self.ms_upper)}, Mt below {_above(self.mt_upper)}"
@@ -198,7 +201,14 @@ def bracket(
             boxes=0, left_out=str(error),
         )  # fmt: skip
     open_bounds = [np.max(found.arcs.s, initial=0.0), np.max(found.arcs.t, initial=0.0)]
-    upper = np.maximum(np.maximum(found.upper, open_bounds) * (1.0 + SLACK), found.lower)
+    bound = np.maximum(found.upper, open_bounds) * (1.0 + SLACK)
+    if found.boxes.centre.size and np.any(found.lower > bound * (1.0 + AGREE)) and np.all(np.isfinite(found.lower)):
+        return Bracket(
+            ms_lower=float(found.lower[0]), ms_upper=np.inf, mt_lower=float(found.lower[1]), mt_upper=np.inf,
+            proven_stable=False, boxes=found.count, parameters=found.parameters,
+            left_out="a plant of the set is worse than the bound, which is therefore none; the model was not enclosed",
+        )  # fmt: skip
+    upper = np.maximum(bound, found.lower)
     proven = bool(np.all(np.isfinite(upper)) and found.stable)
     ms, mt = (float(item) if proven else np.inf for item in upper)
     return Bracket(

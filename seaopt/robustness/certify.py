@@ -149,7 +149,7 @@ def certify(
         for name, plant in plants.items()
     }
     brackets: dict[str, Bracket] = {}
-    if bounds is not None and unknown.size:
+    if bounds is not None:
         brackets = {name: bracket(controller, plant, unknown, worst[name], bounds) for name, plant in plants.items()}
     for name, item in brackets.items():
         if item.parameters:

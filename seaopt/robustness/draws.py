@@ -17,10 +17,12 @@ from jaxtyping import Bool, Float
 from seaopt.control.digital import conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, state_space
+from seaopt.units import factor
 
 MAX_REJECTION = 200
+LEVEL = 0.999  # of the fit's distribution that the worst case is looked for in
 SCREW_MODE, SCREW_MASS = "screw_mode_hz", "m_n"
 
 
@@ -72,8 +74,8 @@ class Uncertainty:
         Uniform, independent of the rest.
     screw : (frequencies, masses)
         Which effective mass m_n puts the screw's mode where, ascending in frequency; for a range of screw_mode_hz.
-    units : mapping of name to str
-        Of the ranges that `nominal` has no value of.
+    absent : mapping of name to Parameter
+        What a range may name that `nominal` has no value of: the plants' defaults, and conditions.
 
     """
 
@@ -82,7 +84,7 @@ class Uncertainty:
     covariance: Float[np.ndarray, "n n"]
     ranges: Mapping[str, tuple[float, float]]
     screw: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]] = (np.empty(0), np.empty(0))
-    units: Mapping[str, str] = field(default_factory=dict[str, str])
+    absent: Mapping[str, Parameter] = field(default_factory=dict[str, Parameter])
 
     @property
     def size(self) -> int:
@@ -91,7 +93,7 @@ class Uncertainty:
 
     def varied(self) -> tuple[Varied, ...]:
         """Return what is drawn and how, the Gaussian part first."""
-        stds, known = np.sqrt(np.diag(self.covariance)), dict(self.nominal)
+        stds, known = np.sqrt(np.diag(self.covariance)), {**self.absent, **self.nominal}
         found = [
             Varied(name=name, unit=item.unit, value=item.value, std=float(std), low=item.min, high=item.max)
             for name, std in zip(self.names, stds, strict=True)
@@ -99,8 +101,7 @@ class Uncertainty:
         ]
         for name, (low, high) in self.ranges.items():
             item = known.get(name)
-            unit = self.units.get(name, "-") if item is None else item.unit
-            value = item.value if item is not None else None if name == SCREW_MODE else 0.0
+            unit, value = ("Hz", None) if item is None else (item.unit, item.value)
             found.append(Varied(name=name, unit=unit, value=value, std=None, low=low, high=high))
         return tuple(found)
 
@@ -152,7 +153,7 @@ class Uncertainty:
         """Return the derivatives of `values` with respect to the coordinates, by name."""
         count, width = coordinates.shape
         out: dict[str, Float[np.ndarray, "n k"]] = {}
-        for name, row in zip(self.names, self._factor(), strict=True):
+        for name, row in zip(self.names, self.factor(), strict=True):
             out[name] = np.zeros((count, width))
             out[name][:, : row.size] = row
         for i, (name, (low, high)) in enumerate(self.ranges.items(), start=len(self.names)):
@@ -171,7 +172,7 @@ class Uncertainty:
     ) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " n"]]]:
         """Give each finite bound of the Gaussian part: its outward normal, and each point's distance from it."""
         values = self._gaussian(coordinates)
-        for j, (name, row) in enumerate(zip(self.names, self._factor(), strict=True)):
+        for j, (name, row) in enumerate(zip(self.names, self.factor(), strict=True)):
             item, std = self.nominal[name], float(np.linalg.norm(row))
             if std == 0.0:
                 continue
@@ -181,7 +182,7 @@ class Uncertainty:
             if np.isfinite(item.min):
                 yield -normal, (values[:, j] - item.min) / std
 
-    def _factor(self) -> Float[np.ndarray, "g g"]:
+    def factor(self) -> Float[np.ndarray, "g g"]:
         """Return the covariance's factor, coordinates to parameters: standard deviations times the correlation's root.
 
         Of the correlation, whose entries are alike: the eigenvalues of a covariance in m, N/m and kg m^2 span so many
@@ -194,7 +195,7 @@ class Uncertainty:
 
     def _gaussian(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
         mean = np.array(self.nominal.values_of(self.names))
-        return mean + coordinates[:, : mean.size] @ self._factor().T
+        return mean + coordinates[:, : mean.size] @ self.factor().T
 
 
 def uncertainty(
@@ -241,19 +242,28 @@ def uncertainty(
     every = (*names, *stds)
     used = [i for i, name in enumerate(every) if name not in ranges and name in known and np.isfinite(whole[i, i])]
     nominal = nominal.with_parameters(*others.values())
+    nominal, scale = _in_plant_units(nominal, plants)
+    factors = np.array([scale.get(name, 1.0) for name in every])
+    whole *= factors[:, None] * factors
     _check_inside(ranges, nominal)
     screw = _screw_masses(plants, nominal, ranges[SCREW_MODE]) if SCREW_MODE in ranges else (np.empty(0), np.empty(0))
     return Uncertainty(
         nominal=nominal, names=tuple(every[i] for i in used), covariance=whole[np.ix_(used, used)],
         ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, screw=screw,
-        units=_units(plants),
+        absent={name: item for plant in plants.values() for name, item in plant.defaults.items()}
+        | conditions(tuple(plants.values())),
     )  # fmt: skip
 
 
-def _units(plants: Mapping[str, Plant]) -> dict[str, str]:
-    """Return the units of what a range may name."""
-    own = {name: plant.parameter_unit(name) for plant in plants.values() for name in plant.parameters}
-    return {SCREW_MODE: "Hz", **own} | {name: item.unit for name, item in conditions(tuple(plants.values())).items()}
+def _in_plant_units(nominal: ParameterSet, plants: Mapping[str, Plant]) -> tuple[ParameterSet, dict[str, float]]:
+    """Return the values in the plants' units, and what each was multiplied by."""
+    scale: dict[str, float] = {}
+    for plant in plants.values():
+        own = plant.complete(nominal)
+        shared = [name for name in own if name in nominal]
+        scale |= {name: factor(nominal[name].unit, own[name].unit) for name in shared if name not in scale}
+        nominal = nominal.with_parameters(*(own[name] for name in shared))
+    return nominal, scale
 
 
 def _check_inside(ranges: Mapping[str, tuple[float, float]], nominal: ParameterSet) -> None:
@@ -356,3 +366,10 @@ def _screw_masses(
             f"{frequencies[0]:.3g} to {frequencies[-1]:.3g} Hz; keep inside, or give ranges of k_b and {SCREW_MASS}"
         )
     return frequencies, masses
+
+
+def radius(dimensions: int) -> float:
+    """Return the radius in standard deviations that holds LEVEL of a Gaussian."""
+    from scipy.special import gammaincinv
+
+    return float(np.sqrt(2.0 * gammaincinv(0.5 * dimensions, LEVEL))) if dimensions else 0.0

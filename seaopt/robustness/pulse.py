@@ -61,10 +61,10 @@ def pulse(controller: Controller, plant: Plant, nominal: ParameterSet, within: R
     uncertain = within.enclosed(boxes, degree)
     count, over = boxes.centre.shape[0], basis(within.size, degree)
     p: list[Entry] = [
-        uncertain.get(name, value)
+        uncertain.get(name, within.fixed.get(name, value))  # a range of no width is no uncertainty, but another value
         for name, value in zip(plant.parameters, plant.parameter_values(nominal), strict=True)
     ]
-    at: dict[str, Entry] = {**within.fixed, **{n: item for n, item in uncertain.items() if n not in plant.parameters}}
+    at: dict[str, Entry] = {n: item for n, item in (within.fixed | uncertain).items() if n not in plant.parameters}
     delay = at.pop(DELAY, 0.0)
     x, u = at_rest(plant, p, at, count, over)
     n, outputs = len(plant.states), len(plant.outputs)

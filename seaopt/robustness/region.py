@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.digital import DELAY, conditions
+from seaopt.control.digital import DELAY, conditions, conditions_of
 from seaopt.plants import Plant
-from seaopt.robustness.draws import SCREW_MASS, SCREW_MODE, Uncertainty
+from seaopt.robustness.draws import SCREW_MASS, SCREW_MODE, Uncertainty, radius
 from seaopt.robustness.taylor import Taylor, basis, linear
-from seaopt.robustness.worst import LEVEL
 
 SMALLEST = 1e-12  # half axis, as a fraction of the largest relative one, that is no uncertainty
 
@@ -141,8 +140,7 @@ def region(plant: Plant, unknown: Uncertainty) -> Region:
     taken = {SCREW_MASS} if SCREW_MODE in unknown.ranges else set[str]()
     gaussian = [k for k, name in enumerate(unknown.names) if name in plant.parameters and name not in taken]
     names = [unknown.names[k] for k in gaussian]
-    values, vectors = np.linalg.eigh(unknown.covariance)
-    rows = (vectors * np.sqrt(np.maximum(values, 0.0)))[gaussian] * _radius(len(unknown.names))
+    rows = unknown.factor()[gaussian] * radius(len(unknown.names))
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     left, axes, _ = np.linalg.svd(rows / np.where(size > 0.0, size, 1.0), full_matrices=False)
     kept = axes > SMALLEST
@@ -159,7 +157,7 @@ def region(plant: Plant, unknown: Uncertainty) -> Region:
     slopes[:count, :ball] = axes
     slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
     middle = [0.5 * (low + high) for low, high in wide.values()]
-    nominal = {name: unknown.nominal[name].value for name in extra if name in unknown.nominal and name not in ends}
+    nominal = {name: value for name, value in conditions_of(plant, unknown.nominal).items() if name not in ends}
     return Region(
         names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
         slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
@@ -174,10 +172,3 @@ def _ends(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[f
         return float(pair[0]), float(pair[1])
     ends = np.interp(np.array(pair), unknown.screw[0], unknown.screw[1])
     return float(np.min(ends)), float(np.max(ends))
-
-
-def _radius(dimensions: int) -> float:
-    """Return the radius in standard deviations that holds LEVEL of a Gaussian."""
-    from scipy.special import gammaincinv
-
-    return float(np.sqrt(2.0 * gammaincinv(0.5 * dimensions, LEVEL))) if dimensions else 0.0

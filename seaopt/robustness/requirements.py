@@ -110,9 +110,11 @@ def _bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
         return []
     value = result.failure_probability_bound if result.samples else 1.0
     fewest = int(np.ceil(np.log(1.0 - result.confidence) / np.log1p(-limit))) if limit < 1.0 else 1
-    where = f"{result.failures} failures in {result.samples} draws" + (
-        "" if value <= limit else f"; {fewest} draws without a failure would do"
-    )
+    where = f"{result.failures} failures in {result.samples} draws"
+    if not result.samples:
+        where = "nothing is uncertain, so that nothing was drawn; give a fit, prior_std or ranges"
+    elif value > limit:
+        where += f"; {fewest} draws without a failure would do"
     return [
         Requirement(name="max_failure_probability", limit=limit, value=value, met=bool(value <= limit), where=where)
     ]

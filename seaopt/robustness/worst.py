@@ -22,11 +22,10 @@ from seaopt.control.digital import conditions, conditions_of
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.batch import BatchFigures, batch_figures
-from seaopt.robustness.draws import Uncertainty
+from seaopt.robustness.draws import Uncertainty, radius
 from seaopt.robustness.severity import limits, severities, severity_slopes
 from seaopt.robustness.tables import worst_html
 
-LEVEL = 0.999
 STARTS = 8
 CORNERS = 64  # vertices of the ranges looked at
 APART = 0.5  # of half a range, or of the ellipsoid's radius
@@ -181,7 +180,7 @@ def _spread(
 ) -> Float[np.ndarray, "s k"]:
     """Return the worst points that are apart, then the worst of the others: one valley must not take all starts."""
     scaled = points.copy()
-    scaled[:, : len(unknown.names)] /= max(_radius(len(unknown.names)), 1.0)
+    scaled[:, : len(unknown.names)] /= max(radius(len(unknown.names)), 1.0)
     order = list(np.argsort(severity)[::-1])
     kept: list[int] = []
     for i in order:
@@ -229,7 +228,7 @@ def _trials(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes, rn
     size = np.linalg.norm(slope, axis=1, keepdims=True)
     unit = slope / np.maximum(size, 1e-300)
     inner = np.linalg.norm(unit[:, :g], axis=1, keepdims=True)
-    vertex = np.hstack([_radius(g) * unit[:, :g] / np.maximum(inner, 1e-300), np.sign(unit[:, g:])])
+    vertex = np.hstack([radius(g) * unit[:, :g] / np.maximum(inner, 1e-300), np.sign(unit[:, g:])])
     towards = x[:, None] + VERTEX_STEPS[:, None] * (vertex - x)[:, None]
     along = x[:, None] + GRADIENT_STEPS[:, None] * unit[:, None]
     about = x[:, None] + PROBE_STEPS[:, None] * rng.normal(size=(x.shape[0], PROBE_STEPS.size, x.shape[1]))
@@ -251,11 +250,4 @@ def _into_set(unknown: Uncertainty, x: Float[np.ndarray, "n k"]) -> Float[np.nda
     """Return the points, those outside the ellipsoid or the box moved onto its edge."""
     g = len(unknown.names)
     size = np.linalg.norm(x[:, :g], axis=1, keepdims=True)
-    return np.hstack([x[:, :g] * np.minimum(1.0, _radius(g) / np.maximum(size, 1e-300)), np.clip(x[:, g:], -1.0, 1.0)])
-
-
-def _radius(dimensions: int) -> float:
-    """Return the radius in standard deviations that holds LEVEL of a Gaussian."""
-    from scipy.special import gammaincinv
-
-    return float(np.sqrt(2.0 * gammaincinv(0.5 * dimensions, LEVEL))) if dimensions else 0.0
+    return np.hstack([x[:, :g] * np.minimum(1.0, radius(g) / np.maximum(size, 1e-300)), np.clip(x[:, g:], -1.0, 1.0)])

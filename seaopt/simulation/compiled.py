@@ -6,7 +6,7 @@ import ctypes
 import os
 import re
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from importlib.resources import files
 from itertools import pairwise
@@ -277,7 +277,7 @@ class Program:
                 arguments[name] = kept.ctypes.data + kept.strides[0] * (edges[:-1] - first)
         if resume is not None:
             arguments["carry"] = resume.ctypes.data
-        self._call(arguments, n)
+        self._call(arguments, n, (result, start, resume))
         return result
 
     def double_sum(
@@ -300,7 +300,7 @@ class Program:
         arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
         for name, array in {"x0": starts, "ring": ring, "form": form}.items():
             arguments[name] = array.ctypes.data + array.strides[0] * np.arange(len(warm))
-        self._call(arguments, self.segment.n)
+        self._call(arguments, self.segment.n, (padded, halved, starts, ring, form))
         total = np.sum(form, axis=0)
         return (total + total.T)[:p, :p]
 
@@ -313,8 +313,11 @@ class Program:
         """Return room for what a stretch hands from one call to the next."""
         return np.zeros(int(self.library.carry_size()))
 
-    def _call(self, arguments: Any, n: int) -> None:
-        """Run the shots, in threads where there are enough samples: ctypes lets go of the interpreter's lock."""
+    def _call(self, arguments: Any, n: int, used: tuple[Any, ...]) -> None:
+        """Run the shots, in threads where there are enough samples: ctypes lets go of the interpreter's lock.
+
+        An interrupt must not free what a thread still writes to: its job holds on to what is `used`, and is waited for.
+        """
         count, call = len(arguments), self.library.seaopt_passes
         if count < 2 or n < PARALLEL or threading.current_thread().name.startswith(THREADS):
             call(arguments.ctypes.data, count)
@@ -322,10 +325,20 @@ class Program:
         bounds = np.linspace(0, count, workers() + 1).astype(int)
         size = arguments.dtype.itemsize
         spans = [(arguments.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds) if b > a]
-        jobs = [threads().submit(call, *span) for span in spans[1:]]
-        call(*spans[0])
+        kept = (arguments, used, self)
+        jobs = [threads().submit(_holding, kept, call, *span) for span in spans[1:]]
+        try:
+            call(*spans[0])
+        finally:
+            wait(jobs)
         for job in jobs:
             job.result()
+
+
+def _holding(kept: tuple[Any, ...], call: Any, *arguments: int) -> None:
+    """Call with addresses whose memory `kept` owns."""
+    call(*arguments)
+    del kept
 
 
 def workers() -> int:

@@ -7,14 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import seaopt as so
 from seaopt.control.law import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
-from seaopt.robustness import Bracket, Budget, batch_figures, bracket, uncertainty
+from seaopt.robustness import Bracket, Budget, Uncertainty, batch_figures, bracket, uncertainty
+from seaopt.robustness.draws import LEVEL
 from seaopt.robustness.region import region
-from seaopt.robustness.worst import LEVEL, find_worst
+from seaopt.robustness.worst import find_worst
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
 
@@ -30,7 +32,6 @@ def of(plant, params, ranges):
 
 def draws(unknown, count, seed=0):
     """Return points of the set: inside the ellipsoid, on its edge, and at the corners of the ranges."""
-    from scipy.stats import chi2
 
     rng = np.random.default_rng(seed)
     g, k = len(unknown.names), len(unknown.ranges)
@@ -247,3 +248,32 @@ def test_figures_are_rounded_up():
 def test_bad_budgets(wrong):
     with pytest.raises(ControlError, match="not positive"):
         Budget(**wrong)
+
+
+@pytest.mark.parametrize("order", [("b_r", "J", "m_l", "k", "K_tau"), ("K_tau", "k", "m_l", "J", "b_r")])
+def test_the_region_has_the_covariance_whatever_the_order(order, stand, thor):
+    """Standard deviations from 2e-7 to 2e4, correlated: the axes times themselves are the covariance again."""
+    std = {"b_r": 1e-5, "J": 2e-7, "m_l": 0.02, "k": 2e4, "K_tau": 2e-4}
+    root = np.random.default_rng(2).normal(size=(5, 5))
+    correlation = root @ root.T
+    correlation /= np.sqrt(np.outer(np.diag(correlation), np.diag(correlation)))
+    scale = np.array([std[name] for name in order])
+    unknown = Uncertainty(
+        nominal=stand.complete(thor), names=order, covariance=correlation * np.outer(scale, scale), ranges={}
+    )
+    within = region(stand, unknown)
+    rows = within.slopes / scale[:, None] / np.sqrt(chi2.ppf(LEVEL, 5))
+    np.testing.assert_allclose(rows @ rows.T, correlation, atol=1e-9)
+
+
+@pytest.mark.parametrize("eta", [0.6, 1.5])
+def test_a_range_of_no_width_is_that_value(eta, stand, thor):
+    """As if the value had been given, by the search and by the bound."""
+    controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    ranges = {"m_l": (0.5, 0.7)}
+    pinned = uncertainty(thor, so.ParameterSet(), ranges | {"eta": (eta, eta)}, {"stand": stand})
+    given = uncertainty(thor.update(eta=eta), so.ParameterSet(), ranges, {"stand": stand})
+    budget = Budget(boxes=50, seconds=20.0)
+    found, expected = (bracket(controller, stand, item, None, budget) for item in (pinned, given))
+    assert found.proven_stable
+    assert found.ms_upper == pytest.approx(expected.ms_upper, rel=1e-9)

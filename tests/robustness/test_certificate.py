@@ -308,3 +308,27 @@ def test_the_bound_is_required_where_it_is_asked_for(controller, swing, thor):
     assert "below 0.24" in few.notes[-1]
     assert so.certify(controller, {"swing": swing}, thor, samples=1375, **options).passed
     assert not so.certify(controller, {"swing": swing}, thor, max_failure_probability=0.01).passed  # nothing is drawn
+
+
+def test_values_in_other_units_are_the_same_values(controller, swing, thor):
+    """646 g known within 1 g, and 0.2 ms of delay."""
+    late = [Parameter(name="delay_s", value=value, unit=unit) for value, unit in ((2e-4, "s"), (0.2, "ms"))]
+    kilograms = thor.with_parameters(replace(thor["m_l"], prior_std=1e-3), late[0])
+    grams = Parameter(name="m_l", value=646.0, unit="g", prior_std=1.0, min=0.0)
+    found = [
+        so.certify(controller, {"swing": swing}, params, ranges={"I_p": (0.3, 0.5)}, samples=50)
+        for params in (kilograms, thor.with_parameters(grams, late[1]))
+    ]
+    assert found[1].worst["swing"].ms == pytest.approx(found[0].worst["swing"].ms, rel=1e-9)
+    assert found[1].worst["swing"].parameters == pytest.approx(found[0].worst["swing"].parameters, rel=1e-9)
+    told = [next(item for item in each.varied if item.name == "m_l") for each in found]
+    assert told[1].std == pytest.approx(told[0].std)
+
+
+def test_a_ranged_parameter_that_nobody_gave_has_its_default(controller, stand, swing):
+    """A set with the stand's names alone: the swing's inertia is the plant's, inside its range."""
+    stands = stand.complete(so.plants.thor())
+    found = so.certify(controller, {"swing": swing}, stands, ranges={"I_p": (0.3, 0.4)}, samples=5)
+    (told,) = found.varied
+    assert told.value == 0.36
+    assert not told.outside

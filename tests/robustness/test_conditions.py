@@ -242,7 +242,7 @@ def test_the_certificates_worst_draw_is_played_there(controller, swing, thor):
     ranges = {"I_p": (0.2, 0.5), "phi": (0.3, 0.8), "delay_s": (0.0, 2e-4)}
     certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50).with_simulation()
     verification = certificate.simulated.verification
-    row = next(row for row in verification.rows if row.draw == "1" and row.scenario == "small step")
+    row = next(row for row in verification.rows if (row.plant, row.draw, row.scenario) == ("swing", "1", "small step"))
     worst = certificate.worst["swing"].parameters
     assert row.parameters == pytest.approx(worst)
     again = verification.replay(row)

@@ -138,5 +138,5 @@ def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkey
     found = simulated(controller, {"stand": stand}, thor)
     assert "Singular matrix" in found.left_out["passivity"]
     assert found.passivity_dict() is None
-    assert set(found.left_out) == {"passivity", "large signals"}
+    assert set(found.left_out) == {"passivity", "large signals on stand"}
     assert found.environments is not None
