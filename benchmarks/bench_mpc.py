@@ -16,7 +16,7 @@ import numpy as np
 
 import seaopt as so
 from seaopt.control import MPCSpec, close_loop, export_mpc, force_mpc
-from seaopt.control.realisation import runnable
+from seaopt.control.laws.realisation import runnable
 
 STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
 LIMIT_A, BANDWIDTH_HZ, STEPS, TS = 9.0, 30.0, 10_000, 1e-3

@@ -19,7 +19,7 @@ from scipy.optimize import differential_evolution
 
 import seaopt as so
 from seaopt.control import Gains, Loop, current_per_force
-from seaopt.control.law import Notch
+from seaopt.control.laws.structures import Notch
 
 LOWEST_HZ, RATE = 0.1, 2 * np.pi * 0.05
 FULL = {"pd": "dT", "pid": "idT", "pid_dob": "idTQ"}

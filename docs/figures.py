@@ -23,12 +23,12 @@ from seaopt.control import (
     sample,
     sweep,
 )
-from seaopt.control.port import held, port_of
-from seaopt.control.realisation import realise, runnable
+from seaopt.control.laws.realisation import realise, runnable
+from seaopt.control.loops.port import held, port_of
 from seaopt.estimation import Limits, design_experiment
 from seaopt.reporting.verification import large_signal_figure, stability_figure
-from seaopt.robustness.environments import coupled_stability
-from seaopt.robustness.large_signal import large_signal
+from seaopt.robustness.verification.environments import coupled_stability
+from seaopt.robustness.verification.large_signal import large_signal
 
 FOLDER = Path(__file__).resolve().parent / "figures"
 COLOURS = {"unlumped": "#0072b2", "lumped": "#d55e00"}

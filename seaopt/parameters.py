@@ -5,13 +5,14 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from seaopt.errors import ParameterError, suggestion
+from seaopt.records import record
 from seaopt.units import factor, unit_after
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Parameter:
     """One named value in an SI unit.
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
+from seaopt.records import record
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Origin:
     """Where a channel came from.
 
@@ -33,7 +32,7 @@ class Origin:
     conversion: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Signal:
     """One channel of a log: samples in an SI unit.
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.export import export
+from seaopt.control.deploy.export import export
 from seaopt.simulation.compiler import find_compiler
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

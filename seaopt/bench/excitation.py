@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SimulationError
+from seaopt.records import record
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Chirp:
     """A sine whose frequency grows exponentially from f0_hz to f1_hz over the whole duration.
 
@@ -37,7 +38,7 @@ class Chirp:
         return self.amplitude * np.sin(phase)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Noise:
     """Gaussian noise, white up to band_hz and nothing above it.
 
@@ -64,7 +65,7 @@ class Noise:
         return self.std * noise / np.sqrt(np.mean(inside))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Multisine:
     """A sum of sines, sum_k a_k sin(2 pi f_k t + phi_k).
 

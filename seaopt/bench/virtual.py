@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from jaxtyping import Float
@@ -13,11 +13,12 @@ from seaopt.errors import SimulationError, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.records import record
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Sensors:
     """What the sensors do to each output, by name; what is left out is ideal.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from seaopt.cli.provenance import FILES, digest
 from seaopt.cli.session import SCHEMAS
-from seaopt.control.export import export
+from seaopt.control.deploy.export import export
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from seaopt.problem import Problem
 from seaopt.problem.schema import ControllerTable
-from seaopt.robustness.draws import SCREW_MODE
+from seaopt.robustness.uncertainty.draws import SCREW_MODE
 
 FILES = {
     "fit": "fit.json",

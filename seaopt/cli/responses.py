@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,11 @@ from rich.table import Table
 
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
-from seaopt.estimation.result import Nuisance
+from seaopt.estimation.result.fit_result import Nuisance
 from seaopt.frequency import Drive, Pair, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
+from seaopt.records import record
 from seaopt.reporting import experiment_survey, write_frequency_figure
 
 HEAD = ("experiment", "response", "coherent", "peak", "gain", "natural", "damping", "2nd order", "file")
@@ -27,7 +28,7 @@ NOTE = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Responses:
     """Surveys of the experiments under the file's values and, where DIR has a fit, under its own."""
 

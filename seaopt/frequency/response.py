@@ -14,18 +14,18 @@ the stretch is long against the plant's memory; models compared with H1 are spre
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError
+from seaopt.records import record
 
 BATCH = 1 << 20  # samples
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class FrequencyResponse:
     """An estimate from one input to one output.
 

@@ -19,7 +19,7 @@ averages over lines has 1 + 2 (4/9 + 1/36) = 35/18 of the variance that independ
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, lru_cache
 from typing import Any
 
@@ -31,6 +31,7 @@ from seaopt.frequency.response import FrequencyResponse
 from seaopt.frequency.sampled import sampled_response
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.records import record
 from seaopt.simulation import Clock, Model, make_model
 
 COHERENT = 0.8  # lines of less coherence are not fitted
@@ -40,7 +41,7 @@ STEPS = 20  # of the linear iteration
 DELAYS = 41  # tried when the delay is unknown, half a sample apart
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Uncertain:
     """A figure with its standard deviation."""
 
@@ -52,7 +53,7 @@ class Uncertain:
         return f"{self.value:.5g} ± {self.std:.2g} {self.unit}".rstrip(" -")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Drive:
     """What a second-order form says of a linear actuator with both links fixed and k known.
 
@@ -77,7 +78,7 @@ class Drive:
     K: Uncertain
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class SecondOrder:
     """K/(s^2 + a s + b) with a delay, fitted to a frequency response.
 

@@ -7,7 +7,7 @@ the source paper reads (16) where the plant says so: two poles, no zero, b = k/m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -21,6 +21,7 @@ from seaopt.frequency.second_order import COHERENT, LINES, Drive, SecondOrder, c
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.records import record
 from seaopt.simulation import Clock, linearised, make_model
 
 SHORTEST = 256  # samples
@@ -29,7 +30,7 @@ NEAR_PEAK = 0.89  # of the peak's height: 1 dB below it
 Response = Callable[[Any], Any]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Peak:
     """The largest response inside the good band; `magnitude` has the pair's unit."""
 
@@ -38,7 +39,7 @@ class Peak:
     std: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Pair:
     """From one input to one output.
 
@@ -91,7 +92,7 @@ class Pair:
         return float(np.sqrt(np.mean(np.abs(away) ** 2) / 2.0))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Survey:
     """The pairs of one log.
 

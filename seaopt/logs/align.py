@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.errors import LogError
+from seaopt.records import record
 
 TICK = 1e-9  # seconds within which two instants are one: an offset that is taken off leaves rounding behind
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Hold:
     """The last sample at or before each instant: commands, switches, and what a controller saw.
 
@@ -47,7 +46,7 @@ class Hold:
         return np.where(inside & (at - time[before] <= self.max_age_s), values[before], np.nan)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Linear:
     """The straight line between the samples on either side: quantities that are smooth between samples.
 
@@ -87,7 +86,7 @@ class Linear:
         return np.where(inside & ((step <= self.max_gap_s) | (weight == 0)), joined, np.nan)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Nearest:
     """The sample nearest in time, if it is within the tolerance: clocks that tick together with a little jitter.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,12 +22,13 @@ from seaopt.logs.faults import (
     stuck,
 )
 from seaopt.logs.spectra import Hum
+from seaopt.records import record
 from seaopt.signals import Signal
 
 MOVES = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class ChannelQuality:
     """What was found in one channel, in its SI unit; rows are counted from 0.
 

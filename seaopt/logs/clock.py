@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -10,11 +9,12 @@ from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
 from seaopt.logs.log import GAP
+from seaopt.records import record
 
 LOOKED_AT = 200_000  # steps that are enough to see the rounding of timestamps
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class ClockQuality:
     """What the timestamps say; rows are counted from 0.
 

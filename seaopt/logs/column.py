@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,13 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.align import Rule
+from seaopt.records import record
 from seaopt.units import factor, si_unit
 
 _BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Column:
     """A column of a file and the way from its numbers to SI: (value, wrapped, times scale, plus offset) in `unit`.
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import html
-from dataclasses import dataclass
 from pathlib import Path
 
 from seaopt.logs.formats import Field, open_source
+from seaopt.records import record
 
 SHOWN = 200
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Contents:
     """The columns of a file, without their data.
 

@@ -6,17 +6,16 @@ missing; the recorder's time column does not, because it counts rows. The first 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
+from seaopt.records import record
 
 PROBE = 1000  # samples that must look like a counter before all are looked at
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Counter:
     """A declared sample counter.
 

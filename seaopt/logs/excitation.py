@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from seaopt.logs.spectra import Spectra
+from seaopt.records import record
 
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
 REACHED = 0.1  # of the largest power in a band; what is weaker is the window's
 COHERENT = 0.5  # of an output with the input, power-weighted; below it most of the output is something else
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Band:
     """A third of an octave.
 
@@ -47,7 +47,7 @@ class Band:
     told: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Excitation:
     """The bands of one input."""
 

@@ -6,10 +6,12 @@ much of a load cell whose noise makes every sample differ from the last.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from seaopt.records import record
 
 LOOKED_AT = 50_000  # samples that are enough to see a quantisation step
 BLOCK = 64  # samples over which a channel's stillness is averaged
@@ -24,7 +26,7 @@ REGULAR = 0.8  # share of a counter's, or a held channel's, steps that must be a
 SCARCE = 16  # samples below which nothing is judged
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Runs:
     """Rows from `start` up to, and not including, `stop`, one pair a run."""
 
@@ -49,7 +51,7 @@ class Runs:
         return Runs(start=self.start[chosen], stop=self.stop[chosen])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Rail:
     """A flat top or bottom: samples piled up at an extreme value.
 
@@ -62,7 +64,7 @@ class Rail:
     clear: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Skips:
     """A channel that counts: each value held `held` samples, `lost` samples skipped ahead of each of `rows`."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from seaopt.logs.excitation import Excitation
 from seaopt.logs.faults import Runs
 from seaopt.logs.log import JITTER_LIMIT
 from seaopt.logs.pairs import Pair
+from seaopt.records import record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -23,7 +23,7 @@ COARSE, FINE = 32, 4096  # levels in a channel's range: below the one a warning,
 AGREED = 0.3  # correlation above which a lag is one
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Finding:
     """One thing that a log's user should know.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
+from seaopt.records import record
 from seaopt.signals import Signal
 from seaopt.units import factor, si_unit
 
@@ -27,7 +28,7 @@ GAP = 1.5  # periods between two samples that make a gap
 BLOCK = 100_000  # samples that are looked at in one go
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Log:
     """Channels on one clock.
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from seaopt.logs.spectra import Spectra
+from seaopt.records import record
 
 FINE = 8  # lags a sample: the correlation is interpolated in frequency, then by a parabola
 NEAR = 3  # samples of lag within which signs are compared
 FLIPPED = 0.3  # correlation beyond which a negative sign is a flip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Pair:
     """The cross-correlation of two channels.
 

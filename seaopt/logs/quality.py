@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -30,13 +30,14 @@ from seaopt.logs.log import Log
 from seaopt.logs.pairs import Pair, pair
 from seaopt.logs.spectra import Spectra, hum, spectra
 from seaopt.logs.table import Table
+from seaopt.records import record
 
 SCHEMA = "seaopt/quality/1"
 INPUTS = frozenset({"i", "fe1", "fe2", "u"})  # names of inputs, in any case
 INPUT_UNITS = frozenset({"A", "V"})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Quality:
     """What is wrong with a log's data, and what they can tell; ``print(quality)`` is a report.
 

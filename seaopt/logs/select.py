@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from seaopt.errors import LogError, SeaoptError, suggestion
@@ -13,13 +13,14 @@ from seaopt.logs.column import Column, bare_name
 from seaopt.logs.counter import Counter
 from seaopt.logs.formats import Field, Source
 from seaopt.logs.formats.layout import is_unit
+from seaopt.records import record
 from seaopt.units import factor, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 SHOWN = 20  # names in a message
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Clock:
     """A column of times: two are the same clock if all of this is the same."""
 
@@ -30,7 +31,7 @@ class Clock:
     offset_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Channel:
     """A channel before it is read."""
 
@@ -42,7 +43,7 @@ class Channel:
     rule: Rule | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Selection:
     """What is to be read."""
 

@@ -8,10 +8,11 @@ of at most 32,768 samples, spread over the log.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float
+
+from seaopt.records import record
 
 SHORTEST, LONGEST, FEWEST, MOST = 32, 1 << 15, 4, 64
 MAINS_HZ = (50.0, 60.0)
@@ -22,7 +23,7 @@ FAMILY = 3  # lines beside the mains' in the same channel that make a multisine
 BRIDGED = 0.02  # share of a stretch's samples that may be missing: they are bridged by lines
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Spectra:
     """Windowed spectra of every channel, one row a stretch, from 0 Hz on.
 
@@ -106,7 +107,7 @@ def _spectrum(cut: Float[np.ndarray, "d n"], window: Float[np.ndarray, " n"]) ->
     return np.fft.rfft((cut - cut.mean(axis=1, keepdims=True)) * window, axis=1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Hum:
     """Lines of the mains in one channel: each line's frequency and height over the noise floor, and their rms."""
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.records import record
 from seaopt.signals import Signal
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Table:
     """Channels of one clock, as read: time may repeat, run backwards or be missing.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,10 @@ from jaxtyping import Complex, Float
 from seaopt.parameters import ParameterSet
 from seaopt.plants.linear import state_space
 from seaopt.plants.plant import Plant
+from seaopt.records import record
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Resonance:
     """A pair of complex poles.
 
@@ -35,7 +35,7 @@ class Resonance:
     states: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Modes:
     """What a linearised plant is made of.
 

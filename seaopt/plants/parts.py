@@ -40,7 +40,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -49,6 +48,7 @@ import casadi as ca
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants.plant import Plant
+from seaopt.records import record
 
 Part = Literal[
     "stribeck", "backlash", "hardening", "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay",
@@ -151,7 +151,7 @@ def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
     return level * ca.tanh(speed / p.v_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class _Filter:
     """A linear filter z' = A z + b v, out = c z + d v, its entries expressions of the parameters."""
 

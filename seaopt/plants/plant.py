@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +18,7 @@ import casadi as ca
 
 from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
@@ -25,7 +26,7 @@ Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Plant:
     r"""States, inputs, outputs and parameters with units, and the equations that tie them.
 

@@ -39,7 +39,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -50,6 +50,7 @@ from seaopt.plants import parts as part_laws
 from seaopt.plants.parts import Part
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import ACTUATOR, GRAVITY, link_mass, pendulum
+from seaopt.records import record
 
 Drive = Literal["unlumped", "lumped"]
 Spring = Literal["link1", "link2"]
@@ -79,7 +80,7 @@ def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[A
     }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class _LinkModel:
     """One link: its coordinate (if it moves), position along x, energies and generalised force."""
 
@@ -113,7 +114,7 @@ def _link_model(kind: Link, index: int, suffix: str, x: Any, p: Any) -> _LinkMod
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class _Motion:
     """The accelerations and forces of the actuator, as expressions of state, input and parameters."""
 
@@ -123,7 +124,7 @@ class _Motion:
     energy: Any
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class _Build:
     """What kind of actuator is built: its links with the endings of their names, drive, spring and parts."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -41,10 +41,11 @@ from seaopt.problem.schema import (
     VirtualTable,
 )
 from seaopt.problem.validation import validated
+from seaopt.records import record
 from seaopt.robustness import placed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Problem:
     """What a problem file describes; logs are read, or made, when asked for.
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness import placed
-from seaopt.robustness.draws import SCREW_MASS, SCREW_MODE
+from seaopt.robustness.uncertainty.draws import SCREW_MASS, SCREW_MODE
 
 
 def range_remarks(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from seaopt.control.digital import DELAY
+from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from seaopt.frequency import Pair
+from seaopt.records import record
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ ROWS = (3.0, 2.0, 1.0)  # heights of magnitude, phase and coherence
 COLUMNS = 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Curve:
     """A model's response, a function of frequencies in Hz."""
 
@@ -31,7 +31,7 @@ class Curve:
     style: str = "-"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Panel:
     """One measured response and the models drawn over it, the one that tells the phase's branch first."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
-from seaopt.estimation.result import Derived
+from seaopt.estimation.result.fit_result import Derived
 from seaopt.frequency import Drive, Pair, Survey, Uncertain, survey
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.reporting.bode import Curve, Panel, bode_figure

@@ -14,7 +14,7 @@ import numpy as np
 from seaopt.control import Controller, Frontier
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
-from seaopt.estimation.forecasts import Percent
+from seaopt.estimation.advice.forecasts import Percent
 from seaopt.files import write_bytes, write_text
 from seaopt.frequency import Survey
 from seaopt.parameters import ParameterSet
@@ -24,9 +24,9 @@ from seaopt.reporting.figures import all_figures
 from seaopt.reporting.residuals import ranking_figure, residual_figure
 from seaopt.reporting.verification import verification_figures, verification_section
 from seaopt.robustness import Certificate
-from seaopt.robustness.environments import StabilityMap
-from seaopt.robustness.large_signal import LargeSignal
-from seaopt.robustness.verification import Verification
+from seaopt.robustness.verification.environments import StabilityMap
+from seaopt.robustness.verification.large_signal import LargeSignal
+from seaopt.robustness.verification.verification import Verification
 
 Result = Fit | Ranking | Controller | Certificate | Verification | StabilityMap | LargeSignal
 _CAPTIONS = {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seaopt.estimation import Diagnostics, Fit, Ranking
-from seaopt.estimation.correlation import CrossCorrelation
+from seaopt.estimation.problem.correlation import CrossCorrelation
 from seaopt.reporting.figures import MEASURED, PLANT_COLOURS, envelope, panels
 
 if TYPE_CHECKING:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seaopt.reporting.figures import MEASURED, MODEL, PLANT_COLOURS, panels
-from seaopt.robustness.environments import StabilityMap
-from seaopt.robustness.judgement import NOMINAL, Outcome, judged_window
-from seaopt.robustness.large_signal import LargeSignal
-from seaopt.robustness.playback import Trace
-from seaopt.robustness.simulated import Simulated
-from seaopt.robustness.verification import Verification
+from seaopt.robustness.certificate.simulated import Simulated
+from seaopt.robustness.verification.environments import StabilityMap
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judged_window
+from seaopt.robustness.verification.large_signal import LargeSignal
+from seaopt.robustness.verification.playback import Trace
+from seaopt.robustness.verification.verification import Verification
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

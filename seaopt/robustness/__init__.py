@@ -1,19 +1,19 @@
 """One controller, many plants: margins, worst case and Monte Carlo certificate."""
 
-from seaopt.robustness.batch import BatchFigures, batch_figures
-from seaopt.robustness.bracket import Bracket, Budget, bracket
-from seaopt.robustness.certificate import Certificate, MonteCarlo, Requirement
-from seaopt.robustness.certify import certify, failure_bound
-from seaopt.robustness.draws import Uncertainty, check_ranges, placed, uncertainty
-from seaopt.robustness.environments import StabilityMap, coupled_stability
-from seaopt.robustness.joint import JointTuning, Round, tune_certified
-from seaopt.robustness.judgement import Outcome
-from seaopt.robustness.large_signal import LargeSignal, large_signal
-from seaopt.robustness.nominal import PlantMargins, plant_margins
-from seaopt.robustness.scenarios import Phase, Scenario, default_scenarios
-from seaopt.robustness.simulated import Simulated, simulated
-from seaopt.robustness.verification import Verification, verify
-from seaopt.robustness.worst import Witness, Worst
+from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
+from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, Requirement
+from seaopt.robustness.certificate.certify import certify, failure_bound
+from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
+from seaopt.robustness.certificate.nominal import PlantMargins, plant_margins
+from seaopt.robustness.certificate.simulated import Simulated, simulated
+from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
+from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, placed, uncertainty
+from seaopt.robustness.uncertainty.worst import Witness, Worst
+from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
+from seaopt.robustness.verification.judgement import Outcome
+from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
+from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
+from seaopt.robustness.verification.verification import Verification, verify
 
 __all__ = [
     "BatchFigures", "Bracket", "Budget", "Certificate", "JointTuning", "LargeSignal", "MonteCarlo", "Outcome", "Phase",

@@ -8,20 +8,20 @@ the exponential of an augmented matrix (Van Loan, IEEE TAC 23(3), 1978): with :m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SimulationError
+from seaopt.records import record
 from seaopt.simulation.model import Model
 
 Hold = Literal["zero", "first"]
 REACH, DEGREE = 0.125, 10  # 0.125^11 / 11! = 3e-18
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Clock:
     """How samples become the input of a continuous plant.
 

@@ -12,11 +12,11 @@ the numbers that the step computes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
+from seaopt.records import record
 from seaopt.simulation.model import Model
 
 
@@ -51,7 +51,7 @@ def output_function(model: Model) -> Any:
     return model.functions["output"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Rates:
     """Right-hand side and outputs for compiled code, with what depends on parameters alone taken out.
 

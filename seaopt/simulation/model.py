@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -13,9 +13,10 @@ from jaxtyping import Float
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.records import record
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Model:
     """Expressions of one plant in its free parameters theta, for chosen outputs.
 

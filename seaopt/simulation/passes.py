@@ -6,20 +6,21 @@ O(1) memory, and without a compiler (`seaopt.simulation.interpreted`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from seaopt.errors import SimulationError
+from seaopt.records import record
 from seaopt.simulation.discretisation import Clock
 
 MAX_SECTIONS = 8  # as in pass.c
 RobustLoss = Literal["square", "huber", "soft_l1"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Weights:
     """What happens to a residual before it is summed, the same for every sample.
 
@@ -52,7 +53,7 @@ class Weights:
         return cls(sections=np.zeros((0, 5)), settle=0, knee=np.full(ny, np.inf))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Segment:
     """A gap-free stretch of a log: one array a channel, in the order of a model's inputs and outputs.
 
@@ -96,7 +97,7 @@ class Segment:
         return np.polynomial.legendre.legvander(tau, terms)[:, 1:]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Point:
     """Where passes are made: the unknowns of an experiment, but for its initial states.
 
@@ -132,7 +133,7 @@ class Point:
         return self.drift.shape[1]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Layout:
     """The columns of v = [residual, shared, initial state, own of the output], and of the state's derivatives.
 
@@ -162,7 +163,7 @@ class Layout:
         return 1 + self.shared + self.nx + (self.ny if self.corrected else 1) * self.own
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class Pass:
     """What passes over shots of one segment found; a shot starts from a state of its own.
 

@@ -9,9 +9,9 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import TransferFunction
-from seaopt.control.closed_loop import LoopState, SampledLoop, run_loop
-from seaopt.control.force_run import close_loop
-from seaopt.control.realisation import realise
+from seaopt.control.laws.realisation import realise
+from seaopt.control.running.closed_loop import LoopState, SampledLoop, run_loop
+from seaopt.control.running.force_run import close_loop
 from seaopt.errors import SimulationError
 from seaopt.simulation import compiler
 

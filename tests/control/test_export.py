@@ -15,8 +15,8 @@ from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.control import Gains, TransferFunction
-from seaopt.control.export import export
-from seaopt.control.realisation import runnable
+from seaopt.control.deploy.export import export
+from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.simulation.compiler import find_compiler

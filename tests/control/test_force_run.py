@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.control import close_loop
-from seaopt.control.closed_loop import SampledLoop, run_loop
+from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError, SimulationError
 from tests.control.test_closed_loop import delayed, law, swing_by_hand
 

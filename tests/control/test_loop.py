@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, current_per_force, sample
-from seaopt.control.response import bracketed
+from seaopt.control.loops.response import bracketed
 
 
 def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains):

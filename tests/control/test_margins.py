@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import DigitalPlant, Loop, TransferFunction, peaks
-from seaopt.control.margins import margins, nu_gap
+from seaopt.control.loops.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from tests.control.test_loop import loop_of
 
@@ -300,7 +300,7 @@ def test_a_nu_gap_across_the_winding_is_one():
 def test_a_delay_in_the_plant_is_pythons_exact_one(stand, thor):
     """A fraction of a sample: simulate the continuous plant at 100 times the rate with the late command."""
     from seaopt.control import current_per_force, sample
-    from seaopt.control.digital import conditions
+    from seaopt.control.loops.sampled_plant import conditions
 
     delay = conditions((stand,))["delay_s"]
     late = sample(
@@ -327,7 +327,7 @@ def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
     import casadi as ca
     from scipy.optimize import fsolve
 
-    from seaopt.control.digital import conditions, linearised
+    from seaopt.control.loops.sampled_plant import conditions, linearised
     from seaopt.parameters import Parameter
 
     f = ca.Function("f", [swing.x, swing.u, swing.p], [swing.dynamics])

@@ -14,8 +14,8 @@ from scipy.signal import lfilter
 
 import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, sample
-from seaopt.control.mpc_code import export_mpc
-from seaopt.control.prediction import interpolation, spread_knots
+from seaopt.control.mpc.export import export_mpc
+from seaopt.control.mpc.prediction import interpolation, spread_knots
 from seaopt.errors import ControlError
 
 TS = 1e-3

@@ -9,7 +9,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Controller, passivity
-from seaopt.control.tuner import disturbance
+from seaopt.control.tuning.tuner import disturbance
 from seaopt.errors import ControlError
 from seaopt.plants import high_impedance
 

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import Gains, TransferFunction, current_per_force
-from seaopt.control.passivity import passivity, passivity_rows
-from seaopt.control.port import held, port_of
+from seaopt.control.laws.passivity import passivity, passivity_rows
+from seaopt.control.loops.port import held, port_of
 from seaopt.errors import ControlError
 from seaopt.plants import high_impedance, moving_output, two_link
 

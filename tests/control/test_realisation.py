@@ -13,7 +13,7 @@ from scipy.signal import bilinear, cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.control import Gains, TransferFunction
-from seaopt.control.realisation import realise, runnable
+from seaopt.control.laws.realisation import realise, runnable
 from seaopt.errors import ControlError
 
 TS = 1e-3

@@ -52,7 +52,7 @@ def test_it_is_as_good_as_a_long_global_search(stand, thor):
     """scipy's differential evolution over the same four numbers, penalised, a hundred times the time."""
     from scipy.optimize import differential_evolution
 
-    from seaopt.control.tuner import disturbance, make_task
+    from seaopt.control.tuning.tuner import disturbance, make_task
 
     spec = so.ControllerSpec(structure="pd", bandwidth_hz=30, **{**LIMITS, "max_noise_gain": 25})
     task = make_task(stand, thor, spec, {})

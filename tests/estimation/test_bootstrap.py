@@ -10,7 +10,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.errors import EstimationError
 from seaopt.estimation import bootstrap
-from seaopt.estimation.bootstrap import block_length
+from seaopt.estimation.uncertainty.bootstrap import block_length
 
 FREE = ("J", "b_r", "eta")
 DRAWS = 400

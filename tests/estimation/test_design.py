@@ -11,7 +11,13 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Noise, excite
 from seaopt.errors import EstimationError
 from seaopt.estimation import Chirps, Limits, Multisines, design_experiment, expected_covariance
-from seaopt.estimation.spectrum import harmonics, low_peak_phases, optimal_powers, schroeder_phases, spectrum
+from seaopt.estimation.experiment_design.spectrum import (
+    harmonics,
+    low_peak_phases,
+    optimal_powers,
+    schroeder_phases,
+    spectrum,
+)
 from seaopt.simulation import Clock, make_model
 
 NOISE = {"F1": 2.0, "F2": 2.0}

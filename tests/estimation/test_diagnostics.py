@@ -13,7 +13,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING
 from seaopt.errors import EstimationError
 from seaopt.estimation import diagnose
-from seaopt.estimation.correlation import autocorrelation, cross_correlation
+from seaopt.estimation.problem.correlation import autocorrelation, cross_correlation
 from seaopt.files import to_json
 
 FREE = ("J", "b_r", "eta")

@@ -14,10 +14,10 @@ from scipy.optimize import least_squares
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
-from seaopt.estimation.fit import _complete, _problem, check_choices
-from seaopt.estimation.losses import Linear
-from seaopt.estimation.observer import kalman_gain
-from seaopt.estimation.unknowns import collect
+from seaopt.estimation.problem.losses import Linear
+from seaopt.estimation.problem.observer import kalman_gain
+from seaopt.estimation.problem.unknowns import collect
+from seaopt.estimation.result.fit import _complete, _problem, check_choices
 
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 METHODS = {
@@ -277,15 +277,15 @@ def test_what_is_linear_is_eliminated_exactly(stand, thor):
 
 def test_the_step_error_is_that_of_the_parameters(swing, thor):
     """A crude step biases J; the stated error is the bias, found by a fit with a fine one."""
-    from seaopt.estimation.solve import settle
-    from seaopt.estimation.steps import step_error
+    from seaopt.estimation.solver.solve import settle
+    from seaopt.estimation.solver.step_size import step_error
 
     truth = thor.update(f_c=40.0, v_s=1e-3, d=0.1)
     bench = experiment(swing, noisy(swing, truth), offset=False, initial_state="rest", sigma={"F1": 2.0, "F2": 2.0})
     free = truth.free("J", "f_c")
     unknowns = collect((bench,), _complete((bench,), free))
     problem = _problem((bench,), unknowns, Linear(), None, 0.0)
-    from seaopt.estimation.least_squares import minimise
+    from seaopt.estimation.solver.least_squares import minimise
 
     def minimum(substeps):
         fixed = replace(problem, substeps=(substeps,))

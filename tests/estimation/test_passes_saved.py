@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import least_squares
 
 import seaopt as so
-from seaopt.estimation.correlation import LaggedSums
-from seaopt.estimation.least_squares import minimise
-from seaopt.estimation.residuals import Evaluation
+from seaopt.estimation.problem.correlation import LaggedSums
+from seaopt.estimation.problem.residuals import Evaluation
+from seaopt.estimation.solver.least_squares import minimise
 from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, make_model, run_passes
 from seaopt.simulation.compiled import PARALLEL, Program
 from seaopt.simulation.compiler import find_compiler

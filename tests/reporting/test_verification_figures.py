@@ -10,10 +10,10 @@ import pytest
 import seaopt as so
 from seaopt.errors import SeaoptError
 from seaopt.reporting.verification import verification_figure
-from seaopt.robustness.environments import coupled_stability
-from seaopt.robustness.large_signal import large_signal
-from seaopt.robustness.scenarios import Phase, Scenario
-from seaopt.robustness.verification import verify
+from seaopt.robustness.verification.environments import coupled_stability
+from seaopt.robustness.verification.large_signal import large_signal
+from seaopt.robustness.verification.scenarios import Phase, Scenario
+from seaopt.robustness.verification.verification import verify
 
 
 def test_the_page_names_what_failed_and_shows_every_figure(stand, swing, thor, tmp_path):

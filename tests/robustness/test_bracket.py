@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import chi2
 
 import seaopt as so
-from seaopt.control.law import TransferFunction
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
 from seaopt.robustness import Bracket, Budget, Uncertainty, batch_figures, bracket, uncertainty
-from seaopt.robustness.draws import LEVEL
-from seaopt.robustness.region import region
-from seaopt.robustness.worst import find_worst
+from seaopt.robustness.bounds.region import region
+from seaopt.robustness.uncertainty.draws import LEVEL
+from seaopt.robustness.uncertainty.worst import find_worst
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
 
@@ -215,7 +215,7 @@ def test_the_certificate_states_and_keeps_the_bounds(controller, swing, thor, tm
 
 def test_a_worse_plant_met_on_the_way_is_the_worst_case(controller, swing, thor):
     unknown = of(swing, thor, {"I_p": (0.1, 0.6)})
-    from seaopt.robustness.worst import witnessed
+    from seaopt.robustness.uncertainty.worst import witnessed
 
     mild = witnessed(controller, swing, thor, {"I_p": 0.36})
     found = bracket(controller, swing, unknown, mild)

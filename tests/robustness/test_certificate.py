@@ -15,8 +15,8 @@ from seaopt.control import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
-from seaopt.robustness.certify import _digest
-from seaopt.robustness.draws import Uncertainty, check_ranges
+from seaopt.robustness.certificate.certify import _digest
+from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges
 
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25

@@ -11,14 +11,14 @@ from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.control import Gains
-from seaopt.control.equilibrium import equilibrium
-from seaopt.control.port import port_of
-from seaopt.control.realisation import runnable
+from seaopt.control.laws.realisation import runnable
+from seaopt.control.loops.port import port_of
+from seaopt.control.running.equilibrium import equilibrium
 from seaopt.errors import ControlError
 from seaopt.robustness import batch_figures
-from seaopt.robustness.playback import Stage, play
-from seaopt.robustness.scenarios import Phase, Scenario, default_scenarios
-from seaopt.robustness.verification import verify
+from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
+from seaopt.robustness.verification.verification import verify
 from tests.control.test_closed_loop import swing_by_hand
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)

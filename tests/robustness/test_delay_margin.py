@@ -13,7 +13,7 @@ from seaopt.control import TransferFunction
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.robustness import plant_margins
-from seaopt.robustness.delay_margin import sampled_delay_margin
+from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 
 TS = 1e-3
 

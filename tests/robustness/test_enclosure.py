@@ -11,10 +11,10 @@ import seaopt as so
 from seaopt.errors import ControlError
 from seaopt.plants import jacobians, state_space
 from seaopt.robustness import uncertainty
-from seaopt.robustness.enclosure import enclosed
-from seaopt.robustness.pulse import pulse
-from seaopt.robustness.region import Boxes, region
-from seaopt.robustness.taylor import basis, constant, linear
+from seaopt.robustness.bounds.enclosure import enclosed
+from seaopt.robustness.bounds.impulse import pulse
+from seaopt.robustness.bounds.region import Boxes, region
+from seaopt.robustness.bounds.taylor import basis, constant, linear
 
 OVER = basis(2, 3)
 E = np.random.default_rng(0).uniform(-1.0, 1.0, (4000, 2))

@@ -9,9 +9,9 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control.passivity import passivity
+from seaopt.control.laws.passivity import passivity
 from seaopt.errors import ControlError
-from seaopt.robustness.environments import against_environment, coupled_stability, environment
+from seaopt.robustness.verification.environments import against_environment, coupled_stability, environment
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,12 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Gains, TransferFunction
-from seaopt.control.realisation import runnable
+from seaopt.control.laws.realisation import runnable
 from seaopt.errors import SimulationError
-from seaopt.robustness.linear import linear_view
-from seaopt.robustness.playback import Stage, play
-from seaopt.robustness.scenarios import Phase, Scenario, default_scenarios
-from seaopt.robustness.verification import verify
+from seaopt.robustness.verification.linear import linear_view
+from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
+from seaopt.robustness.verification.verification import verify
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 

@@ -9,9 +9,9 @@ import pytest
 
 import seaopt as so
 from seaopt.parameters import ParameterSet
-from seaopt.robustness.draws import uncertainty
-from seaopt.robustness.severity import UNSTABLE, severity_slopes
-from seaopt.robustness.worst import witnessed
+from seaopt.robustness.uncertainty.draws import uncertainty
+from seaopt.robustness.uncertainty.severity import UNSTABLE, severity_slopes
+from seaopt.robustness.uncertainty.worst import witnessed
 
 STEP = 1e-4
 RANGES = {"L_a": (0.065, 0.08), "phi": (0.1, 0.6), "delay_s": (2e-4, 8e-4), "eta": (0.85, 1.1)}

@@ -131,7 +131,7 @@ def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkey
     def broken(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    module = sys.modules["seaopt.robustness.simulated"]  # the package's name of it is the function
+    module = sys.modules["seaopt.robustness.certificate.simulated"]  # the package's name of it is the function
     monkeypatch.setattr(module, "passivity", broken)
     monkeypatch.setattr(module, "large_signal", broken)
     monkeypatch.setattr(module, "verify", lambda *_, **__: None)

@@ -12,13 +12,13 @@ import pytest
 import seaopt as so
 from seaopt.bench import Chirp
 from seaopt.control import Gains
-from seaopt.control.realisation import runnable
+from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError
-from seaopt.robustness.large_signal import large_signal
-from seaopt.robustness.oscillation import oscillation
-from seaopt.robustness.playback import Stage, play
-from seaopt.robustness.scenarios import Phase, Scenario, default_scenarios, step_limit
-from seaopt.robustness.verification import verify
+from seaopt.robustness.verification.large_signal import large_signal
+from seaopt.robustness.verification.oscillation import oscillation
+from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, step_limit
+from seaopt.robustness.verification.verification import verify
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 CELL = so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})

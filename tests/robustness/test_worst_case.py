@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 
 import seaopt as so
 from seaopt.control import Loop
-from seaopt.control.margins import margins, nu_gap
+from seaopt.control.loops.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch, batch_figures, plant_margins

@@ -10,11 +10,11 @@ import codecs
 import csv
 import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 from seaopt.errors import LogError, SeaoptError
 from seaopt.logs.column import header_unit
+from seaopt.records import record
 from seaopt.units import si_unit
 
 MAX_LINE = 1 << 20
@@ -28,7 +28,7 @@ _DELIMITERS = ("\t", ";", "|", ",", " ")
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Layout:
     """How a text file is laid out.
 

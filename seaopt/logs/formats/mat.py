@@ -11,7 +11,6 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from jaxtyping import Shaped
 from seaopt.errors import LogError
 from seaopt.logs.formats.simulink import OBJECT, clocked, opaque
 from seaopt.logs.formats.source import MAX_FIELDS, Field, Place, Source, by_rows, check_size, spread
+from seaopt.records import record
 
 HEADER = 128
 PEEK = 1 << 16  # bytes that hold a variable's header
@@ -35,7 +35,7 @@ STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"
 COMPLEX, LOGICAL = 0x08, 0x02
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Variable:
     """A top-level element: where its matrix lies, and how long it is unpacked."""
 
@@ -46,7 +46,7 @@ class Variable:
     order: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Matrix:
     """The header of a matrix; `data` is where what follows it begins."""
 

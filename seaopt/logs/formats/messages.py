@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
+
+from seaopt.records import record
 
 MAX_ELEMENTS = 256
 DEPTH = 32
@@ -23,7 +24,7 @@ NUMBERS = {
 TIMES = {"builtin_interfaces/msg/Time": "Ii", "builtin_interfaces/msg/Duration": "ii"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Number:
     """A number of fixed size."""
 
@@ -32,17 +33,17 @@ class Number:
     size: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Stamp:
     """Seconds and nanoseconds, decoded as whole nanoseconds."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Text:
     """A string."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Many:
     """An array; `count` is None where each message says its own."""
 
@@ -50,7 +51,7 @@ class Many:
     count: int | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Struct:
     """Named parts, in order."""
 
@@ -87,7 +88,7 @@ def _node(found: Any, types: Mapping[str, Any], depth: int) -> Node:
     return Many(child=_node(detail[0], types, depth), count=detail[1] if kind == 3 else None)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Wire:
     """How a message lies in its bytes."""
 

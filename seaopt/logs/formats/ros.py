@@ -10,7 +10,6 @@ import bz2
 import json
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -23,13 +22,14 @@ from seaopt.errors import LogError
 from seaopt.logs.formats.json import flat, kind
 from seaopt.logs.formats.messages import Node, leaves, tree, values, wanted_tree
 from seaopt.logs.formats.source import Field, Source, Window, one_line, optional
+from seaopt.records import record
 
 MAX_CHUNK = 1 << 30
 UNIX = 1_000_000_000 * 1_000_000_000  # stamps after 2001 count from 1970; earlier ones are a simulation's
 ENCODINGS = ("cdr", "ros1", "json")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Topic:
     """One stream of messages."""
 
@@ -41,7 +41,7 @@ class Topic:
     syntax: str  # "msg", "idl", or "" where the recording has no definition
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Bag:
     """An open recording: `messages` gives time in ns and bytes, of one topic, from start to stop (ns)."""
 

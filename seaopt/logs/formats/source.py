@@ -7,7 +7,6 @@ import re
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, SeaoptError
+from seaopt.records import record
 
 # What one file may unfold to in memory: archives are checked before they are unpacked.
 MAX_UNPACKED = 8 << 30
@@ -24,7 +24,7 @@ MAX_FIELDS = 100_000
 MAX_PARTS = 256  # columns of one matrix, or elements of one array, that get a name each
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Field:
     """One column of a file.
 
@@ -58,7 +58,7 @@ class Field:
         return _NUMBERS.fullmatch(self.kind) is not None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Window:
     """Samples of which the clock lies between start and stop, both in the clock's own unit."""
 
@@ -67,7 +67,7 @@ class Window:
     stop: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Source:
     """A file that has been opened and listed.
 
@@ -125,7 +125,7 @@ def rows_of(clock: Float[np.ndarray, " n"], window: Window) -> slice:
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Place:
     """Where a field's samples are: an array, and one row or column of it (all of it where `index` is None)."""
 

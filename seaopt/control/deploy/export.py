@@ -1,0 +1,248 @@
+"""A controller for the target: C99 that needs no library, its gains as a C header, and a MATLAB script.
+
+The C code is `RunnableLaw.step` with the numbers filled in: one struct, `init`, `reset` and `step`; no allocation, no
+include but its own header, nothing global that changes. In double it gives the same currents as `RunnableLaw` to
+rounding. In float the integral stops where an increment is less than half a unit in its last place, at an error of
+about 6e-8 abs(x)/(k_i T_s) (x: the integral's part of the force): take double where k_i is small.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.realisation import RunnableLaw, realise
+from seaopt.control.laws.stored import stored
+from seaopt.errors import ControlError, FileError
+from seaopt.files import write_text
+
+Precision = Literal["double", "float"]
+LARGEST = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
+TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja", "{}_gains.h": "gains.h.jinja", "{}_gains.m": "gains.m.jinja"}
+LONGEST_NAME = 25  # C99 promises 31 characters of an external name, and ours end in _reset
+RESERVED = (
+    # Keywords of C99 (ISO/IEC 9899:1999, 6.4.1), C11, C23 and C++ that could begin a file; headers of C23 (7.1.2).
+    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
+    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while bool true "
+    "false nullptr constexpr typeof alignas alignof thread_local static_assert asm class delete export friend mutable "
+    "namespace new operator private protected public template this throw try catch typename using virtual wchar_t main "
+    "assert complex ctype errno fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic "
+    "stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
+)
+UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N"}
+FIGURES = {
+    "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g} N/N",
+    "gain_margin_db": "gain margin {:.4g} dB", "phase_margin_deg": "phase margin {:.4g} deg",
+}  # fmt: skip
+
+
+def export(
+    controller: Controller | Mapping[str, Any],
+    folder: Path | str,
+    *,
+    precision: Precision = "double",
+    name: str = "force_law",
+    current_limit_A: float | None = None,
+    tracking_time_s: float | None = None,
+    allow_infeasible: bool = False,
+) -> tuple[Path, ...]:
+    """Write a controller as C99, with its gains as a C header and as a MATLAB script.
+
+    Parameters
+    ----------
+    controller : Controller or mapping
+        The controller, or the content of its controller.json.
+    folder : path
+        Where NAME.h, NAME.c, NAME_gains.h and NAME_gains.m go; made if it is not there.
+    precision : {"double", "float"}
+        Of the C code.
+    name : str
+        Begins every name in C; characters that C does not take become underscores.
+    current_limit_A, tracking_time_s : float, optional
+        As in `seaopt.control.laws.realisation.runnable`.
+    allow_infeasible : bool
+        Write a controller that misses its limits too; the files say so.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    ControlError
+        The controller is not feasible or not stable on its design plant, or an argument is out of range.
+    FileError
+        The content is malformed, its gains do not give its coefficients, or the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+    >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
+    >>> [path.name for path in export(controller, tempfile.mkdtemp(), name="knee")]
+    ['knee.h', 'knee.c', 'knee_gains.h', 'knee_gains.m']
+
+    """
+    if precision not in LARGEST:
+        raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
+    prefix = _identifier(name)
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise FileError(f"{folder}: is a file; give a folder")
+    if isinstance(controller, Controller):
+        given = {field.name: getattr(controller, field.name) for field in fields(Controller)}
+        figures = _figures(controller)
+    else:
+        given, figures = stored(controller), _stated(controller)
+    if not given["feasible"] and not allow_infeasible:
+        missed = ", ".join(given["active_constraints"])
+        raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
+    law = _law(given, current_limit_A, tracking_time_s)
+    told = _told(given, law) | {"achieved": figures, "precision": precision, "name": prefix, "NAME": prefix.upper()}
+    numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
+    texts = {
+        pattern.format(prefix): _rendered(template, told | _numbers(given, law, numbers[pattern[-2:]], precision))
+        for pattern, template in TEMPLATES.items()
+    }
+    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+
+
+def _identifier(name: str) -> str:
+    """Return a name that C takes."""
+    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+    if not found or found[0].isdigit() or len(found) > LONGEST_NAME:
+        raise ControlError(
+            f'name = "{name}" cannot begin a name in C; give a letter and up to {LONGEST_NAME - 1} letters or digits'
+        )
+    if found.lower() in RESERVED.split():
+        raise ControlError(f'name = "{name}" is a keyword or a header of C; give another, such as {found}_law')
+    return found
+
+
+def _figures(controller: Controller) -> list[str]:
+    """Return what a controller achieves, computed again where its design plant is known."""
+    if controller.design is None:
+        return _shown("As stated by the controller, not computed again", asdict(controller.achieved))
+    found = controller.close(*controller.design).figures()
+    if not found.stable:
+        raise ControlError("the controller's law is not stable on its design plant; tune one that is")
+    return _shown("Achieved on the design plant", asdict(found))
+
+
+def _stated(content: Mapping[str, Any]) -> list[str]:
+    """Return what a controller.json, which does not hold the design plant, says of it."""
+    achieved = content.get("achieved")
+    if not isinstance(achieved, Mapping):
+        raise FileError("controller.json: achieved is missing or not a table; tune again")
+    for name, value in achieved.items():
+        if name in FIGURES and value is not None and (isinstance(value, bool) or not isinstance(value, (int, float))):
+            raise FileError(f"controller.json: achieved.{name} is {value!r}, not a number; tune again")
+    return _shown("As stated by controller.json, not computed again", achieved)
+
+
+def _shown(whence: str, achieved: Mapping[str, Any]) -> list[str]:
+    """Return the lines that the header has on figures."""
+    shown = [text.format(achieved[key]) for key, text in FIGURES.items() if achieved.get(key) is not None]
+    if len(shown) == len(FIGURES):
+        return [f"{whence}: {', '.join(shown[:3])},", f"{', '.join(shown[3:])}."]
+    return [f"{whence}: {', '.join(shown) or 'nothing that was measured'}."]
+
+
+def _law(given: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
+    return realise(
+        given["reference"],
+        given["measurement"],
+        sample_time_s=given["sample_time_s"],
+        current_per_force_A_per_N=given["current_per_force_A_per_N"],
+        current_limit_A=given["spec"].current_limit_A if current_limit_A is None else current_limit_A,
+        tracking_time_s=tracking_time_s,
+    )
+
+
+def _told(given: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
+    """Return what the files say in words."""
+    return {
+        "structure": _said(given["structure"]),
+        "measured": _said(given["spec"].measured),
+        "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
+        "delay_samples": given["delay_samples"],
+        "feasible": given["feasible"],
+        "blocking": _said(", ".join(given["active_constraints"])),
+        "limited": math.isfinite(law.current_limit_A),
+        "order": law.c.size,
+        "storage": max(law.c.size, 1),
+        "integrators": law.integrators,
+    }
+
+
+def _said(text: str) -> str:
+    """Return text without what would end a comment."""
+    return re.sub(r"[^\w .,:;+()<>=-]", "", str(text), flags=re.ASCII)
+
+
+def _literal(precision: Precision) -> Callable[[float], str]:
+    """Return what writes a number as a C literal that reads back as itself (in float: as the nearest float)."""
+    if precision == "double":
+        return lambda value: repr(float(value))
+
+    def single(value: float) -> str:
+        text = repr(float(str(np.float32(value))))
+        return f"{text}f"
+
+    return single
+
+
+def _numbers(
+    given: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
+) -> dict[str, Any]:
+    """Return the numbers as text; a law without states is given one that stays zero."""
+
+    def row(values: Iterable[float]) -> str:
+        return ", ".join(number(float(value)) for value in values) or number(0.0)
+
+    rest = law.rest()
+    largest = float(LARGEST[precision])
+    return {
+        "a": [row(values) for values in law.a] or [number(0.0)],
+        "b_reference": row(law.b_reference),
+        "b_measurement": row(law.b_measurement),
+        "c": row(law.c),
+        "d_reference": number(law.d_reference),
+        "d_measurement": number(law.d_measurement),
+        "anti_windup": row(law.anti_windup),
+        "rest_reference": row(rest[0]),
+        "rest_measurement": row(rest[1]),
+        "force_limit_N": number(min(law.force_limit_N, largest)),
+        "current_limit_A": number(min(law.current_limit_A, largest)),
+        "current_per_force": number(law.current_per_force_A_per_N),
+        "sample_time_s": number(law.sample_time_s),
+        "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
+        "gains": [
+            {"name": _identifier(key), "value": number(float(value)), "unit": UNITS.get(key, "")}
+            for key, value in given["gains"].items()
+        ],
+        "transfer_functions": [
+            {"name": key, "num": row(given[key].num), "den": row(given[key].den)}
+            for key in ("reference", "measurement")
+        ],
+    }
+
+
+def _rendered(template: str, told: Mapping[str, Any]) -> str:
+    from jinja2 import Environment, StrictUndefined, select_autoescape
+
+    environment = Environment(
+        autoescape=select_autoescape(default=False), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )  # fmt: skip
+    text = files("seaopt.control.deploy").joinpath("templates", template).read_text(encoding="utf-8")
+    return environment.from_string(text).render(told)

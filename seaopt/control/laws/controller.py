@@ -1,0 +1,298 @@
+"""A tuned controller: the law, what was asked, and what it achieves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.stored import stored
+from seaopt.control.laws.structures import Observer
+from seaopt.control.loops.loop import Loop, LoopFigures
+from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.estimation import resting_on
+from seaopt.markup import figure, items, paragraph, table
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+
+SCHEMA = "seaopt/controller/1"
+UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
+CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
+NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
+UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
+_NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
+
+
+@record(eq=False)
+class Controller:
+    """F_m = C_r F_ref - C_y F_meas, commanded as the current I = current_per_force_A_per_N F_m.
+
+    Parameters
+    ----------
+    structure : str
+        "pd", "pid" or "pid_dob".
+    gains : mapping
+        For reading; the law is `reference` and `measurement`.
+    sample_time_s : float
+        Seconds.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    reference, measurement : TransferFunction
+        C_r and C_y.
+    current_per_force_A_per_N : float
+        Of the design plant.
+    spec : ControllerSpec
+        What was asked.
+    achieved : LoopFigures
+        Of the design plant.
+    feasible : bool
+        Whether every limit is met, as measured.
+    active_constraints : tuple of str
+        The limits that are broken; if none is, those met with nothing to spare.
+    robust_to : tuple of str
+        The plants, besides the design plant, that Ms and Mt were kept on.
+    design : (Plant, ParameterSet) or None
+        The design plant and its parameters.
+    observer : Observer or None
+        The disturbance observer of a pid_dob, which is in the law already.
+    blocked_by : tuple of str
+        The limits that are broken, each with its figure.
+    largest_bandwidth_hz : float or None
+        Where it is not feasible: the largest bandwidth in the specification's range that keeps the limits, 0 if none
+        was found; None where none was looked for.
+
+    """
+
+    structure: str
+    gains: Mapping[str, float]
+    sample_time_s: float
+    delay_samples: int
+    reference: TransferFunction
+    measurement: TransferFunction
+    current_per_force_A_per_N: float
+    spec: ControllerSpec
+    achieved: LoopFigures
+    feasible: bool
+    active_constraints: tuple[str, ...]
+    robust_to: tuple[str, ...] = ()
+    design: tuple[Plant, ParameterSet] | None = None
+    observer: Observer | None = None
+    blocked_by: tuple[str, ...] = ()
+    largest_bandwidth_hz: float | None = None
+
+    @property
+    def explanation(self) -> str:
+        """One line: what blocks, and what bandwidth can be had; empty where every limit is met."""
+        if self.feasible:
+            return ""
+        blocked = " and ".join(self.blocked_by or self.active_constraints)
+        asked, low = self.spec.bandwidth_hz, self.spec.bandwidth_range_hz[0]
+        if self.largest_bandwidth_hz is None:
+            return f"{asked:g} Hz is blocked by {blocked}"
+        if self.largest_bandwidth_hz == 0.0:
+            remedy = f"no bandwidth from {low:g} Hz up was found that keeps these limits"
+        else:
+            remedy = f"with these limits {self.largest_bandwidth_hz:.4g} Hz is possible"
+        return f"{asked:g} Hz is blocked by {blocked}; {remedy}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know besides the limits, one sentence each."""
+        if self.design is None:
+            return ()
+        plant, values = self.design
+        # What the plants of robust_to need is in the same set.
+        return (*resting_on(values, None if self.robust_to else plant.parameters), *self._noise_notes())
+
+    def _noise_notes(self) -> tuple[str, ...]:
+        """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
+        k_d, T_f = self.gains["k_d"], self.gains["T_f"]
+        if self.spec.max_noise_gain is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
+            return ()
+        return (
+            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 N of noise on "
+            f"{self.spec.measured} makes up to {self.achieved.noise_gain:.3g} N of motor force; give max_noise_gain",
+        )
+
+    @property
+    def engineering(self) -> dict[str, float]:
+        """The gains in the units that a drive is set in: A per N of force error, its integral and its rate."""
+        scale = self.current_per_force_A_per_N
+        names = {"k_p": "k_p_A_per_N", "k_i": "k_i_A_per_Ns", "k_d": "k_d_As_per_N", "k_ff": "k_ff_A_per_N"}
+        return {names[name]: scale * value for name, value in self.gains.items() if name in names}
+
+    def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
+        """Return a plant as this controller sees it: from motor force, through its own current per force."""
+        return sample(
+            plant,
+            params,
+            self.spec.measured,
+            self.current_per_force_A_per_N,
+            self.sample_time_s,
+            self.delay_samples,
+        )
+
+    def close(self, plant: Plant, params: ParameterSet) -> Loop:
+        """Return the loop of this controller around a plant."""
+        return Loop(plant=self.plant(plant, params), reference=self.reference, measurement=self.measurement)
+
+    def force_limit(self, frequency_hz: float) -> float | None:
+        """Return the largest amplitude of F_ref (N) at a frequency that `current_limit_A` allows on the design plant.
+
+        The motor force per reference is |T_r/P|, the plant's property whatever the controller; None without a limit.
+        """
+        if self.spec.current_limit_A is None or self.design is None:
+            return None
+        loop = self.close(*self.design)
+        f = np.array([float(frequency_hz)])
+        force = np.abs(loop.reference.response(f, self.sample_time_s) * loop.sensitivity(f))[0]
+        return float(self.spec.current_limit_A / self.current_per_force_A_per_N / force)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of controller.json (schema seaopt/controller/1)."""
+        achieved = {field.name: getattr(self.achieved, field.name) for field in fields(LoopFigures)}
+        return {
+            "schema": SCHEMA,
+            "structure": self.structure,
+            "gains": dict(self.gains),
+            "sample_time_s": self.sample_time_s,
+            "delay_samples": self.delay_samples,
+            "reference": {"num": self.reference.num, "den": self.reference.den},
+            "measurement": {"num": self.measurement.num, "den": self.measurement.den},
+            "current_per_force_A_per_N": self.current_per_force_A_per_N,
+            "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
+            "achieved": {name: value for name, value in achieved.items() if name not in _NOT_ACHIEVED},
+            "feasible": self.feasible,
+            "active_constraints": list(self.active_constraints),
+            "engineering": self.engineering,
+            "observer": self._observer_dict(),
+            "blocked_by": list(self.blocked_by),
+            "largest_bandwidth_hz": self.largest_bandwidth_hz,
+            "notes": list(self.notes),
+        }
+
+    def _observer_dict(self) -> dict[str, Any] | None:
+        """Return the observer's filters, and what it takes to build it again."""
+        if self.observer is None:
+            return None
+        q, inverse = self.observer.filters(self.sample_time_s)
+        nominal = self.observer.nominal
+        return {
+            "T_q": self.observer.T_q,
+            "bandwidth_hz": self.observer.bandwidth_hz,
+            "Q": {"num": q.num, "den": q.den},
+            "Q_over_P_n": {"num": inverse.num, "den": inverse.den},
+            "kept": nominal.kept,
+            "inverse": {"num": nominal.inverse.num, "den": nominal.inverse.den},
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet) -> Controller:
+        """Return the controller of a controller.json; what it achieves is computed again on the design plant.
+
+        Raises
+        ------
+        FileError
+            A field is missing or malformed, or gains and coefficients differ.
+
+        """
+        given = stored(content)
+        law = {name: given[name] for name in ("reference", "measurement")}
+        ts, gain = given["sample_time_s"], given["current_per_force_A_per_N"]
+        sampled = sample(plant, params, given["spec"].measured, gain, ts, given["delay_samples"])
+        return cls(**given, achieved=Loop(plant=sampled, **law).figures(), design=(plant, params))
+
+    def __repr__(self) -> str:
+        a, s = self.achieved, self.spec
+        verdict = "every limit met" if self.feasible else "NOT FEASIBLE: " + ", ".join(self.active_constraints)
+        band = (
+            "none" if a.tracking_band_hz is None else f"{a.tracking_band_hz[0]:.3g} to {a.tracking_band_hz[1]:.4g} Hz"
+        )
+        return "\n".join(
+            [
+                f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
+                f"delay of {self.delay_samples} sample{'' if self.delay_samples == 1 else 's'}: {verdict}",
+                *self._gain_lines(),
+                f"  bandwidth {_shown(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
+                f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
+                f"  gain margin {_shown(a.gain_margin_db)} dB, phase margin {_shown(a.phase_margin_deg)} deg, "
+                f"delay margin {_shown(None if a.delay_margin_s is None else 1e3 * a.delay_margin_s)} ms",
+                *self._force_lines(),
+                f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
+                if self.feasible
+                else f"  {self.explanation}",
+                *(f"  note: {note}" for note in self.notes),
+            ]
+        ).rstrip()
+
+    def _gain_lines(self) -> list[str]:
+        law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
+        lines = [
+            "  " + ", ".join(f"{name} = {value:.5g} {UNITS[name]}" for name, value in law.items()),
+            "  as current: " + ", ".join(
+                f"{name.split('_A')[0]} = {value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
+            ),
+        ]  # fmt: skip
+        if self.observer is not None:
+            lines.append(f"  disturbance observer: Q is 3 dB down at {self.observer.bandwidth_hz:.4g} Hz")
+        if "notch_depth" in self.gains:
+            f, width, depth = (self.gains[f"notch_{name}"] for name in ("frequency_hz", "width", "depth"))
+            use = "" if depth < NO_NOTCH else ": of no use, tune without it"
+            lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}")
+        return lines
+
+    def _force_lines(self) -> list[str]:
+        slow, fast = self.force_limit(0.01), self.force_limit(self.spec.bandwidth_hz)
+        if slow is None or fast is None:
+            return []
+        limit, band = self.spec.current_limit_A, self.spec.bandwidth_hz
+        return [f"  {limit:g} A allow a reference of {slow:.4g} N at rest and {fast:.4g} N at {band:g} Hz"]
+
+    def _repr_html_(self) -> str:
+        head, *_ = repr(self).splitlines()
+        current = {
+            name.split("_A")[0]: f"{value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
+        }
+        gains = [
+            (name, f"{value:.5g} {UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
+            for name, value in self.gains.items()
+        ]
+        told = [] if self.feasible else [self.explanation]
+        return (
+            paragraph(head) + table(("gain", "", "as current"), gains)
+            + table(("on the design plant", "achieved", "asked"), self._achieved_rows())
+            + items([*told, *(line.strip() for line in self._force_lines())])
+        )  # fmt: skip
+
+    def _achieved_rows(self) -> list[tuple[str, str, str]]:
+        a, s = self.achieved, self.spec
+        band, delay = a.tracking_band_hz, a.delay_margin_s
+        return [
+            ("bandwidth", figure(a.bandwidth_hz, "Hz"), f"{s.bandwidth_hz:g} Hz"),
+            ("tracking band", "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", ""),
+            (
+                "sensitivity bandwidth", figure(a.sensitivity_bandwidth_hz, "Hz"),
+                f"at least {s.sensitivity_bandwidth_limit_hz:g} Hz",
+            ),
+            ("Ms", figure(a.ms), _limited("at most", s.max_sensitivity)),
+            ("Mt", figure(a.mt), _limited("at most", s.max_complementary)),
+            ("reference peak", figure(a.reference_peak), _limited("at most", s.max_reference_peak)),
+            ("noise gain", figure(a.noise_gain, "N/N"), _limited("at most", s.max_noise_gain)),
+            ("disk margin", figure(a.disk_margin), _limited("at least", s.min_disk_margin)),
+            ("gain margin", figure(a.gain_margin_db, "dB"), ""),
+            ("phase margin", figure(a.phase_margin_deg, "deg"), ""),
+            ("delay margin", figure(None if delay is None else 1e3 * delay, "ms"), ""),
+        ]  # fmt: skip
+
+
+def _limited(sense: str, limit: float | None) -> str:
+    return "" if limit is None else f"{sense} {limit:g}"
+
+
+def _shown(value: float | None) -> str:
+    return "none" if value is None else f"{value:.4g}"

@@ -1,0 +1,311 @@
+r"""Passivity of the controlled actuator at link 2: what it does to a hand, a leg or a wall that moves it.
+
+Link 1 is held, link 2 is moved with the speed v, and F2 v is the power that goes into the actuator (link 2 feels -F2,
+so that a mass has the impedance +j omega m). The actuator is passive where its impedance Z = F2/v has Re Z >= 0; where
+it is so at every frequency, nothing passive that link 2 is attached to is made unstable by it (Colgate, Hogan, Int. J.
+Control 48(1), 1988). That takes a loop that does not grow with link 2 held, Z having no pole on the right: of any
+other, Re Z says nothing.
+
+With :math:`F_1 = G_{11} F_m + G_{12} v` and :math:`F_2 = G_{21} F_m + G_{22} v` of the plant's linearisation, and
+:math:`F_m = -C' F_1`,
+
+.. math:: Z = \frac{G_{22} + \Delta\, C'}{1 + G_{11} C'}, \qquad \Delta = G_{11} G_{22} - G_{12} G_{21} .
+
+Unlumped, spring at link 1: from :math:`M \ddot q = F_m - b_m \dot q - F_2`, :math:`F_1 = k (q + x_2)` and
+:math:`F_2 = F_1 + m_l (\ddot q + \ddot x_2)`,
+
+.. math:: Z = \frac{(m_l s^2 + k)(M s + b_m)}{m_k s^2 + b_m s + k (1 + C')}, \qquad \Delta = 0 .
+
+F1 tells F2, the sprung mass being rigid, which is why :math:`\Delta = 0`, and why Re Z >= 0 is affine in the gains:
+:math:`\mathrm{Re}[G_{22} \overline{(1 + G_{11} C')}] \ge 0` (`passivity_rows`). For an undelayed PID it reads
+
+.. math:: b_m k (1 + k_p) - M k k_i + (M k k_d - b_m m_l)\, \omega^2 \ge 0 \qquad (\omega^2 < k/m_l),
+
+at low frequency :math:`k_i \le b_m (1 + k_p)/M`, where M = J/r^2 is m_k but for m_l. Beyond :math:`\omega^2 = k/m_l`
+(160 Hz for THOR) F2 and F1 have opposite signs and the inequality is reversed: no undelayed PID of positive gains is
+passive just above. `Passivity.limit_hz` is where that begins. A delay that has turned C' by more than a quarter of a
+circle turns both: such a loop can lose passivity below and have it back above.
+
+The sampled controller is taken as linear and time-invariant: :math:`C' = C_y(e^{j\omega T_s})\, e^{-j\omega d T_s}
+(1 - e^{-j\omega T_s})/(j\omega T_s)`, with its delay and its hold. That leaves out the images that sampling folds back
+onto f from f + n/T_s, which the plant has filtered out all but for a part that grows towards the Nyquist frequency.
+Under a sinusoidal motion the mean power into the sampled loop is then abs(v)^2 Re Z/2, up to those images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.crossings import crossings, with_minima
+from seaopt.control.loops.loop import GROWING, Loop
+from seaopt.control.loops.port import Frequencies, Port, Response, held, port_of, sight
+from seaopt.control.loops.sampled_plant import DigitalPlant, hold
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+
+Curve = Callable[[Frequencies], Any]
+LOWEST_HZ = 0.01
+POINTS = 2000
+ROUNDING = 1e-9  # cosines of the impedance's angle nearer to zero than this are zero
+TINY = float(np.finfo(float).tiny)
+
+
+@record
+class Passivity:
+    """Where the actuator is passive at link 2.
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        What was looked at.
+    held_stable : bool
+        No closed-loop eigenvalue is outside the circle with link 2 held.
+    bands_hz : tuple of (low, high)
+        Where Re Z >= 0; none if not `held_stable`.
+    violated_hz : float or None
+        The lowest frequency at which Re Z < 0 begins, `low_hz` if not `held_stable`; None: nowhere.
+    least_damping_N_s_per_m : float
+        The least Re Z; where it is negative, this much viscous damping at the port would make up for it.
+    least_hz : float
+        Where that is.
+    least_cosine : float
+        Re Z/abs(Z) there, from -1 to 1.
+    limit_hz : float or None
+        From here the fed-back force and the force at the port oppose each other; None where they never do.
+
+    """
+
+    low_hz: float
+    high_hz: float
+    held_stable: bool
+    bands_hz: tuple[tuple[float, float], ...]
+    violated_hz: float | None
+    least_damping_N_s_per_m: float
+    least_hz: float
+    least_cosine: float
+    limit_hz: float | None
+
+    def holds(self, band_hz: tuple[float, float]) -> bool:
+        """Tell whether Re Z >= 0 throughout a band.
+
+        Raises
+        ------
+        ControlError
+            The band is not within what was looked at.
+
+        """
+        low, high = band_hz
+        if not self.low_hz <= low < high <= self.high_hz:
+            raise ControlError(
+                f"band_hz = [{low:g}, {high:g}] is not a band within {self.low_hz:g} to {self.high_hz:g} Hz; "
+                "give one, or look further"
+            )
+        return any(start <= low and high <= stop for start, stop in self.bands_hz)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields, for robustness.json."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __repr__(self) -> str:
+        bands = ", ".join(f"{low:.4g} to {high:.4g} Hz" for low, high in self.bands_hz) or "nowhere"
+        lines = [f"Passive at link 2: {bands} (of {self.low_hz:g} to {self.high_hz:g} Hz)"]
+        if not self.held_stable:
+            return f"{lines[0]}\n  the loop is UNSTABLE with link 2 held"
+        if self.violated_hz is not None:
+            lines.append(
+                f"  violated from {self.violated_hz:.4g} Hz, most at {self.least_hz:.4g} Hz: Re Z = "
+                f"{self.least_damping_N_s_per_m:.4g} N s/m, {self.least_cosine:.3g} of |Z|"
+            )
+        if self.limit_hz is not None:
+            lines.append(f"  from {self.limit_hz:.4g} Hz the fed-back force opposes the force at the port")
+        return "\n".join(lines)
+
+
+def passivity(
+    controller: Controller,
+    plant: Plant,
+    params: ParameterSet,
+    *,
+    low_hz: float = LOWEST_HZ,
+    high_hz: float | None = None,
+) -> Passivity:
+    """Find where a controlled actuator is passive at link 2.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its measurement path closes the loop; the reference stands still.
+    plant, params
+        An actuator with a port at link 2; what its links are does not matter, link 1 is held and link 2 moved.
+    low_hz, high_hz : float
+        Where to look; up to the Nyquist frequency if left out.
+
+    Returns
+    -------
+    Passivity
+        Crossings refined to rounding, and the least of all local minima, refined too.
+
+    Raises
+    ------
+    ControlError
+        The plant has no port at link 2, or the band is not one below the Nyquist frequency.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3)
+    >>> plant, params = so.plants.high_impedance(), so.plants.thor()
+    >>> found = passivity(so.tune(plant, params, spec), plant, params)
+    >>> round(found.limit_hz, 1)
+    160.3
+
+    """
+    ts = controller.sample_time_s
+    high = 0.5 / ts if high_hz is None else high_hz
+    if not 0.0 < low_hz < high <= 0.5 / ts:
+        raise ControlError(
+            f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
+        )
+    port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
+    law = controller.measurement
+    impedance, angle = _curves(port, law, ts, controller.delay_samples)
+    f = with_minima(angle, with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
+    stable = held_stable(port, controller)
+    bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
+    z = impedance(f)
+    least = int(np.argmin(np.real(z)))
+    return Passivity(
+        low_hz=low_hz,
+        high_hz=high,
+        held_stable=stable,
+        bands_hz=bands,
+        violated_hz=violated,
+        least_damping_N_s_per_m=float(np.real(z[least])),
+        least_hz=float(f[least]),
+        least_cosine=float(np.real(z[least]) / max(abs(z[least]), TINY)),
+        limit_hz=_limit(port, f),
+    )
+
+
+def least_cosine(
+    port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the least Re Z/abs(Z) in a band, refined to rounding, and the frequency in Hz where it is."""
+    _, angle = _curves(port, law, sample_time_s, delay_samples)
+    f = with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
+    found = angle(f)
+    least = int(np.argmin(found))
+    return float(found[least]), float(f[least])
+
+
+def passivity_rows(
+    plant: Plant,
+    params: ParameterSet,
+    spec: ControllerSpec,
+    current_per_force_A_per_N: float,
+    basis: Complex[np.ndarray, "m n"],
+    f: Frequencies,
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
+    """Return A and b with A theta >= b where C_y = sum of theta_i basis_i makes Re Z >= 0 at the frequencies f.
+
+    Parameters
+    ----------
+    plant, params, spec
+        The actuator, and what is measured, how fast, and how late.
+    current_per_force_A_per_N : float
+        Of the controller.
+    basis : array, shape (m, n)
+        Responses of 1, the integrator, the filtered difference, ... at f, as the controller computes them: delay and
+        hold are put in here.
+    f : array, shape (m,)
+        Hz, above zero.
+
+    Returns
+    -------
+    A, b : arrays, shapes (m, n) and (m,)
+        Each row in units of abs(G_22), so that A theta - b is Re Z/abs(Z) times abs(1 + L).
+
+    Raises
+    ------
+    ControlError
+        The measured force does not tell the force at the port (an elastic screw between them), so that the condition
+        is quadratic in the gains.
+
+    """
+    port = port_of(plant, params, spec.measured, current_per_force_A_per_N)
+    loop, unit = sight(port, spec.sample_time_s, spec.delay_samples, f)
+    return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
+
+
+def held_stable(port: Port, controller: Controller) -> bool:
+    """Tell whether nothing grows in the sampled loop with link 2 held."""
+    a, b, c, d = port.link_held()
+    late = np.array([port.delay_s])
+    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), controller.sample_time_s, late)
+    plant = DigitalPlant(
+        a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=controller.sample_time_s,
+        delay_samples=controller.delay_samples, static_gain=np.nan,
+    )  # fmt: skip
+    poles = Loop(plant=plant, reference=controller.measurement, measurement=controller.measurement).eigenvalues()
+    return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
+
+
+def _curves(port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
+    """Return Z and Re Z/abs(Z) as functions of frequency."""
+
+    def impedance(f: Frequencies) -> Response:
+        return port.response(f).impedance(law.response(f, sample_time_s) * held(f, sample_time_s, delay_samples))
+
+    def angle(f: Frequencies) -> Frequencies:
+        z = impedance(f)
+        return np.real(z) / np.maximum(np.abs(z), TINY)
+
+    return impedance, angle
+
+
+def _grid(port: Port, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
+    """Return frequencies that resolve the modes of plant and law."""
+    roots = np.roots(np.trim_zeros(law.den, "b"))
+    poles = np.log(roots.astype(complex)) / sample_time_s
+    at, width = port.modes_hz()
+    at = np.concatenate([at, np.abs(poles.imag) / (2 * np.pi)])
+    width = np.concatenate([width, np.abs(poles.real) / (2 * np.pi)])
+    fan = np.concatenate([[0.0], *([[-x, x] for x in np.geomspace(0.03, 10.0, 20)])])
+    near = (at[:, None] + np.maximum(width, 1e-6 * high_hz)[:, None] * fan).ravel()
+    inside = near[(near > low_hz) & (near < high_hz)]
+    return np.unique(np.concatenate([np.geomspace(low_hz, high_hz, POINTS), inside]))
+
+
+def _bands(
+    curve: Callable[[Frequencies], Frequencies], f: Frequencies
+) -> tuple[tuple[tuple[float, float], ...], float | None]:
+    """Return where the curve is not negative, and where it first is."""
+    edges = np.concatenate([f[:1], crossings(curve, f), f[-1:]])
+    good = curve(np.sqrt(edges[:-1] * edges[1:])) >= 0.0
+    bands: list[tuple[float, float]] = []
+    for low, high, fine in zip(edges[:-1], edges[1:], good, strict=True):
+        if fine and bands and bands[-1][1] == low:
+            bands[-1] = (bands[-1][0], float(high))
+        elif fine:
+            bands.append((float(low), float(high)))
+    bad = np.flatnonzero(~good)
+    return tuple(bands), float(edges[bad[0]]) if bad.size else None
+
+
+def _limit(port: Port, f: Frequencies) -> float | None:
+    def alike(x: Frequencies) -> Frequencies:
+        response = port.response(x)
+        return np.real(response.motor_to_port * np.conj(response.motor_to_feedback))
+
+    found = crossings(alike, f)
+    return float(found[0]) if found.size else None

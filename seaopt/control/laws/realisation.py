@@ -1,0 +1,313 @@
+r"""The law as it runs: one step a sample, with the motor's current limit and anti-windup.
+
+.. math::
+    u &= C x + D_r r - D_y y, \qquad x^+ = A x + B_r r - B_y y + K (\mathrm{sat}(u) - u)
+
+K does nothing until the current saturates. While it does, the state moves with :math:`A - K C`: K is chosen so that
+the poles of the m integrators go from 1 to :math:`\lambda = T_t/(T_t + T_s)`, and the others stay:
+:math:`K_j = \binom{m}{j} (1-\lambda)^j` on the chain and zero elsewhere. For one integrator that is back-calculation
+with the tracking time constant T_t (Astrom, Hagglund, PID Controllers, 2nd ed., ISA 1995, integrator windup). Theirs
+is T_i for a PI, and :math:`\sqrt{T_i T_d}` with a derivative. The feedforward of these laws makes another one right.
+At rest at the limit, with a reference that is out of reach by e,
+:math:`u - \mathrm{sat}(u) = (k_\mathrm{ff} + k_p) e + x_I` and :math:`\dot x_I = k_i e - (u - \mathrm{sat}(u))/T_t`,
+so that the integrator rests at zero, and the law returns from saturation as if it had been given the reference that
+is in reach (Hanus, Kinnaert, Henrotte, Automatica 23(6), 1987), for
+
+.. math:: T_t = \frac{k_\mathrm{ff} + k_p}{k_i}, \qquad \text{in general } T_s \frac{a_1}{a_0} \text{ of }
+          C_r = a_0 \delta^{-m} + a_1 \delta^{1-m} + \dots
+
+the default (a sample at least), which is T_i where there is no feedforward.
+
+A disturbance observer, :math:`u = v + Q (\mathrm{sat}(u) - P_n^{-1} y)`, has to see the saturated command, not its
+own. Here it does: unsaturated, :math:`u = (v - Q P_n^{-1} y)/(1 - Q)` integrates, since Q = 1 at 0 Hz, and the
+saturated law differs from it by sat(u) - u at the input of Q, which is a K. For :math:`Q = (1-\lambda)/(z - \lambda)`
+that K is :math:`1 - \lambda`: this module's, with T_t the time constant of Q, and since
+:math:`1/(1-Q) = (1 - \lambda q)/(1-q)`, that is the default too. For Q of higher order K moves the integrator alone;
+the other poles of 1/(1 - Q), about as fast as Q, stay.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.linalg import block_diag
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.minimal import Part, balanced, common, split
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+Vector = Float[np.ndarray, " n"]
+EPS = float(np.finfo(float).eps)
+SAME = 1e-6  # how well the state space must have the response of its transfer functions
+
+
+@record(eq=False)
+class LawState:
+    """What a running law remembers.
+
+    Parameters
+    ----------
+    x : array, shape (n,)
+        State.
+    current_A : float
+        The last command.
+    held : int
+        Samples in a row that were not used because a number in them was not finite.
+
+    """
+
+    x: Vector
+    current_A: float = 0.0
+    held: int = 0
+
+
+@record(eq=False)
+class RunnableLaw:
+    """F = c x + d_reference r - d_measurement y, x+ = a x + b_reference r - b_measurement y + anti_windup (sat(F) - F).
+
+    Parameters
+    ----------
+    a, b_reference, b_measurement, c, d_reference, d_measurement
+        Matrices, shapes (n, n), (n,), (n,), (n,) and numbers; the first `integrators` states are the integrators.
+    anti_windup : array, shape (n,)
+        K of the module's docstring.
+    integrators : int
+        How many poles at z = 1.
+    tracking_time_s : float or None
+        T_t; None where nothing integrates.
+    sample_time_s : float
+        Seconds.
+    current_per_force_A_per_N : float
+        The command is this times F.
+    current_limit_A : float
+        The command's largest magnitude; infinite where there is no limit.
+
+    """
+
+    a: Float[np.ndarray, "n n"]
+    b_reference: Vector
+    b_measurement: Vector
+    c: Vector
+    d_reference: float
+    d_measurement: float
+    anti_windup: Vector
+    integrators: int
+    tracking_time_s: float | None
+    sample_time_s: float
+    current_per_force_A_per_N: float
+    current_limit_A: float
+
+    @property
+    def force_limit_N(self) -> float:
+        """The motor force at the current limit."""
+        return self.current_limit_A / self.current_per_force_A_per_N
+
+    def __repr__(self) -> str:
+        tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
+        limit = "no current limit" if math.isinf(self.current_limit_A) else f"limited to {self.current_limit_A:g} A"
+        return (
+            f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
+            f"{1 / self.sample_time_s:.6g} Hz, {limit}"
+        )
+
+    def rest(self) -> tuple[Vector, Vector]:
+        """Return x per reference and per measurement (counted negative) at rest, integrators zero."""
+        m, n = self.integrators, self.c.size
+        out = np.zeros((2, n))
+        inner = np.eye(n - m) - self.a[m:, m:]
+        out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
+        return out[0], out[1]
+
+    def response(self, f: Float[np.ndarray, " k"]) -> tuple[Complex[np.ndarray, " k"], Complex[np.ndarray, " k"]]:
+        """Return C_r and C_y at frequencies in Hz, above zero."""
+        z = np.exp(2j * np.pi * f * self.sample_time_s)
+        inner = z[:, None, None] * np.eye(self.c.size) - self.a
+        causes = np.column_stack([self.b_reference, self.b_measurement]).astype(complex)
+        out = self.c @ np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape)))
+        return out[:, 0] + self.d_reference, out[:, 1] + self.d_measurement
+
+    def reset(self, reference: float = 0.0, measurement: float = 0.0, current_A: float = 0.0) -> LawState:
+        """Return the state at rest under constant inputs, with the integrator set to continue from a current.
+
+        A law without integrator has no such freedom: its next command follows from the inputs alone.
+
+        Raises
+        ------
+        ControlError
+            An input is not finite, or the current is above the limit.
+
+        """
+        if not (math.isfinite(reference) and math.isfinite(measurement)):
+            raise ControlError(f"reference = {reference:g}, measurement = {measurement:g}: give finite numbers")
+        if not abs(current_A) <= self.current_limit_A:
+            raise ControlError(f"current_A = {current_A:g} is above the limit of {self.current_limit_A:g} A; lower it")
+        per_reference, per_measurement = self.rest()
+        x = per_reference * reference - per_measurement * measurement
+        if self.integrators:
+            force = float(self.c @ x) + self.d_reference * reference - self.d_measurement * measurement
+            x[0] = current_A / self.current_per_force_A_per_N - force
+        return LawState(x=x, current_A=current_A)
+
+    def step(self, state: LawState, reference: float, measurement: float) -> tuple[float, LawState]:
+        """Return the current (A) to command at this sample, and the next state.
+
+        A sample with a number that is not finite, in its inputs or in what would follow, is not used: the last command
+        is held, the state stays, and `held` counts.
+        """
+        with np.errstate(all="ignore"):
+            force = float(self.c @ state.x) + self.d_reference * reference - self.d_measurement * measurement
+            applied = min(max(force, -self.force_limit_N), self.force_limit_N)
+            x = self.a @ state.x + self.b_reference * reference - self.b_measurement * measurement
+            x += self.anti_windup * (applied - force)
+        if not (math.isfinite(force) and np.all(np.isfinite(x))):
+            return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1)
+        current = applied * self.current_per_force_A_per_N
+        current = min(max(current, -self.current_limit_A), self.current_limit_A)  # a limit to the last bit
+        return current, LawState(x=x, current_A=current)
+
+    def run(
+        self,
+        references: Float[np.ndarray, " samples"],
+        measurements: Float[np.ndarray, " samples"],
+        state: LawState | None = None,
+    ) -> tuple[Float[np.ndarray, " samples"], LawState]:
+        """Return the currents (A) of a sequence of samples, and the last state; it starts from zero if not given."""
+        state = self.reset() if state is None else state
+        out = np.zeros(references.size)
+        for i, (reference, measurement) in enumerate(zip(references, measurements, strict=True)):
+            out[i], state = self.step(state, float(reference), float(measurement))
+        return out, state
+
+
+def runnable(
+    controller: Controller, *, current_limit_A: float | None = None, tracking_time_s: float | None = None
+) -> RunnableLaw:
+    """Return a controller's law ready to run.
+
+    Parameters
+    ----------
+    controller : Controller
+        As tuned or read.
+    current_limit_A : float, optional
+        The specification's if left out; infinite where neither is given.
+    tracking_time_s : float, optional
+        T_t of the anti-windup; the module's docstring has the default.
+
+    Raises
+    ------
+    ControlError
+        As `realise`.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+    >>> law = runnable(so.tune(so.plants.high_impedance(), so.plants.thor(), spec))
+    >>> current, state = law.step(law.reset(), reference=5000.0, measurement=0.0)
+    >>> round(current, 6)
+    9.0
+
+    """
+    limit = controller.spec.current_limit_A if current_limit_A is None else current_limit_A
+    return realise(
+        controller.reference,
+        controller.measurement,
+        sample_time_s=controller.sample_time_s,
+        current_per_force_A_per_N=controller.current_per_force_A_per_N,
+        current_limit_A=limit,
+        tracking_time_s=tracking_time_s,
+    )
+
+
+def realise(
+    reference: TransferFunction,
+    measurement: TransferFunction,
+    *,
+    sample_time_s: float,
+    current_per_force_A_per_N: float = 1.0,
+    current_limit_A: float | None = None,
+    tracking_time_s: float | None = None,
+) -> RunnableLaw:
+    """Return F = C_r F_ref - C_y F_meas as a state-space law of least order with limit and anti-windup.
+
+    Parameters
+    ----------
+    reference, measurement : TransferFunction
+        C_r and C_y, of any order.
+    sample_time_s : float
+        Seconds.
+    current_per_force_A_per_N : float
+        A/N.
+    current_limit_A : float, optional
+        None: no limit.
+    tracking_time_s : float, optional
+        T_t; the module's docstring has the default.
+
+    Raises
+    ------
+    ControlError
+        A number is out of range, the law by itself is unstable other than by integrators, or its poles lie so close
+        together that double precision does not hold it.
+
+    """
+    for name, value in (
+        ("sample_time_s", sample_time_s),
+        ("current_per_force_A_per_N", current_per_force_A_per_N),
+        ("current_limit_A", current_limit_A),
+        ("tracking_time_s", tracking_time_s),
+    ):
+        if value is not None and not value > 0.0:
+            raise ControlError(f"{name} = {value:g} is not positive; give a positive number")
+    parts = [split(name, tf) for name, tf in (("reference", reference), ("measurement", measurement))]
+    m = max(part.chain.size for part in parts)
+    gains = np.zeros((m, 2))
+    for column, part in enumerate(parts):
+        gains[: part.chain.size, column] = part.chain
+    through = (float(reference.num[0]), float(measurement.num[0]))
+    a, b, c = balanced(*common(parts), max(map(abs, through)))
+    tracking = _tracking(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
+    share = sample_time_s / (tracking + sample_time_s) if tracking is not None else 0.0
+    b = np.vstack([gains, b])
+    law = RunnableLaw(
+        a=np.asarray(block_diag(np.eye(m) + np.eye(m, k=1), a)),
+        b_reference=b[:, 0].copy(),
+        b_measurement=b[:, 1].copy(),
+        c=np.concatenate([np.eye(1, m)[0], c]),
+        d_reference=through[0],
+        d_measurement=through[1],
+        anti_windup=np.array([math.comb(m, j) * share**j for j in range(1, m + 1)] + [0.0] * c.size),
+        integrators=m,
+        tracking_time_s=tracking if m else None,
+        sample_time_s=sample_time_s,
+        current_per_force_A_per_N=current_per_force_A_per_N,
+        current_limit_A=math.inf if current_limit_A is None else current_limit_A,
+    )
+    _check(law, reference, measurement)
+    return law
+
+
+def _check(law: RunnableLaw, reference: TransferFunction, measurement: TransferFunction) -> None:
+    """Refuse a law whose response is not that of its transfer functions, but for their coefficients' rounding."""
+    f = np.geomspace(1e-4, 0.49, 25) / law.sample_time_s
+    q = np.exp(-2j * np.pi * f * law.sample_time_s)
+    for found, tf in zip(law.response(f), (reference, measurement), strict=True):
+        bottom = np.polynomial.polynomial.polyval(q, tf.den)
+        wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
+        rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
+        allowed = SAME * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
+        if not np.all(np.abs(found - wanted) <= allowed):
+            raise ControlError(
+                "the law's slow poles are too close together to tell from integrators in double precision; "
+                "sample more slowly, or make them faster"
+            )
+
+
+def _tracking(parts: list[Part], sample_time_s: float) -> float:
+    """Return T_s abs(a_1/a_0) of C_r, of C_y where the reference is not integrated; a sample at least."""
+    most = max(part.chain.size for part in parts)
+    a_0, a_1 = next(part.series for part in parts if part.chain.size == most)[:2]
+    return sample_time_s * max(abs(float(a_1 / a_0)), 1.0)

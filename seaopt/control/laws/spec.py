@@ -1,0 +1,194 @@
+"""What is asked of a controller."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, fields
+from typing import Any, Literal
+
+from seaopt.control.laws.structures import STRUCTURES, Derivative, Notch, Structure
+from seaopt.errors import ControlError, suggestion
+from seaopt.records import record
+
+LIMITS = ("max_sensitivity", "max_complementary", "max_reference_peak", "max_noise_gain")
+OPTIONAL = ("min_disk_margin", "min_sensitivity_bandwidth_hz", "current_limit_A", "step_N")
+MAX_DELAY_SAMPLES = 1000
+LOWEST_HZ = 1e-3  # limits are kept from here
+
+
+@record
+class ControllerSpec:
+    """A bandwidth and the limits to keep; a limit left out (None) is not imposed.
+
+    Parameters
+    ----------
+    measured : str
+        The output that is fed back, F1 as a rule.
+    bandwidth_hz : float
+        Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
+    bandwidth_range_hz : (low, high)
+        What bandwidth_hz may be; give another range to leave 15 to 60.
+    structure : {"pd", "pid", "pid_dob"}
+        Each with feedforward of the reference; a pid_dob has a disturbance observer whose nominal plant is the design
+        plant.
+    notch : Notch, optional
+        A notch in series; what its fields leave open is tuned.
+    derivative : {"error", "measurement"}
+        What is differentiated.
+    sample_rate_hz : float
+        Of the controller.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    max_sensitivity, max_complementary : float, optional
+        Ms and Mt, peaks of abs(S) and abs(L/(1+L)), on every plant.
+    min_disk_margin : float, optional
+        Symmetric disk margin, below 2, on every plant.
+    max_reference_peak : float, optional
+        Peak of abs(F/F_ref) over its static value, design plant.
+    max_noise_gain : float, optional
+        Peak of abs(F_m / noise on F), N/N, design plant.
+    min_sensitivity_bandwidth_hz : float, optional
+        abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.
+    passive_band_hz : (low, high), optional
+        From here to there the actuator of the design plant is passive at link 2 with link 1 held, Re Z >= 0
+        (`seaopt.control.laws.passivity`).
+    objective : {"disturbance", "noise"}
+        Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
+    current_limit_A : float, optional
+        Of the motor; it does not shape the gains. The controller says which force it leaves (`force_limit`).
+    step_N : float, optional
+        A step of the reference that the current limit must at least hold.
+    reserve : float
+        Ms, Mt and the other limits are met with this fraction to spare, so that parameters as uncertain as a fit
+        leaves them do not break them.
+
+    Raises
+    ------
+    ControlError
+        A value is out of range, or two contradict each other.
+
+    """
+
+    measured: str = "F1"
+    bandwidth_hz: float = 30.0
+    bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
+    structure: Structure = "pid"
+    notch: Notch | None = None
+    derivative: Derivative = "error"
+    sample_rate_hz: float = 1000.0
+    delay_samples: int = 1
+    max_sensitivity: float | None = None
+    max_complementary: float | None = None
+    min_disk_margin: float | None = None
+    max_reference_peak: float | None = None
+    max_noise_gain: float | None = None
+    min_sensitivity_bandwidth_hz: float | None = None
+    passive_band_hz: tuple[float, float] | None = None
+    objective: Literal["disturbance", "noise"] = "disturbance"
+    current_limit_A: float | None = None
+    step_N: float | None = None
+    reserve: float = 0.005
+
+    def __post_init__(self) -> None:
+        self._check_types()
+        low, high = self.bandwidth_range_hz
+        if not 0.0 < low < high:
+            raise ControlError(f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high")
+        if not low <= self.bandwidth_hz <= high:
+            raise ControlError(
+                f"bandwidth_hz = {self.bandwidth_hz:g} is outside {low:g} to {high:g}; choose one inside, "
+                "or give another bandwidth_range_hz"
+            )
+        if self.structure not in STRUCTURES:
+            raise ControlError(
+                f'structure = "{self.structure}" is not known; {suggestion(str(self.structure), STRUCTURES)}'
+            )
+        if self.derivative not in ("error", "measurement"):
+            raise ControlError(f'derivative = "{self.derivative}" is not known; use "error" or "measurement"')
+        if self.objective not in ("disturbance", "noise"):
+            raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
+        if not 0 <= self.delay_samples <= MAX_DELAY_SAMPLES:
+            raise ControlError(f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}")
+        if not 4.0 * self.bandwidth_hz < self.sample_rate_hz < math.inf:
+            raise ControlError(
+                f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
+                "sample more than four times as fast"
+            )
+        self._check_limits()
+
+    def _check_types(self) -> None:
+        if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int):
+            raise ControlError(
+                f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give 0, 1, ..."
+            )
+        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *LIMITS, *OPTIONAL):
+            value = getattr(self, name)
+            if value is None and name in (*LIMITS, *OPTIONAL):
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+                raise ControlError(f"{name} = {value!r} is not a number; give one")
+
+    def _check_limits(self) -> None:
+        for name in LIMITS:
+            value = getattr(self, name)
+            least = 0.0 if name in ("max_noise_gain", "max_complementary") else 1.0
+            if value is not None and not value > least:
+                raise ControlError(f"{name} = {value:g} can be met by no loop; give more than {least:g}")
+        wanted = self.min_sensitivity_bandwidth_hz
+        if wanted is not None and not 0.0 <= wanted < self.bandwidth_hz:
+            raise ControlError(
+                f"min_sensitivity_bandwidth_hz = {wanted:g} is not between 0 and bandwidth_hz = "
+                f"{self.bandwidth_hz:g}; lower it"
+            )
+        disk = self.min_disk_margin
+        if disk is not None and not 0.0 < disk < 2.0:
+            raise ControlError(f"min_disk_margin = {disk:g} can be met by no loop; give more than 0 and less than 2")
+        self._check_notch()
+        self._check_band()
+        if self.step_N is not None and not self.step_N > 0.0:
+            raise ControlError(f"step_N = {self.step_N:g} is not positive; give the step's size")
+        if self.current_limit_A is not None and not self.current_limit_A > 0.0:
+            raise ControlError(f"current_limit_A = {self.current_limit_A:g} is not positive; give the motor's limit")
+        if not 0.0 <= self.reserve < 0.5:
+            raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
+
+    def _check_band(self) -> None:
+        if self.passive_band_hz is None:
+            return
+        given: Any = self.passive_band_hz
+        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(f, (int, float)) for f in given):
+            raise ControlError(f"passive_band_hz = {given!r} is not a band; give (low, high)")
+        low, high = self.passive_band_hz
+        if not LOWEST_HZ <= low < high < 0.5 * self.sample_rate_hz:
+            raise ControlError(
+                f"passive_band_hz = [{low:g}, {high:g}] is not a band; give {LOWEST_HZ:g} <= low < high < "
+                f"{0.5 * self.sample_rate_hz:g} Hz, half the sample rate"
+            )
+
+    def _check_notch(self) -> None:
+        if self.notch is None:
+            return
+        if not isinstance(self.notch, Notch):
+            raise ControlError(f"notch = {self.notch!r} is a {type(self.notch).__name__}; give a Notch")
+        top = {"frequency_hz": 0.45 * self.sample_rate_hz, "width": 10.0, "depth": 1.0}
+        for name, value in asdict(self.notch).items():
+            if value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= top[name]:
+                raise ControlError(f"notch.{name} = {value!r} is not above 0 and up to {top[name]:g}")
+
+    @property
+    def sample_time_s(self) -> float:
+        """Seconds between samples."""
+        return 1.0 / self.sample_rate_hz
+
+    @property
+    def sensitivity_bandwidth_limit_hz(self) -> float:
+        """The least sensitivity bandwidth: as given, or bandwidth_hz/5."""
+        given = self.min_sensitivity_bandwidth_hz
+        return self.bandwidth_hz / 5.0 if given is None else given
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields, as in a problem file."""
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return own | {"notch": None if self.notch is None else asdict(self.notch)}

@@ -1,0 +1,121 @@
+r"""What no controller can do: requests that a delay or a current limit rules out before anything is tuned.
+
+**Delay.** If the loop's first response comes k samples late, the sensitivity of every stable loop is
+:math:`S(q) = 1 + O(q^k)`, analytic in the unit disk. It is to stay below w: :math:`1/\sqrt2` up to :math:`f_s`,
+:math:`M_s` above. Let W be the outer function with :math:`|W| = w` on the circle,
+
+.. math:: W(q) = \exp\big(a_0 + 2\sum_n a_n q^n\big), \qquad
+    a_0 = \tfrac{\omega_s}{\pi}\ln\tfrac{1}{\sqrt2} + \big(1 - \tfrac{\omega_s}{\pi}\big)\ln M_s, \quad
+    a_n = \frac{\sin n\omega_s}{n\pi}\,\ln\frac{1}{\sqrt2 M_s} .
+
+Then :math:`G = S/W` is analytic with :math:`|G| \le 1`, and its first k coefficients are those of 1/W. Such a G exists
+if and only if the lower triangular Toeplitz matrix of these coefficients has norm 1 at most (Caratheodory, Schur). At
+k = 1 that is Bode's integral.
+
+**Current.** At rest a force F takes the motor force :math:`k_\mathrm{ff} F`, whatever the gains.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.errors import ControlError
+
+LEAST_SHARE = 1e-4  # of the sample rate: what is below is called nothing
+
+
+def sensitivity_possible(sensitivity_hz: float, ms: float, sample_time_s: float, late: int) -> bool:
+    """Tell whether a loop that answers `late` samples late can have abs(S) below -3 dB up to a frequency, and Ms.
+
+    Parameters
+    ----------
+    sensitivity_hz : float
+        Where abs(S) may leave -3 dB.
+    ms : float
+        Largest abs(S) above.
+    sample_time_s : float
+        Seconds.
+    late : int
+        Samples, at least 1.
+
+    Examples
+    --------
+    >>> [sensitivity_possible(12.0, 1.6, 1e-3, late) for late in (2, 40)]
+    [True, False]
+
+    """
+    omega, n = 2 * np.pi * sensitivity_hz * sample_time_s, np.arange(1, late)
+    low, high = np.log(np.sqrt(0.5)), np.log(ms)
+    constant = omega / np.pi * low + (1 - omega / np.pi) * high
+    slopes = -2.0 * np.sin(n * omega) / (n * np.pi) * (low - high)  # of -ln W
+    return bool(np.linalg.norm(_toeplitz(_exponential(-constant, slopes)), 2) <= 1.0 + 1e-9)
+
+
+def _exponential(constant: float, slopes: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """Return the first coefficients of exp(constant + sum of slopes q^n): n g_n = sum of k slopes_k g_(n-k)."""
+    g = np.zeros(slopes.size + 1)
+    g[0] = np.exp(constant)
+    weighted = slopes * np.arange(1, slopes.size + 1)
+    for n in range(1, g.size):
+        g[n] = weighted[:n] @ g[n - 1 :: -1][:n] / n
+    return g
+
+
+def _toeplitz(g: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    index = np.arange(g.size)[:, None] - np.arange(g.size)
+    return np.where(index >= 0, g[index], 0.0)
+
+
+def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
+    """Refuse a bandwidth that the delay rules out for every controller.
+
+    Raises
+    ------
+    ControlError
+        It does; the message says what the delay allows.
+
+    """
+    wanted, ms = spec.sensitivity_bandwidth_limit_hz, spec.max_sensitivity
+    late = plant.delay_samples + (plant.d == 0.0)
+    if ms is None or wanted <= 0.0 or late < 1 or sensitivity_possible(wanted, ms, spec.sample_time_s, late):
+        return
+    low, high = LEAST_SHARE * spec.sample_rate_hz, wanted
+    while high / low > 1.01:
+        middle = float(np.sqrt(low * high))
+        low, high = (
+            (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
+        )  # fmt: skip
+    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with delay_samples = {spec.delay_samples}"
+    raise ControlError(
+        f"{asked} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "
+        f"max_sensitivity = {ms:g}; the delay allows at most {low:.3g} Hz, so lower bandwidth_hz or "
+        "min_sensitivity_bandwidth_hz, or the delay"
+    )
+
+
+def check_current(spec: ControllerSpec, k_ff: float, current_per_force: float, friction_N: float) -> None:
+    """Refuse a current limit that does not hold the step, or does not overcome dry friction.
+
+    Raises
+    ------
+    ControlError
+        As said.
+
+    """
+    limit = spec.current_limit_A
+    if limit is None:
+        return
+    if limit <= current_per_force * friction_N:
+        raise ControlError(
+            f"current_limit_A = {limit:g} makes {limit / current_per_force:.4g} N, no more than the friction f_c = "
+            f"{friction_N:g} N: nothing moves; raise it"
+        )
+    held = limit / (current_per_force * abs(k_ff))
+    if spec.step_N is not None and spec.step_N > held:
+        raise ControlError(
+            f"step_N = {spec.step_N:g} takes {limit * spec.step_N / held:.4g} A at rest, more than current_limit_A = "
+            f"{limit:g}: no controller makes it; ask for {held:.4g} N at most"
+        )

@@ -1,0 +1,174 @@
+r"""The closed loop of a digital controller and a sampled plant, and the figures that describe it.
+
+With :math:`L = C_y P z^{-d}`: :math:`S = 1/(1+L)`, :math:`T_r = P z^{-d} C_r / (1 + L)` from reference to force,
+:math:`C_y S` from sensor noise to motor force. Stability is decided by the eigenvalues of plant, hold, delay and
+controller together, never by a frequency grid; an unstable loop has no margins (zero) and infinite peaks. Peaks and
+crossings come from the eigenvalues of level sets (`response`, `peaks`), so that none is missed, however narrow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.loops.peaks import HALF_POWER, TRACKING, measured
+from seaopt.control.loops.response import ClosedLoop, close
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.records import record
+
+LOWEST_HZ = 1e-3
+# A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
+# nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
+# takes longer than 11 days at 1 kHz.
+STABLE, GROWING = 1.0 - 1e-11, 1.0 + 1e-9
+
+
+@record
+class LoopFigures:
+    """What describes a closed loop; frequencies in Hz, None where there is none.
+
+    Parameters
+    ----------
+    stable : bool
+        All closed-loop eigenvalues inside the unit circle.
+    spectral_radius : float
+        The largest of their magnitudes.
+    bandwidth_hz : float or None
+        Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz.
+    tracking_band_hz : (lo, hi) or None
+        Widest band in which abs(F/F_ref) stays within 3 dB of 1.
+    crossover_hz : float or None
+        Highest frequency at which abs(L) = 1.
+    sensitivity_bandwidth_hz : float
+        abs(S) stays below -3 dB up to here.
+    ms, mt : float
+        Peaks of abs(S) and abs(L S).
+    ms_hz : float
+        Where abs(S) peaks.
+    reference_peak : float
+        Peak of abs(F/F_ref) over its static value.
+    gain_margin_db : float or None
+        Smallest change of gain, up or down, that makes the loop unstable; None: no change does.
+    phase_margin_deg, delay_margin_s : float or None
+        Smallest over all crossovers; None: abs(L) never crosses 1.
+    disk_margin : float
+        Symmetric disk margin, 2 / peak of abs(S - T) (Seiler, Packard, Gahinet 2020).
+    noise_gain : float
+        Peak of abs(F_m / noise on F), N/N.
+
+    """
+
+    stable: bool
+    spectral_radius: float
+    bandwidth_hz: float | None
+    tracking_band_hz: tuple[float, float] | None
+    crossover_hz: float | None
+    sensitivity_bandwidth_hz: float
+    ms: float
+    mt: float
+    ms_hz: float
+    reference_peak: float
+    gain_margin_db: float | None
+    phase_margin_deg: float | None
+    delay_margin_s: float | None
+    disk_margin: float
+    noise_gain: float
+
+
+@record(eq=False)
+class Loop:
+    """A plant closed by C_r (reference) and C_y (measurement)."""
+
+    plant: DigitalPlant
+    reference: TransferFunction
+    measurement: TransferFunction
+
+    def open_loop(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return L at frequencies in Hz."""
+        return self.plant.response(f) * self.measurement.response(f, self.plant.sample_time_s)
+
+    def sensitivity(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return S = 1/(1 + L)."""
+        return 1.0 / (1.0 + self.open_loop(f))
+
+    def tracking(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return F/F_ref."""
+        reference = self.reference.response(f, self.plant.sample_time_s)
+        return self.plant.response(f) * reference * self.sensitivity(f)
+
+    def noise(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return -F_m/noise = C_y S."""
+        return self.measurement.response(f, self.plant.sample_time_s) * self.sensitivity(f)
+
+    def system(self) -> ClosedLoop:
+        """Return plant, hold, delay and controller as one system."""
+        return close(self.plant.delayed(), self.reference, self.measurement)
+
+    def eigenvalues(self) -> Complex[np.ndarray, " n"]:
+        """Return the closed loop's eigenvalues."""
+        return self.system().poles
+
+    def grid(self) -> Float[np.ndarray, " m"]:
+        """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
+        base = np.geomspace(LOWEST_HZ, self.plant.nyquist_hz, 1200)
+        poles = np.concatenate([np.linalg.eigvals(self.plant.a), self.eigenvalues()])
+        return np.union1d(base, self.about(poles))
+
+    def about(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """Return frequencies that resolve poles, up to the Nyquist frequency, unsorted."""
+        nyquist = self.plant.nyquist_hz
+        f0 = np.abs(np.angle(poles)) / (2 * np.pi * self.plant.sample_time_s)
+        width = np.maximum(np.abs(1.0 - np.abs(poles)) * nyquist / np.pi, 1e-9 * nyquist)
+        fan = np.concatenate([[0.0], *[[-x, x] for x in np.geomspace(0.05, 30.0, 20)]])
+        near = (f0[:, None] + width[:, None] * fan).ravel()
+        return near[(near > LOWEST_HZ) & (near < nyquist)]
+
+    def figures(self) -> LoopFigures:
+        """Return the loop's figures."""
+        system = self.system()
+        radius = float(np.max(np.abs(system.poles), initial=0.0))
+        if not radius < STABLE:
+            return LoopFigures(
+                stable=False, spectral_radius=radius, bandwidth_hz=None, tracking_band_hz=None, crossover_hz=None,
+                sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
+                gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0, disk_margin=0.0, noise_gain=np.inf,
+            )  # fmt: skip
+        found = measured(system)
+        per_hz = 2 * np.pi * self.plant.sample_time_s
+        (ms, mt, skew, noise, reference), ms_at = found.peaks, found.at[0]
+        crossovers, slow, below = found.crossovers, found.sensitivity_edges, found.bandwidth_edges
+        quiet = abs(found.ends[0, 0]) < HALF_POWER
+        band = _tracking_band(system, found.band_edges)
+        return LoopFigures(
+            stable=True,
+            spectral_radius=radius,
+            bandwidth_hz=float(below[0]) / per_hz if below.size else None,
+            tracking_band_hz=None if band is None else (band[0] / per_hz, band[1] / per_hz),
+            crossover_hz=float(crossovers[-1]) / per_hz if crossovers.size else None,
+            sensitivity_bandwidth_hz=float(slow[0] if slow.size else np.pi) / per_hz if quiet else 0.0,
+            ms=float(ms),
+            mt=float(mt),
+            ms_hz=float(ms_at) / per_hz,
+            reference_peak=float(reference) / found.static if found.static else np.inf,
+            gain_margin_db=_least(found.gains_db),
+            phase_margin_deg=_least(found.lags_deg),
+            delay_margin_s=_least(found.delays * self.plant.sample_time_s),
+            disk_margin=2.0 / float(skew),
+            noise_gain=float(noise),
+        )
+
+
+def _least(sizes: Float[np.ndarray, " k"]) -> float | None:
+    return float(np.min(np.abs(sizes))) if sizes.size else None
+
+
+def _tracking_band(system: ClosedLoop, inner: Float[np.ndarray, " k"]) -> tuple[float, float] | None:
+    edges = np.concatenate([[0.0], inner, [np.pi]])
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    size = np.abs(system.curves(middles)[TRACKING])
+    inside = (size > HALF_POWER) & (size < 1.0 / HALF_POWER)
+    if not np.any(inside):
+        return None
+    best = int(np.argmax(np.where(inside, np.diff(edges), -1.0)))
+    return float(edges[best]), float(edges[best + 1])

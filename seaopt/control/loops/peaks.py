@@ -1,0 +1,224 @@
+"""The peaks and crossings of a stable closed loop: exact, with a proof that none was missed.
+
+A coarse grid and the loop's poles give first candidates; where the slope of a curve changes sign it is refined to
+rounding. Then the level set a ten-millionth above each peak is computed (`response`): if any of its arcs is above the
+level, the grid has missed a peak, which is climbed in turn; if none is, the peak is proved to that tolerance. Crossings
+are bracketed by the arcs of their own level sets.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from seaopt.control.loops.response import ClosedLoop, Indices, arcs, bracketed, sign_changes
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+HALF_POWER = 1.0 / np.sqrt(2.0)
+PROOF = 1e-7
+BASE = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
+CURVES = 5
+SENSITIVITY, TRACKING = 0, 4
+REFINED = 3  # local maxima refined of each curve before the proof
+MAX_ROUNDS = 20
+BESIDE = 1e-5  # how near a pole of L on the circle -1/L is that pole's: a double one is known to the root of rounding
+RESOLVED = 1e-9
+
+
+@record(eq=False)
+class Measured:
+    """Peaks, crossings and ends of a closed loop; angles in radians a sample, ascending.
+
+    Parameters
+    ----------
+    peaks, at
+        Largest values of S, T, S - T, C_y S and F/F_ref, and the angles where.
+    ends
+        The five curves at 0 and pi, shape (5, 2).
+    static : float
+        abs(F/F_ref) at 0; zero where a zero of the plant leaves nothing but rounding.
+    crossovers, crossover_phases
+        Where abs(L) = 1, and the phase of -L there (rad).
+    gain_factors
+        Every positive factor on L that puts it through -1.
+    gain_angles
+        Where these factors do.
+    sensitivity_edges, bandwidth_edges, band_edges
+        Where abs(S) is -3 dB, abs(F/F_ref) -3 dB of its static value, and within 3 dB of 1 or not.
+
+    """
+
+    peaks: Float[np.ndarray, " 5"]
+    at: Float[np.ndarray, " 5"]
+    ends: Complex[np.ndarray, "5 2"]
+    static: float
+    crossovers: Float[np.ndarray, " k"]
+    crossover_phases: Float[np.ndarray, " k"]
+    gain_factors: Float[np.ndarray, " l"]
+    gain_angles: Float[np.ndarray, " l"]
+    sensitivity_edges: Float[np.ndarray, " m"]
+    bandwidth_edges: Float[np.ndarray, " n"]
+    band_edges: Float[np.ndarray, " o"]
+
+    @property
+    def gains_db(self) -> Float[np.ndarray, " l"]:
+        """The gain factors in dB: margins up positive, down negative."""
+        return 20.0 * np.log10(self.gain_factors)
+
+    @property
+    def lags_deg(self) -> Float[np.ndarray, " k"]:
+        """The phases at the crossovers in degrees: lag to -1 positive, lead negative."""
+        return np.degrees(self.crossover_phases)
+
+    @property
+    def delays(self) -> Float[np.ndarray, " k"]:
+        """The delay, in samples, that each crossover's phase amounts to."""
+        return np.mod(self.crossover_phases, 2 * np.pi) / self.crossovers
+
+
+def measured(system: ClosedLoop) -> Measured:
+    """Return the peaks and crossings of a stable closed loop.
+
+    Raises
+    ------
+    ControlError
+        A peak cannot be proved.
+
+    """
+    peaks, at = _candidates(system)
+    ends = system.curves(np.array([0.0, np.pi]))
+    static = float(np.abs(ends[TRACKING, 0]))
+    static = static if static > 1e-9 * peaks[TRACKING] else 0.0
+    levels = [(SENSITIVITY, HALF_POWER), (TRACKING, np.sqrt(2.0)), (TRACKING, HALF_POWER)]
+    levels += [(TRACKING, HALF_POWER * static)] if static else []
+    present = np.flatnonzero(peaks > 0.0)
+    proofs = [system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, present)]
+    pencils = [system.equal(), system.real(), *(system.modulus(k, level) for k, level in levels)]
+    edges = arcs([*pencils, *proofs])
+    peaks, at = _proved(system, peaks, at, present, edges[len(pencils) :])
+    own = system.sensitivity(at[:3])
+    peaks[:3] = np.abs([own[0], 1.0 - own[1], 2.0 * own[2] - 1.0])
+
+    def function(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
+        values = system.curves(theta)
+        rows = [2.0 * values[0].real - 1.0, values[0].imag]
+        rows += [np.abs(values[k] / level) ** 2 - 1.0 for k, level in levels]
+        return np.array(rows)[which, np.arange(theta.size)]
+
+    found = sign_changes(function, edges[: len(pencils)])
+    turns = np.concatenate([[0.0], found[1], [np.pi]])
+    factors, angles = _gain_factors(system, turns)
+    return Measured(
+        peaks=peaks, at=at, ends=ends, static=static, crossovers=found[0], crossover_phases=_phases(system, found[0]),
+        gain_factors=factors, gain_angles=angles, sensitivity_edges=found[2],
+        bandwidth_edges=found[5] if static else np.empty(0), band_edges=np.sort(np.concatenate(found[3:5])),
+    )  # fmt: skip
+
+
+def crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return where abs(L) = 1, and the phase of -L there (rad); the loop need not be stable."""
+
+    def function(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
+        return 2.0 * system.curves(theta)[0].real - 1.0
+
+    (found,) = sign_changes(function, arcs([system.equal()]))
+    return found, _phases(system, found)
+
+
+def _phases(system: ClosedLoop, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    s, t = system.curves(theta)[:2]
+    return np.angle(-t / s)
+
+
+def _gain_factors(
+    system: ClosedLoop, turns: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
+    """Return the factors -1/L at angles where L is real and negative, and these angles.
+
+    A pole of L on the circle, an integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is
+    rounding. A pole is on the circle if it is no further from it than it is known; next to a light mode, which is off
+    it, a crossing is one.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factors = -np.real(system.sensitivity(turns) / system.curves(turns)[1])
+    poles = system.opened
+    beside = np.abs(np.exp(1j * turns)[:, None] - poles) < BESIDE
+    if np.any(beside):
+        beside &= np.abs(np.abs(poles) - 1.0) <= system.resolution()
+    infinite = np.any(beside, axis=1)
+    crossing = (factors > RESOLVED) & (factors < 1.0 / RESOLVED) & ~infinite
+    return factors[crossing], turns[crossing]
+
+
+def _candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:
+    """Return the largest values on a coarse grid and at the poles, the best of each curve refined."""
+    modes = np.abs(np.angle(system.poles))
+    theta = np.unique(np.concatenate([BASE, modes[modes > 1e-9]]))
+    values, slopes = np.abs(system.curves(theta)), system.slopes(theta)
+    best = np.argmax(values, axis=1)
+    peaks, at = values[np.arange(CURVES), best], theta[best]
+    curve, cell = np.nonzero((slopes[:, :-1] > 0.0) & (slopes[:, 1:] < 0.0))
+    height = np.maximum(values[curve, cell], values[curve, cell + 1])
+    order = np.lexsort((-height, curve))
+    rank = np.arange(curve.size) - np.searchsorted(curve[order], curve[order])
+    kept = order[rank < REFINED]
+    return _climbed(system, peaks, at, curve[kept], theta[cell[kept]], theta[cell[kept] + 1])
+
+
+def _climbed(
+    system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curve: Indices,
+    low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
+) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
+    """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in."""
+    if not curve.size:
+        return peaks, at
+
+    def slope(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
+        return system.slopes(theta)[curve[which], np.arange(theta.size)]
+
+    every = np.arange(curve.size)
+    top = bracketed(slope, low, high, slope(low, every), slope(high, every), 1e-8)
+    value = np.abs(system.curves(top)[curve, every])
+    peaks, at = peaks.copy(), at.copy()
+    for k in range(CURVES):
+        own = np.flatnonzero(curve == k)
+        if own.size and value[own].max() > peaks[k]:
+            best = own[np.argmax(value[own])]
+            peaks[k], at[k] = value[best], top[best]
+    return peaks, at
+
+
+def _proved(
+    system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curves: Int[np.ndarray, " c"],
+    edges: list[Float[np.ndarray, " _"]],
+) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
+    """Return the peaks, raised until no arc of the level set just above them holds a larger value.
+
+    Raises
+    ------
+    ControlError
+        That does not come to an end.
+
+    """
+    for _ in range(MAX_ROUNDS):
+        own = np.repeat(curves, [row.size - 1 for row in edges])
+        low, high = np.concatenate([row[:-1] for row in edges]), np.concatenate([row[1:] for row in edges])
+        middle = 0.5 * (low + high)
+        values = np.abs(system.curves(middle)[own, np.arange(own.size)])
+        above = values > peaks[own] * (1.0 + PROOF)
+        if not np.any(above):
+            return peaks, at
+        own, low, high = own[above], low[above], high[above]
+        for k, value, theta in zip(own, values[above], middle[above], strict=True):
+            if value > peaks[k]:
+                peaks[k], at[k] = value, theta
+        every = np.arange(own.size)
+        rising = (system.slopes(low)[own, every] > 0.0) & (system.slopes(high)[own, every] < 0.0)
+        peaks, at = _climbed(system, peaks, at, own[rising], low[rising], high[rising])
+        curves = np.unique(own)
+        edges = arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])
+    raise ControlError(
+        f"the peaks of this loop are still rising after {MAX_ROUNDS} rounds, so that they cannot be stated; look at "
+        "modes of the plant or the law that lie closer to the unit circle than rounding resolves"
+    )

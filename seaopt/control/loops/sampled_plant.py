@@ -1,0 +1,383 @@
+r"""A plant as a digital controller sees it: sampled through a zero-order hold, one input to one output, with delay.
+
+Besides parameters, a plant has conditions, which stand in the same `ParameterSet` under these names:
+
+a state of the plant (``phi``)
+    It is linearised at rest there, the first input and the other states being what keeps it at rest, instead of at
+    zero.
+``delay_s``
+    Seconds of delay besides the controller's whole samples. With :math:`w` whole samples and a rest :math:`\tau` in
+    it, the older of two commands acts for :math:`\tau` and the newer for what is left of a period:
+    :math:`x^+ = e^{AT} x + [\Gamma(T) - \Gamma(T - \tau)] u_{k-w-1} + \Gamma(T - \tau) u_{k-w}` with
+    :math:`\Gamma(t) = \int_0^t e^{As} ds\, B` (Astrom, Wittenmark, Computer-Controlled Systems, 3rd ed., 2.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Complex, Float, Inexact
+
+from seaopt.errors import ControlError, UnitError, suggestion
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant, jacobians
+from seaopt.records import record
+from seaopt.units import factor
+
+StateSpace = tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]
+Linear = tuple[
+    Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k n"], Float[np.ndarray, " k"]
+]  # fmt: skip
+Held = tuple[
+    Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, " k"]
+]  # fmt: skip
+
+DELAY = "delay_s"
+MAPPED = 512  # plants in one call of CasADi
+REACH, DEGREE = 0.125, 10  # of the exponential's Taylor polynomial: 0.125^11 / 11! = 3e-18
+NEWTON_STEPS = 30
+
+
+@record(eq=False)
+class DigitalPlant:
+    """x+ = a x + b u, y = c x + d u at a sample time, and whole samples of delay before u.
+
+    Parameters
+    ----------
+    a, b, c, d
+        Matrices, shapes (n, n), (n,), (n,) and a number.
+    sample_time_s : float
+        Seconds.
+    delay_samples : int
+        From measurement to output, besides the hold.
+    static_gain : float
+        y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
+
+    """
+
+    a: Float[np.ndarray, "n n"]
+    b: Float[np.ndarray, " n"]
+    c: Float[np.ndarray, " n"]
+    d: float
+    sample_time_s: float
+    delay_samples: int
+    static_gain: float
+
+    @property
+    def nyquist_hz(self) -> float:
+        """Half the sample rate."""
+        return 0.5 / self.sample_time_s
+
+    def response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return P(z) z^-delay at frequencies in Hz."""
+        z = np.exp(2j * np.pi * f * self.sample_time_s)
+        n = self.b.size
+        inner = z[:, None, None] * np.eye(n) - self.a
+        x = np.linalg.solve(inner, np.broadcast_to(self.b[:, None].astype(complex), (f.size, n, 1)))[:, :, 0]
+        return (x @ self.c + self.d) * z**-self.delay_samples
+
+    def delayed(self) -> StateSpace:
+        """Return a state-space model that holds the delay as states."""
+        k, n = self.delay_samples, self.b.size
+        if k == 0:
+            return self.a, self.b, self.c, self.d
+        a = np.zeros((n + k, n + k))
+        a[:n, :n], a[:n, n + k - 1] = self.a, self.b
+        for i in range(1, k):
+            a[n + i, n + i - 1] = 1.0
+        b = np.zeros(n + k)
+        b[n] = 1.0
+        c = np.concatenate([self.c, np.zeros(k)])
+        c[n + k - 1] = self.d
+        return a, b, c, 0.0
+
+
+def sample(
+    plant: Plant, params: ParameterSet, measured: str, gain: float, sample_time_s: float, delay_samples: int
+) -> DigitalPlant:
+    """Return the digital plant from motor force to a measured force, linearised at rest.
+
+    Parameters
+    ----------
+    plant, params
+        The plant; its first input is the motor current. `params` may hold conditions too.
+    measured : str
+        The output that is fed back.
+    gain : float
+        A/N: the current that the controller commands for a motor force.
+    sample_time_s : float
+        Seconds.
+    delay_samples : int
+        Whole samples of delay.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output, or cannot rest where it is to be linearised.
+
+    """
+    values = np.array(plant.parameter_values(params))[:, None]
+    given = {name: np.array([value]) for name, value in conditions_of(plant, params).items()}
+    a, b, c, d = linearised(plant, values, given, measured, gain)
+    held = hold(a, b, c, d, sample_time_s, given.get(DELAY, np.zeros(1)))
+    return DigitalPlant(
+        a=held[0][0], b=held[1][0], c=held[2][0], d=float(held[3][0]), sample_time_s=sample_time_s,
+        delay_samples=delay_samples, static_gain=_static(a[0], b[0], c[0], float(d[0])),
+    )  # fmt: skip
+
+
+def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
+    """Return what a plant's `ParameterSet` may hold besides its parameters."""
+    found = {DELAY: Parameter(name=DELAY, value=0.0, unit="s", min=0.0, description="delay besides the controller's")}
+    for plant in plants:
+        found |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
+    return found
+
+
+def conditions_of(plant: Plant, params: ParameterSet) -> dict[str, float]:
+    """Return the conditions that parameters hold, in SI units, by name.
+
+    Raises
+    ------
+    ControlError
+        One is not finite, a delay is negative, or a unit is of another dimension.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> late = so.plants.thor().with_parameters(so.Parameter(name="delay_s", value=0.2, unit="ms"))
+    >>> conditions_of(so.plants.high_impedance(), late)
+    {'delay_s': 0.0002}
+
+    """
+    found: dict[str, float] = {}
+    for name, item in conditions((plant,)).items():
+        if name not in params:
+            continue
+        try:
+            found[name] = params[name].value * factor(params[name].unit, item.unit)
+        except UnitError as error:
+            raise ControlError(f"{name} = {params[name].value:g} {params[name].unit}: {error}") from error
+        if not (np.isfinite(found[name]) and found[name] >= item.min):
+            raise ControlError(f"{name} = {found[name]:g} {item.unit} is not finite or negative; give another")
+    return found
+
+
+def linearised(
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float
+) -> Linear:
+    """Return (a, b, c, d) from motor force to a measured output of k plants, one column of parameters each.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output, or cannot rest where it is to be linearised.
+
+    """
+    if measured not in plant.outputs:
+        raise ControlError(
+            f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
+        )
+    row = list(plant.outputs).index(measured)
+    a, b, c, d = _jacobians(plant, *_rest(plant, p, at), p)
+    return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
+
+
+def resting(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
+    """Return states and inputs at rest where the conditions among `params` are; zeros without any.
+
+    Raises
+    ------
+    ControlError
+        The plant cannot rest there.
+
+    Examples
+    --------
+    >>> import math, seaopt as so
+    >>> swing, thor = so.plants.moving_output(), so.plants.thor()
+    >>> x, u = resting(swing, thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad")))
+    >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
+    >>> print(f"{force:.2f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.2f} N")
+    -88.70 N, -88.70 N
+
+    """
+    at = {name: np.array([value]) for name, value in conditions_of(plant, params).items() if name != DELAY}
+    x, u = _rest(plant, np.array(plant.parameter_values(params))[:, None], at)
+    return x[:, 0], u[:, 0]
+
+
+def _rest(
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]]
+) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
+    """Return states and inputs at rest, by Newton's method in the first input and the states that are not given."""
+    count, names = p.shape[1], list(plant.states)
+    x, u = np.zeros((len(names), count)), np.zeros((len(plant.inputs), count))
+    fixed = [names.index(name) for name in at if name in names]
+    if not fixed or not any(np.any(at[names[i]]) for i in fixed):
+        return x, u
+    for i in fixed:
+        x[i] = at[names[i]]
+    loose = [i for i in range(len(names)) if i not in fixed]
+    if len(fixed) > 1:
+        raise ControlError(f"{', '.join(names[i] for i in fixed)} are both given; a plant rests at one of them")
+    for _ in range(NEWTON_STEPS):
+        (rates,) = _mapped(plant, "dynamics", x, u, p)
+        a, b, _, _ = _jacobians(plant, x, u, p)
+        try:
+            step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), rates.T[:, :, None])[..., 0].T
+        except np.linalg.LinAlgError:
+            break
+        x[loose] -= step[:-1]
+        u[0] -= step[-1]
+        size = np.max(np.abs(np.concatenate([x[loose], u[:1]])), axis=0)
+        if np.all(np.max(np.abs(step), axis=0) <= 1e-12 * np.maximum(size, 1e-6)):
+            return x, u
+    given = ", ".join(f"{names[i]} = {at[names[i]][0]:g}" for i in fixed)
+    raise ControlError(f"plant {plant.name} cannot rest at {given}, so it cannot be linearised there; give another")
+
+
+def linearised_along(
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]],
+    dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
+) -> tuple[Linear, Linear]:  # fmt: skip
+    """Return what `linearised` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
+    row, names = list(plant.outputs).index(measured), list(plant.states)
+    x, u = _rest(plant, p, at)
+    a, b, c, d = _jacobians(plant, x, u, p)
+    dx, du = np.zeros_like(x), np.zeros_like(u)
+    fixed = [names.index(name) for name in at if name in names]
+    if fixed:  # f(x, u, p) = 0 along the direction: linear in the loose states and the first input
+        loose = [i for i in range(len(names)) if i not in fixed]
+        for i in fixed:
+            dx[i] = dat[names[i]]
+        (drift,) = _mapped(plant, "drift", x, u, p, dp)
+        moved = drift.T[:, :, None] + a[:, :, fixed] @ dx[fixed].T[:, :, None]
+        step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), -moved)[..., 0].T
+        dx[loose], du[0] = step[:-1], step[-1]
+    da, db, dc, dd = _blocks(plant, _mapped(plant, "turn", x, u, p, dx, du, dp))
+    return (
+        (a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain),
+        (da, db[:, :, 0] * gain, dc[:, row], dd[:, row, 0] * gain),
+    )
+
+
+def _jacobians(
+    plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
+) -> tuple[Float[np.ndarray, "k _ _"], ...]:
+    """Return A, B, C and D of k plants."""
+    return _blocks(plant, _mapped(plant, "jacobians", x, u, p))
+
+
+def _blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:
+    """Return matrices as CasADi maps them, side by side, as stacks."""
+    nx, nu, ny = len(plant.states), len(plant.inputs), len(plant.outputs)
+    shapes = ((nx, nx), (nx, nu), (ny, nx), (ny, nu))
+    return tuple(
+        item.reshape(rows, -1, width).transpose(1, 0, 2) for item, (rows, width) in zip(columns, shapes, strict=True)
+    )
+
+
+def _mapped(plant: Plant, what: str, *arguments: Float[np.ndarray, "_ k"]) -> list[Float[np.ndarray, "_ _"]]:
+    """Return a function of `_function` at every column, in blocks that CasADi maps over."""
+    function = jacobians(plant) if what == "jacobians" else _function(plant, what)
+    count = arguments[0].shape[1]
+    block = 1 if count == 1 else MAPPED
+    key = f"{what} of {block}"
+    if key not in plant.cache:
+        plant.cache[key] = function if block == 1 else function.map(block)
+    parts: list[list[Any]] = []
+    for start in range(0, count, block):
+        own = [item[:, start : start + block] for item in arguments]
+        width = own[0].shape[1]
+        found = plant.cache[key].call([ca.DM(np.pad(item, ((0, 0), (0, block - width)), "edge")) for item in own])
+        columns = [item.shape[1] // block for item in found]
+        parts.append([np.array(item)[:, : each * width] for item, each in zip(found, columns, strict=True)])
+    return [np.concatenate(items, axis=1) for items in zip(*parts, strict=True)]
+
+
+def _function(plant: Plant, what: str) -> Any:
+    """Return a CasADi function, made once a plant.
+
+    dynamics: (x, u, p) to f; drift: f's derivative along dp; turn: that of A, B, C and D along (dx, du, dp).
+    """
+    if what not in plant.cache:
+        given = [plant.x, plant.u, plant.p]
+        x, u, p = (ca.SX.sym("along", item.shape[0]) for item in given)
+        dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
+        if what == "dynamics":
+            found, wanted = given, [dynamics]
+        elif what == "drift":
+            found, wanted = [*given, p], [ca.jtimes(dynamics, plant.p, p)]
+        else:
+            along = ca.vertcat(x, u, p)
+            wanted = [ca.densify(ca.jtimes(item, ca.vertcat(*given), along)) for item in jacobians(plant).call(given)]
+            found = [*given, x, u, p]
+        plant.cache[what] = ca.Function(what, found, wanted)
+    return plant.cache[what]
+
+
+def hold(
+    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], c: Inexact[np.ndarray, "k n"],
+    d: Inexact[np.ndarray, " k"], sample_time_s: float, delay_s: Inexact[np.ndarray, " k"],
+) -> Held:  # fmt: skip
+    """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's.
+
+    Imaginary parts come through as derivatives do: with 1e-20 of a
+    direction added as one, those of the result are 1e-20 of its derivative (complex step).
+    """
+    whole_period, gamma = _exponential(a, b, np.full(delay_s.size, sample_time_s))
+    if not np.any(delay_s):
+        return whole_period, gamma, c, d
+    whole = np.floor(np.real(delay_s) / sample_time_s + 1e-9).astype(int)
+    rest = delay_s - whole * sample_time_s
+    rest = rest - np.minimum(np.real(rest), 0.0)
+    newer = _exponential(a, b, sample_time_s - rest)[1]
+    count, n, chain = a.shape[0], a.shape[1], int(whole.max()) + 1
+    rows = np.arange(count)
+    drive = np.zeros((count, n, chain + 1), dtype=newer.dtype)  # column i: the command i samples ago
+    through = np.zeros((count, chain + 1), dtype=d.dtype)
+    drive[rows, :, whole] = newer
+    drive[rows, :, whole + 1] += gamma - newer
+    through[rows, np.where(np.real(rest) > 0.0, whole + 1, whole)] = d  # the output is read before the command changes
+    big = np.zeros((count, n + chain, n + chain), dtype=drive.dtype)
+    late = np.zeros((count, n + chain), dtype=drive.dtype)
+    big[:, :n, :n], big[:, :n, n:] = whole_period, drive[:, :, 1:]
+    late[:, :n], late[:, n] = drive[:, :, 0], 1.0
+    for i in range(1, chain):
+        big[:, n + i, n + i - 1] = 1.0
+    return big, late, np.concatenate([c, through[:, 1:]], axis=1), through[:, 0]
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a plant far off may overflow: the loop is then not stable
+def _exponential(
+    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], t: Inexact[np.ndarray, " k"]
+) -> tuple[Inexact[np.ndarray, "k n n"], Inexact[np.ndarray, "k n"]]:
+    """Return exp(a t) and the integral of exp(a s) b from 0 to t: Taylor's polynomial, scaled and squared."""
+    n = a.shape[1]
+    block = np.zeros((a.shape[0], n + 1, n + 1), dtype=np.result_type(a, b, t))
+    block[:, :n, :n], block[:, :n, n] = a, b
+    block *= t[:, None, None]
+    norm = np.max(np.sum(np.abs(block), axis=2), axis=1, initial=0.0)
+    norm = np.where(np.isfinite(norm), norm, 0.0)
+    # Each its own: squared as often as the stiffest of them needs, the others would lose their digits.
+    squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, 1e-300) / REACH))).astype(int)
+    block *= np.ldexp(1.0, -squarings)[:, None, None]
+    one = np.eye(n + 1)
+    out = one + block / DEGREE
+    for k in range(DEGREE - 1, 0, -1):
+        out = one + block @ out / k
+    for done in range(int(squarings.max(initial=0))):
+        live = squarings > done
+        out[live] = out[live] @ out[live]
+    return out[:, :n, :n], out[:, :n, n]
+
+
+def _static(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float) -> float:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        try:
+            return float(d - c @ np.linalg.solve(a, b)) if np.linalg.cond(a) < 1e14 else np.inf
+        except np.linalg.LinAlgError:
+            return np.inf

@@ -1,0 +1,38 @@
+"""A transfer function in q = z^-1, as loops and control laws are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+ROUNDING = 1e-17
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TransferFunction:
+    """num(q)/den(q): coefficients in ascending powers of q = z^-1, den[0] = 1."""
+
+    num: Float[np.ndarray, " n"]
+    den: Float[np.ndarray, " m"]
+
+    def response(self, f: Float[np.ndarray, " k"], sample_time_s: float) -> Complex[np.ndarray, " k"]:
+        """Return the values at frequencies in Hz; next to a pole on the circle, no more than rounding allows."""
+        q = np.exp(-2j * np.pi * f * sample_time_s)
+        below = np.polynomial.polynomial.polyval(q, self.den)
+        least = ROUNDING * np.sum(np.abs(self.den))
+        return np.polynomial.polynomial.polyval(q, self.num) / np.where(np.abs(below) < least, least, below)
+
+    def state_space(
+        self,
+    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+        """Return a controllable canonical realisation."""
+        n = max(self.num.size, self.den.size) - 1
+        num, den = np.zeros(n + 1), np.zeros(n + 1)
+        num[: self.num.size], den[: self.den.size] = self.num, self.den
+        a, b = np.zeros((n, n)), np.zeros(n)
+        if n:
+            a[0], b[0] = -den[1:], 1.0
+            a[1:, :-1] = np.eye(n - 1)
+        return a, b, num[1:] - num[0] * den[1:], float(num[0])

@@ -1,0 +1,379 @@
+r"""A Kalman filter of an identified plant: forces, spring rate and motion of the links from what is measured.
+
+The plant is linearised at rest and sampled through a zero-order hold; white noise w and random walk d of its inputs
+(see `noise`) are states beside its own, so that :math:`z = [x, w, d]` and
+
+.. math::
+    z_{k+1} = A z_k + B u_{k-n} + v_k, \quad y_k = C z_k + D u_{k-n} + e_k, \qquad
+    \hat z_{k|k} = \hat z_k + L \epsilon_k, \quad \hat z_{k+1} = A \hat z_{k|k} + B u_{k-n}
+
+with n whole samples of delay, innovations :math:`\epsilon_k = y_k - C \hat z_k - D u_{k-n}` and the steady-state gain
+:math:`L = P C^T S^{-1}`, :math:`S = C P C^T + R`, where P solves the discrete algebraic Riccati equation. If plant and
+noise are right the innovations are white with covariance S: `run` tests that on a log (Ljung and Box, Biometrika 65,
+1978).
+
+Every matrix is public: a step is two products of small matrices, as easily written in C.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.mpc.estimates import augmented, disturbances_of, estimates
+from seaopt.control.mpc.noise import NoiseModel
+from seaopt.errors import ControlError, suggestion
+from seaopt.estimation import Fit
+from seaopt.estimation.problem.correlation import autocorrelation, ljung_box
+from seaopt.logs import Log
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant, state_space
+from seaopt.records import record
+from seaopt.simulation.discretisation import expm_with_derivatives
+from seaopt.simulation.simulate import input_samples
+
+LAGS = 20
+RATE_TOLERANCE = 1e-6  # of the log's period against the estimator's
+
+
+@record(eq=False)
+class EstimatorState:
+    """What the filter knows after a sample.
+
+    Parameters
+    ----------
+    predicted : array, shape (n,)
+        z of the next sample, before it is measured.
+    corrected : array, shape (n,)
+        z of this sample, with its measurement.
+    applied : array, shape (nu,)
+        What reached the plant's inputs at this sample.
+    past : array, shape (delay_samples, nu)
+        Inputs that are on their way, oldest first.
+    innovation : array, shape (ny,)
+        Measured less predicted, in the outputs' units; NaN where nothing was measured.
+
+    """
+
+    predicted: Float[np.ndarray, " n"]
+    corrected: Float[np.ndarray, " n"]
+    applied: Float[np.ndarray, " nu"]
+    past: Float[np.ndarray, "delay nu"]
+    innovation: Float[np.ndarray, " ny"]
+
+
+@record(eq=False)
+class EstimatorRun:
+    """A filter's pass over a log.
+
+    Parameters
+    ----------
+    time : array, shape (m,)
+        Seconds.
+    values : mapping of name to array, shape (m,)
+        Estimates with each sample's measurement, the names being those of `Estimator.names`.
+    std : mapping of name to float
+        Their standard deviations, once the filter has settled.
+    innovations : mapping of output to array, shape (m,)
+    whiteness_p : mapping of output to float
+        Ljung-Box p-values over 20 lags, the settling left out; small means coloured.
+    settled : int
+        First sample that the test counts.
+
+    """
+
+    time: Float[np.ndarray, " m"]
+    values: Mapping[str, Float[np.ndarray, " m"]]
+    std: Mapping[str, float]
+    innovations: Mapping[str, Float[np.ndarray, " m"]]
+    whiteness_p: Mapping[str, float]
+    settled: int
+
+    def __getitem__(self, name: str) -> Float[np.ndarray, " m"]:
+        """Return one estimate over the log."""
+        if name not in self.values:
+            raise ControlError(f'no estimate "{name}"; {suggestion(name, self.values)}')
+        return self.values[name]
+
+
+@record(eq=False)
+class Estimator:
+    """A steady-state Kalman filter; `estimator` makes one.
+
+    Parameters
+    ----------
+    plant : Plant
+    outputs : tuple of str
+        Measured, in the order of y.
+    sample_time_s : float
+    delay_samples : int
+        Whole samples from an input to the plant.
+    noise : NoiseModel
+    A, B, C, D : arrays
+        The sampled plant with its disturbances, shapes (n, n), (n, nu), (ny, n), (ny, nu).
+    gain : array, shape (n, ny)
+        L, from innovation to correction.
+    covariance : array, shape (n, n)
+        Of the error of the corrected z.
+    innovation_covariance : array, shape (ny, ny)
+        S.
+    offset : array, shape (ny,)
+        Of the sensors.
+    names, units : tuple of str
+        What is estimated: every output and state of the plant, the deflection and rate of its spring, and each
+        disturbance, as ``I_drift``.
+    G, H : arrays, shapes (nz, n), (nz, nu)
+        The estimates are G z + H u.
+
+    """
+
+    plant: Plant
+    outputs: tuple[str, ...]
+    sample_time_s: float
+    delay_samples: int
+    noise: NoiseModel
+    A: Float[np.ndarray, "n n"]
+    B: Float[np.ndarray, "n nu"]
+    C: Float[np.ndarray, "ny n"]
+    D: Float[np.ndarray, "ny nu"]
+    gain: Float[np.ndarray, "n ny"]
+    covariance: Float[np.ndarray, "n n"]
+    innovation_covariance: Float[np.ndarray, "ny ny"]
+    offset: Float[np.ndarray, " ny"]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    G: Float[np.ndarray, "nz n"]
+    H: Float[np.ndarray, "nz nu"]
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviation of each estimate once the filter has settled; it counts the noise, not the parameters."""
+        variance = np.einsum("ij,jk,ik->i", self.G, self.covariance, self.G)
+        return dict(zip(self.names, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True))
+
+    @property
+    def start(self) -> EstimatorState:
+        """The plant at rest at zero, nothing on its way."""
+        n, nu = self.B.shape
+        return EstimatorState(
+            predicted=np.zeros(n), corrected=np.zeros(n), applied=np.zeros(nu),
+            past=np.zeros((self.delay_samples, nu)), innovation=np.full(len(self.outputs), np.nan),
+        )  # fmt: skip
+
+    def correct(
+        self, state: EstimatorState, y: Float[np.ndarray, " ny"], applied: Float[np.ndarray, " nu"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " ny"]]:
+        """Return z with this sample's measurement, and the innovation; a NaN measurement corrects nothing."""
+        innovation = y - self.offset - self.C @ state.predicted - self.D @ applied
+        return state.predicted + self.gain @ np.where(np.isnan(innovation), 0.0, innovation), innovation
+
+    def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
+        """Take one sample in: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
+        line = np.vstack([state.past, u])
+        applied = line[0]
+        corrected, innovation = self.correct(state, y, applied)
+        return EstimatorState(
+            predicted=self.A @ corrected + self.B @ applied, corrected=corrected, applied=applied, past=line[1:],
+            innovation=innovation,
+        )  # fmt: skip
+
+    def values(self, state: EstimatorState) -> dict[str, float]:
+        """Return the estimates of the last sample by name, in `units`."""
+        found = self.G @ state.corrected + self.H @ state.applied
+        return dict(zip(self.names, found.tolist(), strict=True))
+
+    def run(self, log: Log) -> EstimatorRun:
+        """Filter a log from rest; channels carry the plant's names.
+
+        Raises
+        ------
+        ControlError
+            The log's rate is not the filter's, or it has gaps or missing samples.
+        LogError
+            An input or a measured output is not in the log.
+
+        """
+        u, y = self._samples(log)
+        settled = min(self._settling(), len(log) // 2)
+        late = np.vstack([np.zeros((self.delay_samples, u.shape[1])), u])[: len(log)]
+        closed = self.A @ (np.eye(len(self.A)) - self.gain @ self.C)
+        drive = late @ (self.B - self.A @ self.gain @ self.D).T + (y - self.offset) @ (self.A @ self.gain).T
+        predicted = np.vstack([np.zeros(len(closed)), recursion(closed, drive)[:-1]])
+        innovations = y - self.offset - predicted @ self.C.T - late @ self.D.T
+        found = (predicted + innovations @ self.gain.T) @ self.G.T + late @ self.H.T
+        return EstimatorRun(
+            time=log.time,
+            values=dict(zip(self.names, found.T.copy(), strict=True)),
+            std=self.std,
+            innovations=dict(zip(self.outputs, innovations.T.copy(), strict=True)),
+            whiteness_p={
+                name: ljung_box(autocorrelation(channel, LAGS)[1:], channel.size)
+                for name, channel in zip(self.outputs, innovations[settled:].T, strict=True)
+            },
+            settled=settled,
+        )
+
+    def _settling(self) -> int:
+        """Samples until an error at the start has shrunk a thousandfold."""
+        radius = float(np.max(np.abs(np.linalg.eigvals(self.A @ (np.eye(len(self.A)) - self.gain @ self.C)))))
+        return int(np.ceil(np.log(1e-3) / np.log(min(max(radius, 1e-3), 1.0 - 1e-12))))
+
+    def _samples(self, log: Log) -> tuple[Float[np.ndarray, "m nu"], Float[np.ndarray, "m ny"]]:
+        if abs(log.period / self.sample_time_s - 1.0) > RATE_TOLERANCE:
+            raise ControlError(
+                f"{log.source} is sampled every {log.period:.6g} s, the estimator every {self.sample_time_s:.6g} s; "
+                "make one with the log's sample_time_s"
+            )
+        if len(log.segments) > 1:
+            raise ControlError(f"{log.source} has gaps; run each stretch by itself (log.between)")
+        y = np.column_stack([log[name] for name in self.outputs])
+        for name, channel in zip(self.outputs, y.T, strict=True):
+            if not np.all(np.isfinite(channel)):
+                row = int(np.argmin(np.isfinite(channel)))
+                raise ControlError(
+                    f"{log.source}: output {name} is missing at t = {log.time[row]:g} s; cut there (log.between), or "
+                    "take it in sample by sample with `step`"
+                )
+        return np.column_stack(input_samples(self.plant, log)), y
+
+    def __repr__(self) -> str:
+        rows = [
+            f"  {name:<12} ± {std:.3g} {unit}" for (name, std), unit in zip(self.std.items(), self.units, strict=True)
+        ]
+        plural = "" if self.delay_samples == 1 else "s"
+        delay = f", delay of {self.delay_samples} sample{plural}" if self.delay_samples else ""
+        head = f"Estimator of {self.plant.name} from {', '.join(self.outputs)} at {1 / self.sample_time_s:g} Hz{delay}"
+        return "\n".join([head, *rows])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def estimator(
+    plant: Plant,
+    params: ParameterSet | Fit,
+    noise: NoiseModel,
+    *,
+    outputs: tuple[str, ...] = ("F1",),
+    sample_time_s: float = 1e-3,
+    delay_samples: int = 0,
+) -> Estimator:
+    """Return the steady-state Kalman filter of a plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        Linearised at rest at zero; friction f_c must be zero, for dry friction has no linearisation there.
+    params : ParameterSet or Fit
+        Its parameters.
+    noise : NoiseModel
+        Of the measured outputs and of the inputs.
+    outputs : tuple of str
+        What is measured.
+    sample_time_s : float
+        Seconds.
+    delay_samples : int
+        Whole samples from a commanded input to the plant.
+
+    Raises
+    ------
+    ControlError
+        A name is unknown, a number is out of range, nothing but the sensors is noisy, or something that does not die
+        out by itself is seen by no sensor.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import NoiseModel, estimator
+    >>> noise = NoiseModel(sensor_std={"F1": 2.0}, input_noise={"I": 0.01})
+    >>> kalman = estimator(so.plants.high_impedance(), so.plants.thor(), noise, sample_time_s=1 / 400)
+    >>> kalman.std["F1"] < 2.0, kalman.units[kalman.names.index("spring_rate")]
+    (True, 'm/s')
+
+    """
+    values = params.parameters if isinstance(params, Fit) else params
+    chosen = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    _check(plant, values, noise, chosen, sample_time_s, delay_samples)
+    a, b, c, d = state_space(plant, values)
+    nx, nu = b.shape
+    block = np.zeros((nx + nu, nx + nu))
+    block[:nx, :nx], block[:nx, nx:] = a, b
+    whole, _ = expm_with_derivatives(block * sample_time_s, np.zeros((0, nx + nu, nx + nu)))
+    disturbances = disturbances_of(plant, noise, sample_time_s)
+    A, B, Q = augmented(whole[:nx, :nx], whole[:nx, nx:], disturbances)
+    columns = [column for column, _, _ in disturbances]
+    rows = [list(plant.outputs).index(name) for name in chosen]
+    C, D = np.hstack([c, d[:, columns]])[rows], d[rows]
+    R = np.diag([noise.sensor_std[name] ** 2 for name in chosen])
+    P = _riccati(plant, chosen, A, C, Q, R)
+    S = C @ P @ C.T + R
+    gain = np.linalg.solve(S, C @ P).T
+    keep = np.eye(len(A)) - gain @ C
+    names, units, G, H = estimates(plant, values, (a, b, c, d), disturbances)
+    return Estimator(
+        plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples, noise=noise,
+        A=A, B=B, C=C, D=D, gain=gain, covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
+        offset=np.array([noise.offset.get(name, 0.0) for name in chosen]), names=names, units=units, G=G, H=H,
+    )  # fmt: skip
+
+
+def _check(
+    plant: Plant, params: ParameterSet, noise: NoiseModel, outputs: tuple[str, ...], sample_time_s: float, delay: int
+) -> None:
+    for name in outputs:
+        if name not in plant.outputs:
+            raise ControlError(f'output "{name}" is not one of {plant.name}; {suggestion(name, plant.outputs)}')
+    if not outputs or len(set(outputs)) < len(outputs):
+        raise ControlError(f"outputs = {outputs}; name each measured output once")
+    if not 0.0 < sample_time_s < np.inf:
+        raise ControlError(f"sample_time_s = {sample_time_s!r} is not a time; give seconds above zero")
+    if isinstance(delay, bool) or not isinstance(delay, int) or delay < 0:
+        raise ControlError(f"delay_samples = {delay!r} is not a whole number of samples; give 0, 1, ...")
+    complete = plant.complete(params)
+    if "f_c" in complete and complete["f_c"].value != 0.0:
+        raise ControlError(
+            f"f_c = {complete['f_c'].value:g}: dry friction at rest has no linear model; set f_c = 0 and let "
+            "input_noise or input_drift stand for it"
+        )
+    if not isinstance(noise, NoiseModel):
+        raise ControlError(f"noise is a {type(noise).__name__}; give a NoiseModel")
+    noise.check(plant, outputs)
+    if not any([*noise.input_noise.values(), *noise.input_drift.values()]):
+        raise ControlError("noise: nothing but the sensors is noisy; give input_noise or input_drift above zero")
+
+
+def _riccati(
+    plant: Plant, outputs: tuple[str, ...], A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"],
+    Q: Float[np.ndarray, "n n"], R: Float[np.ndarray, "ny ny"],
+) -> Float[np.ndarray, "n n"]:  # fmt: skip
+    """Return the covariance of the prediction in steady state."""
+    from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
+
+    poles, modes = np.linalg.eig(A)
+    seen = np.linalg.norm((C / np.sqrt(np.diag(R))[:, None]) @ modes, axis=0)
+    size = np.linalg.norm(np.abs(C / np.sqrt(np.diag(R))[:, None]) @ np.abs(modes), axis=0) + 1e-300
+    for k in np.flatnonzero((np.abs(poles) > 1.0 - 1e-9) & (seen <= 1e-9 * size)):
+        states = [*plant.states, *["a disturbance"] * len(A)]
+        name = states[int(np.argmax(np.abs(modes[:, k])))]
+        raise ControlError(
+            f"{name} of {plant.name} does not die out and {', '.join(outputs)} cannot see it; measure another output"
+        )
+    try:
+        return np.asarray(solve_discrete_are(A.T, C.T, Q, R))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ControlError(
+            f"no steady filter of {plant.name} from {', '.join(outputs)} ({error}); "
+            "measure more outputs, or give noise to every input"
+        ) from error
+
+
+def recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+    """Return x with x[k] = a x[k-1] + v[k], x[-1] = 0, by doubling the reach until a's power has died out."""
+    x, power, reach = v, a, 1
+    while reach < len(v) and np.max(np.abs(power)) > 1e-18:
+        x = np.vstack([x[:reach], x[reach:] + x[:-reach] @ power.T])
+        power, reach = power @ power, 2 * reach
+    return x

@@ -1,0 +1,93 @@
+"""The C code of a `ForceMPC`: OSQP's own, generated for its program, and one step function around it."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
+from seaopt.control.mpc.quadratic_program import RHO, make_solver
+from seaopt.errors import FileError
+from seaopt.files import write_text
+
+OWN = ("force_mpc.h", "force_mpc.c", "example.c")
+LEFT_OUT = ("emosqp.c", "Makefile")  # OSQP's demonstration, which has a main of its own
+
+
+def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = False) -> Path:
+    """Write a controller as C99 that allocates nothing and needs no library; return the folder.
+
+    ``force_mpc.h`` says how to compile and call it; ``example.c`` is a program around it. A step does what
+    `ForceMPC.step` does, with the same checks and the same safe current.
+
+    Parameters
+    ----------
+    mpc : ForceMPC
+        As `force_mpc` makes it.
+    folder : path
+        Made if it is not there; files of these names in it are written anew.
+    single_precision : bool
+        float instead of double.
+
+    Raises
+    ------
+    FileError
+        The folder cannot be written.
+
+    """
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        make_solver(mpc.prediction).codegen(
+            str(target), parameters="matrices", extension_name=None, force_rewrite=True, use_float=single_precision,
+            prefix="force_mpc_",
+        )  # fmt: skip
+        for name in LEFT_OUT:
+            (target / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
+    for name in OWN:
+        write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
+    write_text(target / "force_mpc_data.h", _data(mpc))
+    return target
+
+
+def _data(mpc: ForceMPC) -> str:
+    kalman, prediction, spec = mpc.kalman, mpc.prediction, mpc.spec
+    rows = prediction.knots.size + len(prediction.M)
+    sizes = {
+        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": spec.delay_samples,
+        "KNOTS": prediction.knots.size, "ROWS": rows,
+    }  # fmt: skip
+    numbers = {
+        "limit": spec.current_limit_A, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
+        "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO,
+    }  # fmt: skip
+    arrays = {
+        "A": kalman.A, "B": kalman.B[:, 0], "C": kalman.C[0], "gain": kalman.gain[:, 0], "rest": mpc.rest,
+        "F": prediction.F, "M": prediction.M, "shift": mpc.shift,
+    }  # fmt: skip
+    lines = [f"#define FORCE_MPC_{name} {value}" for name, value in sizes.items()]
+    lines += [f"static const OSQPFloat mpc_{name} = {_number(value)};" for name, value in numbers.items() if
+              np.isfinite(value)]  # fmt: skip
+    lines += [_array(name, value) for name, value in arrays.items() if value.size]
+    return "\n".join(
+        ["/* Sizes and numbers of one controller. */", "#ifndef FORCE_MPC_DATA_H", "#define FORCE_MPC_DATA_H",
+         '#include "osqp_api_types.h"', *lines, "#endif", ""]
+    )  # fmt: skip
+
+
+def _number(value: float) -> str:
+    return f"(OSQPFloat){value:.17g}"
+
+
+def _array(name: str, value: Float[np.ndarray, "..."]) -> str:
+    shape = "".join(f"[{n}]" for n in value.shape)
+    if value.ndim == 1:
+        body = ", ".join(map(_number, value))
+    else:
+        body = ",\n ".join("{" + ", ".join(map(_number, line)) + "}" for line in value)
+    return f"static const OSQPFloat mpc_{name}{shape} = {{{body}}};"

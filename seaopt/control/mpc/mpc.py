@@ -1,0 +1,389 @@
+r"""Constrained force control: a quadratic program a sample, within the motor's current and current slew.
+
+Each sample a Kalman filter (see `estimator`) corrects plant and disturbance with the measured force; the state is
+predicted over the delay with the currents that are on their way; the targets that hold the reference against the
+disturbance,
+
+.. math:: u_s = \operatorname{clip}(F_\mathrm{ref}/g - \hat d,\ \pm I_\mathrm{max}), \qquad
+          x_s = (I - A)^{-1} b\,(u_s + \hat d),
+
+make the force free of offset wherever a current within limits can (Pannocchia and Rawlings, AIChE J. 49, 2003); and
+the program of `prediction`, which always has a solution, is solved from the last one shifted by a sample.
+
+What the solver returns is not trusted: its status is checked, its currents are held against the limits, and the one
+that is used is clipped to them. If it fails, the current goes towards :math:`u_s` as fast as the slew limit lets it,
+and the step says so.
+"""
+
+from __future__ import annotations
+
+import html
+import time
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
+from seaopt.control.mpc.noise import NoiseModel
+from seaopt.control.mpc.prediction import Prediction, Regulator, condense, regulator_of_bandwidth, spread_knots
+from seaopt.control.mpc.quadratic_program import make_solver, solved
+from seaopt.control.mpc.spec import MPCSpec
+from seaopt.control.tuning.tuner import current_per_force
+from seaopt.errors import ControlError, suggestion
+from seaopt.estimation import Fit
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant, state_space
+from seaopt.records import record
+
+VIOLATION = 1e-2  # of the limits; a solution further outside is not used
+SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
+
+
+@record(eq=False)
+class MPCState:
+    """What the controller carries from sample to sample.
+
+    Parameters
+    ----------
+    kalman : EstimatorState
+    current_A : float
+        The last command.
+    plan : array, shape (n,)
+        The currents planned at the knots, A.
+    dual : array, shape (m,)
+        Of the last program, where the next starts.
+
+    """
+
+    kalman: EstimatorState
+    current_A: float
+    plan: Float[np.ndarray, " n"]
+    dual: Float[np.ndarray, " m"]
+
+
+@record(eq=False)
+class MPCStep:
+    """One sample's result.
+
+    Parameters
+    ----------
+    current_A : float
+        The command, within limits.
+    state : MPCState
+        For the next step.
+    solved : bool
+        False: the solver failed, and the current is the safe one.
+    status : str
+        The solver's, or what was wrong with its solution.
+    force_N : float
+        Estimate of the measured force, with this sample.
+    target_N : float
+        The reference, or the nearest force that the current limit can hold.
+    iterations : int
+        Of the solver.
+    solve_time_s : float
+        The solver's own, in C.
+    step_time_s : float
+        The whole step's, in Python.
+
+    """
+
+    current_A: float
+    state: MPCState
+    solved: bool
+    status: str
+    force_N: float
+    target_N: float
+    iterations: int
+    solve_time_s: float
+    step_time_s: float
+
+
+@record(eq=False)
+class ForceMPC:
+    """A force controller within limits; `force_mpc` makes one.
+
+    Parameters
+    ----------
+    spec : MPCSpec
+    design : (Plant, ParameterSet)
+    kalman : Estimator
+    regulator : Regulator
+        What it is without limits.
+    prediction : Prediction
+        The quadratic program.
+    static_gain : float
+        N/A.
+    rest : array, shape (nx,)
+        The plant's state at rest per ampere.
+    shift : array, shape (n, n)
+        The plan at the knots one sample later.
+
+    """
+
+    spec: MPCSpec
+    design: tuple[Plant, ParameterSet]
+    kalman: Estimator
+    regulator: Regulator
+    prediction: Prediction
+    static_gain: float
+    rest: Float[np.ndarray, " nx"]
+    shift: Float[np.ndarray, "n n"]
+    solver: Any
+
+    @property
+    def start(self) -> MPCState:
+        """At rest at zero."""
+        n, m = self.prediction.knots.size, self.prediction.knots.size + len(self.prediction.M)
+        return MPCState(kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), dual=np.zeros(m))
+
+    def step(self, state: MPCState, reference_N: float, measurement_N: float) -> MPCStep:
+        """Return the current for a reference and a measured force; a NaN measurement is predicted instead.
+
+        Raises
+        ------
+        ControlError
+            The reference is not a finite number.
+
+        """
+        began = time.perf_counter()
+        if not np.isfinite(reference_N):
+            raise ControlError(f"reference_N = {reference_N}: not a force; hold the last one instead")
+        limit, last = self.spec.current_limit_A, state.current_A
+        corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
+        xi, u_s, target = self._targets(ahead, reference_N)
+        q, low, high = self.program(xi, u_s, last)
+        first = (self.shift @ state.plan - u_s) / limit
+        theta, dual, status, info = solved(self.solver, q, low, high, first, state.dual)
+        status = status or self._fault(theta, low, high)
+        if status:
+            theta, dual = np.zeros_like(q), np.zeros_like(low)
+            plan = np.full(q.size, u_s)
+            current = u_s
+        else:
+            plan = limit * theta + u_s
+            current = float(plan[0])
+        current = self.admissible(current, last)
+        kalman = self._advance(state.kalman, corrected, innovation, current)
+        return MPCStep(
+            current_A=current, solved=not status, status=status or "solved", target_N=target,
+            state=MPCState(kalman=kalman, current_A=current, plan=plan, dual=dual),
+            force_N=float(self.kalman.C[0] @ corrected), iterations=int(info.iter), solve_time_s=float(info.run_time),
+            step_time_s=time.perf_counter() - began,
+        )  # fmt: skip
+
+    def command(self, state: MPCState, reference_N: float, measurement_N: float) -> tuple[float, MPCState]:
+        """Return the current and the next state alone, as `close_loop` takes them."""
+        result = self.step(state, reference_N, measurement_N)
+        return result.current_A, result.state
+
+    def admissible(self, current_A: float, last_A: float) -> float:
+        """Return the current nearest to one given that slew and size allow after the last."""
+        limit, slew = self.spec.current_limit_A, self.spec.slew_per_sample_A
+        return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -limit, limit))
+
+    def program(
+        self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows."""
+        limit, one = self.spec.current_limit_A, np.ones(self.prediction.knots.size)
+        slopes = np.zeros(len(self.prediction.M))
+        if slopes.size:
+            slopes[0] = (last_A - u_s) / self.spec.slew_per_sample_A
+        q = self.prediction.F @ np.append(xi, last_A - u_s)
+        low = np.concatenate([(-1.0 - u_s / limit) * one, slopes - 1.0])
+        high = np.concatenate([(1.0 - u_s / limit) * one, slopes + 1.0])
+        return q, low, high
+
+    def _observe(
+        self, kalman: EstimatorState, measurement: float
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " 1"], Float[np.ndarray, " n"]]:
+        """Return z with the measurement, the innovation, and z when a current commanded now arrives."""
+        line = kalman.past
+        applied = line[0] if len(line) else np.zeros(self.kalman.B.shape[1])  # D = 0: it does not matter
+        corrected, innovation = self.kalman.correct(kalman, np.array([measurement]), applied)
+        ahead = corrected
+        for u in line:
+            ahead = self.kalman.A @ ahead + self.kalman.B @ u
+        return corrected, innovation, ahead
+
+    def _targets(
+        self, ahead: Float[np.ndarray, " n"], reference: float
+    ) -> tuple[Float[np.ndarray, " nx"], float, float]:
+        """Return the state's distance from its target, the target current, and the force it holds."""
+        limit, nx, drift = self.spec.current_limit_A, self.rest.size, float(ahead[-1])
+        u_s = float(np.clip(reference / self.static_gain - drift, -limit, limit))
+        return ahead[:nx] - self.rest * (u_s + drift), u_s, self.static_gain * (u_s + drift)
+
+    def _fault(
+        self, theta: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]
+    ) -> str:
+        rows = np.concatenate([theta, self.prediction.M @ theta])
+        outside = float(np.max(np.maximum(low - rows, rows - high)))
+        return "" if outside <= VIOLATION else f"solution breaks a limit by {outside:.1%} of it"
+
+    def _advance(
+        self, kalman: EstimatorState, corrected: Float[np.ndarray, " n"], innovation: Float[np.ndarray, " 1"],
+        current: float,
+    ) -> EstimatorState:  # fmt: skip
+        u = np.zeros(self.kalman.B.shape[1])
+        u[0] = current
+        line = np.vstack([kalman.past, u])
+        return EstimatorState(
+            predicted=self.kalman.A @ corrected + self.kalman.B @ line[0], corrected=corrected, applied=line[0],
+            past=line[1:], innovation=innovation,
+        )  # fmt: skip
+
+    def unlimited(self) -> tuple[TransferFunction, TransferFunction]:
+        """Return what the controller is as long as no limit is active, I = C_r F_ref - C_y F_meas in A/N."""
+        gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.spec.current_limit_A
+        n, delay = len(self.kalman.A), self.spec.delay_samples
+        past = max(delay, 1)  # of which the last command is one
+
+        def respond(s: Float[np.ndarray, " k"], r: float, y: float) -> Float[np.ndarray, " k1"]:
+            z, line = s[:n], s[n:]
+            corrected = z + self.kalman.gain[:, 0] * (y - self.kalman.C[0] @ z)
+            ahead, b = corrected, self.kalman.B[:, 0]
+            for u in line[past - delay :]:
+                ahead = self.kalman.A @ ahead + b * u
+            u_s = r / self.static_gain - ahead[-1]
+            xi = ahead[: self.rest.size] - self.rest * r / self.static_gain
+            current = u_s + gains @ np.append(xi, line[-1] - u_s)
+            queue = np.append(line, current)
+            after = self.kalman.A @ corrected + b * queue[past - delay]
+            return np.concatenate([after, queue[1:], [current]])
+
+        size = n + past
+        whole = np.column_stack(
+            [*[respond(e, 0.0, 0.0) for e in np.eye(size)], respond(np.zeros(size), 1.0, 0.0),
+             respond(np.zeros(size), 0.0, 1.0)]
+        )  # fmt: skip
+        a, c = whole[:size, :size], whole[size, :size]
+        reference = _transfer_function(a, whole[:size, size], c, float(whole[size, size]))
+        measurement = _transfer_function(a, -whole[:size, size + 1], c, -float(whole[size, size + 1]))
+        return reference, measurement
+
+    def close(self, plant: Plant, params: ParameterSet) -> Loop:
+        """Return the loop around a plant while no limit is active; its figures are in newtons of motor force."""
+        scale = current_per_force(*self.design)
+        reference, measurement = (TransferFunction(num=found.num / scale, den=found.den) for found in self.unlimited())
+        digital = sample(
+            plant, params, self.spec.measured, scale, self.spec.sample_time_s, self.spec.delay_samples
+        )  # fmt: skip
+        return Loop(plant=digital, reference=reference, measurement=measurement)
+
+    def __repr__(self) -> str:
+        s, slew = self.spec, self.spec.current_slew_A_per_s
+        limits = f"{s.current_limit_A:g} A" + ("" if slew is None else f", {slew:g} A/s")
+        return (
+            f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
+            f"delay of {s.delay_samples} sample{'' if s.delay_samples == 1 else 's'}\n"
+            f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} N\n"
+            f"  bandwidth {s.bandwidth_hz:g} Hz without limits; horizon {1e3 * s.horizon_s:g} ms, "
+            f"{self.prediction.knots.size} free currents"
+        )
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceMPC:
+    """Return a force controller that plans within current and slew limits.
+
+    Parameters
+    ----------
+    plant, params
+        The design plant, the test stand as a rule, and its parameters; its first input is the motor current.
+    spec : MPCSpec
+        Limits and bandwidth.
+
+    Raises
+    ------
+    ControlError
+        The measured output does not settle under a constant current, or responds to it at once; the limits hold less
+        than `spec.largest_force_N`; or the bandwidth cannot be had.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import MPCSpec, force_mpc
+    >>> mpc = force_mpc(so.plants.high_impedance(), so.plants.thor(), MPCSpec(current_limit_A=9.0))
+    >>> step = mpc.step(mpc.start, reference_N=2000.0, measurement_N=0.0)
+    >>> step.solved, round(step.current_A, 3)
+    (True, 9.0)
+
+    """
+    values = params.parameters if isinstance(params, Fit) else params
+    if spec.measured not in plant.outputs:
+        raise ControlError(
+            f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
+        )
+    digital = sample(plant, values, spec.measured, 1.0, spec.sample_time_s, 0)
+    gain = _static_gain(plant, digital, spec)
+    noise = spec.noise or NoiseModel(
+        sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={_drive(plant): 1.0},
+        input_drift={_drive(plant): 3.0},
+    )  # fmt: skip
+    if not noise.input_drift.get(_drive(plant), 0.0) > 0.0 or len(noise.input_drift) > 1:
+        raise ControlError(
+            f"noise: input_drift must be of {_drive(plant)} alone and above zero, for it takes the force's offset away"
+        )
+    kalman = estimator(
+        plant, values, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
+        delay_samples=spec.delay_samples,
+    )  # fmt: skip
+    a, b, c = digital.a, digital.b, digital.c
+    weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, values, spec.measured)
+    found = regulator_of_bandwidth(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
+    knots = spread_knots(spec.samples, spec.moves)
+    prediction = condense(a, b, weighted, gain, found, knots, spec.current_limit_A, spec.slew_per_sample_A)
+    shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
+    return ForceMPC(
+        spec=spec, design=(plant, values), kalman=kalman, regulator=found, prediction=prediction, static_gain=gain,
+        rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
+    )  # fmt: skip
+
+
+def _rate(plant: Plant, params: ParameterSet, measured: str) -> Float[np.ndarray, " nx"]:
+    """Return the row that gives the measured output's time derivative, without the current's own part."""
+    a, _, c, _ = state_space(plant, params)
+    return c[list(plant.outputs).index(measured)] @ a
+
+
+def _drive(plant: Plant) -> str:
+    return next(iter(plant.inputs))
+
+
+def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
+    """Return N/A of the measured force, or say why it cannot be controlled so."""
+    if np.max(np.abs(np.linalg.eigvals(digital.a))) > 1.0 - 1e-9:
+        raise ControlError(
+            f"{plant.name} does not come to rest by itself, so that no current belongs to a force; design on the stand"
+        )
+    gain = float(digital.c @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
+    if abs(gain) < 1e-9:
+        raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant current; design on the stand")
+    if digital.d != 0.0:
+        raise ControlError(
+            f"{spec.measured} of {plant.name} follows the current at once (d = {digital.d:.3g}); "
+            "control the spring's force"
+        )
+    held = abs(gain) * spec.current_limit_A
+    if spec.largest_force_N is not None and spec.largest_force_N > held:
+        raise ControlError(
+            f"current_limit_A = {spec.current_limit_A:g} holds {held:.4g} N, less than largest_force_N = "
+            f"{spec.largest_force_N:g}; raise the one or lower the other"
+        )
+    return gain
+
+
+def _transfer_function(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
+) -> TransferFunction:
+    """Return c (zI - a)^-1 b + d in powers of z^-1: det(zI - a + b c) - det(zI - a) is its numerator without d."""
+    den = np.real(np.poly(a))
+    return TransferFunction(num=np.real(np.poly(a - np.outer(b, c))) - den + d * den, den=den)

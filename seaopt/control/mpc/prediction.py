@@ -1,0 +1,199 @@
+r"""What a force model predictive controller minimises: a condensed quadratic cost over a few currents.
+
+From targets x_s, u_s that hold the reference, :math:`\xi = x - x_s`, :math:`\mu = u - u_s`; over N samples
+
+.. math::
+    J = \sum_{j=0}^{N-1} \Big[ (w\,\xi_j / g)^2 + \rho\,(\mu_j - \mu_{j-1})^2 \Big]
+        + \begin{bmatrix} \xi_N \\ \mu_{N-1} \end{bmatrix}^T \Pi \begin{bmatrix} \xi_N \\ \mu_{N-1} \end{bmatrix},
+    \qquad \xi_{j+1} = A \xi_j + b \mu_j
+
+with :math:`w\,\xi = F - F_\mathrm{ref} + \tau \dot F`, so that an error which dies out with the time constant
+:math:`\tau` costs nothing and overshoot does; g the static gain in N/A, and :math:`\Pi` the cost of going on for ever
+without limits (the Riccati solution of the plant with its last current as a state): with every sample free and no limit
+active, the first current is that of the linear-quadratic regulator, whatever N. The weight :math:`\rho` is found from
+the bandwidth that is asked of it.
+
+Currents are free at some knots only, and straight lines between: :math:`\mu = W \theta`. A limit on size or slope of
+such a line holds everywhere if it holds at the knots, so that nothing is lost but freedom.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+WEIGHTS = (1e-9, 1e9)  # of rho, over the square of the current per force
+HALF_POWER = np.sqrt(0.5)
+BELOW = 1000  # frequencies of the three decades below the bandwidth at which the force must follow
+
+
+@record(eq=False)
+class Regulator:
+    """The unlimited optimum: increments of current are -(K_x xi + K_u mu), the cost to go is quadratic in Pi.
+
+    Parameters
+    ----------
+    rho : float
+        Weight of the current's increments, 1/A^2.
+    K_x : array, shape (nx,)
+        A per unit of each state.
+    K_u : float
+    Pi : array, shape (nx + 1, nx + 1)
+
+    """
+
+    rho: float
+    K_x: Float[np.ndarray, " nx"]
+    K_u: float
+    Pi: Float[np.ndarray, "n n"]
+
+
+@record(eq=False)
+class Prediction:
+    """The quadratic program in theta, the knots' deviations from u_s in units of the current limit.
+
+    Minimise theta' H theta / 2 + (F s)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds.
+
+    Parameters
+    ----------
+    knots : array of int, shape (n,)
+        Samples at which the current is free.
+    H : array, shape (n, n)
+    F : array, shape (n, nx + 1)
+    M : array, shape (n, n) or (0, n)
+        Slopes between knots over the slew limit, if there is one; the first row is the step from the last current.
+
+    """
+
+    knots: Int[np.ndarray, " n"]
+    H: Float[np.ndarray, "n n"]
+    F: Float[np.ndarray, "n s"]
+    M: Float[np.ndarray, "m n"]
+
+
+def regulator(
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float, rho: float
+) -> Regulator:
+    """Return the linear-quadratic regulator of w xi over `gain` and current increments."""
+    from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
+
+    nx = b.size
+    A, B = np.eye(nx + 1), np.append(b, 1.0)[:, None]
+    A[:nx, :nx], A[:nx, nx] = a, b
+    row = np.append(w / gain, 0.0)
+    try:
+        Pi = np.asarray(solve_discrete_are(A, B, np.outer(row, row), np.array([[rho]])))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ControlError(
+            f"the plant has a mode that the current cannot steer ({error}); design on another, such as the stand"
+        ) from error
+    K = (B.T @ Pi @ A / (rho + B.T @ Pi @ B))[0]
+    return Regulator(rho=rho, K_x=K[:nx], K_u=float(K[nx]), Pi=Pi)
+
+
+def regulator_of_bandwidth(
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"],
+    w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
+) -> Regulator:  # fmt: skip
+    """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by bisection on rho."""
+    nx = b.size
+    rest = np.linalg.solve(np.eye(nx) - a, b) / gain  # x_s per newton
+    A = np.block([[a, b[:, None]], [np.zeros((1, nx)), np.eye(1)]])
+    B, row = np.append(b, 1.0), np.append(c, 0.0)
+    below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
+
+    def tracking(found: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
+        """Return abs(F/F_ref); the delay, which does not change it, is left out."""
+        z = np.exp(2j * np.pi * f * sample_time_s)[:, None, None]
+        drive = (B * (found.K_x @ rest + found.K_u / gain)).astype(complex)[:, None]
+        closed = A - np.outer(B, np.append(found.K_x, found.K_u))
+        return np.abs(np.linalg.solve(z * np.eye(nx + 1) - closed, drive)[:, :, 0] @ row)
+
+    low, high = (np.log(w) for w in WEIGHTS)
+    if tracking(regulator(a, b, w, gain, np.exp(low)))[0] < HALF_POWER:
+        raise ControlError(
+            f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
+        )
+    if tracking(regulator(a, b, w, gain, np.exp(high)))[0] > HALF_POWER:
+        raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if tracking(regulator(a, b, w, gain, np.exp(middle)))[0] > HALF_POWER:
+            low = middle
+        else:
+            high = middle
+    found = regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
+    dips = np.flatnonzero(tracking(found, below) < 0.99 * HALF_POWER)
+    if dips.size:
+        raise ControlError(
+            f"the force is lost near {below[dips[0]]:.3g} Hz, far below bandwidth_hz = {bandwidth_hz:g}: the plant "
+            "has a zero there that no controller fills; design on the stand"
+        )
+    return found
+
+
+def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
+    """Return `moves` samples from 0 to samples - 1, each step longer than the last by about a constant factor.
+
+    Examples
+    --------
+    >>> spread_knots(50, 8).tolist()
+    [0, 1, 3, 5, 10, 17, 29, 49]
+    >>> spread_knots(5, 5).tolist()
+    [0, 1, 2, 3, 4]
+
+    """
+    low, high = 1.0, 10.0
+    for _ in range(80):  # the factor for which `moves` - 1 steps reach the end
+        factor = 0.5 * (low + high)
+        if _edges(factor, moves)[-1] < samples - 1:
+            low = factor
+        else:
+            high = factor
+    knots = np.round(_edges(high, moves)).astype(int)
+    knots[-1] = samples - 1
+    return np.maximum(knots, np.arange(moves))
+
+
+def _edges(factor: float, moves: int) -> Float[np.ndarray, " n"]:
+    return np.concatenate([[0.0], np.cumsum(factor ** np.arange(moves - 1))])
+
+
+def interpolation(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "samples n"]:
+    """Return W, which draws straight lines between the knots."""
+    samples = np.arange(knots[-1] + 1)
+    return np.column_stack([np.interp(samples, knots, row) for row in np.eye(knots.size)])
+
+
+def condense(
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float,
+    found: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float,
+) -> Prediction:  # fmt: skip
+    """Return the quadratic program of a horizon; `limit` in A, `slew_per_sample` in A, infinite if there is none."""
+    W = interpolation(knots)
+    N, nx = len(W), b.size
+    free, forced = np.eye(nx), np.zeros((nx, N))  # xi_j = free xi_0 + forced mu
+    hessian, cross = np.zeros((N, N)), np.zeros((N, nx + 1))
+    for j in range(N):
+        row, start = w @ forced / gain, w @ free / gain
+        hessian += np.outer(row, row)
+        cross[:, :nx] += np.outer(row, start)
+        free, forced = a @ free, a @ forced
+        forced[:, j] += b
+    step = np.eye(N) - np.eye(N, k=-1)  # mu_j - mu_{j-1}, of which the first has mu_-1
+    hessian += found.rho * step.T @ step
+    cross[0, nx] -= found.rho
+    end = np.vstack([forced, np.eye(N)[-1]])
+    begin = np.zeros((nx + 1, nx + 1))
+    begin[:nx, :nx] = free
+    hessian += end.T @ found.Pi @ end
+    cross += end.T @ found.Pi @ begin
+    H, F = limit**2 * W.T @ hessian @ W, limit * W.T @ cross
+    scale = knots.size / float(np.trace(H))
+    steps = np.diff(knots, prepend=knots[0] - 1)
+    slopes = (np.eye(knots.size) - np.eye(knots.size, k=-1)) * limit / (slew_per_sample * steps)[:, None]
+    rows = knots.size if np.isfinite(slew_per_sample) else 0
+    return Prediction(knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=slopes[:rows])

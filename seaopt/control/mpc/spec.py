@@ -1,0 +1,110 @@
+"""What is asked of a force controller within limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from seaopt.control.mpc.noise import NoiseModel
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+MAX_SAMPLES = 500  # of a horizon
+MAX_DELAY_SAMPLES = 100
+
+
+@record
+class MPCSpec:
+    """Limits to plan within, and a bandwidth where they are not felt.
+
+    Parameters
+    ----------
+    current_limit_A : float
+        The command stays within plus and minus this.
+    current_slew_A_per_s : float, optional
+        It changes no faster than this; None: as fast as it likes.
+    measured : str
+        The output that is fed back, F1 as a rule.
+    bandwidth_hz : float
+        Frequency at which abs(F/F_ref) is 3 dB below its static value as long as no limit is active, on the design
+        plant; it sets the weight of the current's increments.
+    sample_rate_hz : float
+        Of the controller.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    decay : float
+        Time constant with which the force error should die out, times 2 pi bandwidth_hz, from 0 to below 1: the
+        larger, the less overshoot and the more noise in the current.
+    horizon_s : float
+        How far it plans.
+    moves : int
+        Currents that are free in the plan; straight lines between.
+    largest_force_N : float, optional
+        A force that the current limit must be able to hold; a limit too low for it is refused.
+    noise : NoiseModel, optional
+        Of the Kalman filter, with a drift of the current. If left out, one that makes the filter quick: its sensor
+        noise is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
+
+    Raises
+    ------
+    ControlError
+        A value is out of range, or two contradict each other.
+
+    """
+
+    current_limit_A: float
+    current_slew_A_per_s: float | None = None
+    measured: str = "F1"
+    bandwidth_hz: float = 30.0
+    sample_rate_hz: float = 1000.0
+    delay_samples: int = 1
+    decay: float = 0.8
+    horizon_s: float = 0.05
+    moves: int = 12
+    largest_force_N: float | None = None
+    noise: NoiseModel | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("current_limit_A", "bandwidth_hz", "sample_rate_hz", "horizon_s"):
+            self._positive(name)
+        for name in ("current_slew_A_per_s", "largest_force_N"):
+            if getattr(self, name) is not None:
+                self._positive(name)
+        if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
+            raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
+        for name, least, most in (("delay_samples", 0, MAX_DELAY_SAMPLES), ("moves", 2, MAX_SAMPLES)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise ControlError(f"{name} = {value!r} is not a whole number from {least} to {most}")
+        if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
+            raise ControlError(
+                f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
+                "sample more than four times as fast"
+            )
+        if not self.moves <= self.samples <= MAX_SAMPLES:
+            raise ControlError(
+                f"horizon_s = {self.horizon_s:g} is {self.samples} samples; it takes {self.moves} (moves) to "
+                f"{MAX_SAMPLES}"
+            )
+
+    def _positive(self, name: str) -> None:
+        value = getattr(self, name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
+            raise ControlError(f"{name} = {value!r} is not a number above zero; give one")
+
+    @property
+    def sample_time_s(self) -> float:
+        """Seconds between samples."""
+        return 1.0 / self.sample_rate_hz
+
+    @property
+    def samples(self) -> int:
+        """Samples in the horizon."""
+        return round(self.horizon_s * self.sample_rate_hz)
+
+    @property
+    def slew_per_sample_A(self) -> float:
+        """Largest change of current from one sample to the next; infinite without a limit."""
+        slew = self.current_slew_A_per_s
+        return np.inf if slew is None else slew * self.sample_time_s

@@ -1,0 +1,284 @@
+r"""The loop as it will run: a continuous nonlinear plant and a law that acts once a sample.
+
+At sample k the load cell reads :math:`m_k = Q(y_k + n_k)`, noise :math:`n_k` and quantisation Q as `Sensors` says; the
+law `RunnableLaw` makes of it and of the reference a motor force, limited, with its anti-windup; the current
+:math:`I = g\,\mathrm{sat}(F)` may be rounded to the amplifier's step, but never to one above the limit, waits
+`delay_samples` samples (and `delay_s` more, where a run's parameters hold that) and is then held for one. In between
+
+.. math:: \dot x = f(t, x, u, p), \qquad u \text{ constant},
+
+is integrated by Runge-Kutta's method of order four in fixed steps. Every sample is integrated twice, with n and with 2n
+steps; the finer result goes on, a fifteenth of the difference estimates its error (order four), and n is doubled until
+that is below `rtol` of each state's largest value in every sample. It is the error of one sample from the same start:
+a quantiser would turn any difference into a whole step, so that two whole runs cannot be compared. A run that
+leaves what floats can hold has no error to look at: it is taken for the loop's doing, and not for that of steps too
+long for the plant, where half as long ones lose it in the same sample or the next, after states as large.
+
+Peaks are of every fine step, not of the samples alone: a mode at 160 Hz has six samples a period at 1 kHz, whose
+largest can be 13 % below the top.
+
+A law without delay sees the output of this moment. Where that contains the current itself (F2 of some plants) the
+loop would be algebraic; it is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from seaopt.control.loops.sampled_plant import conditions_of
+from seaopt.control.running.loop_kernel import Job, Trace, kernel
+from seaopt.control.running.sampled_loop import DELAY, ENERGY, LoopState, SampledLoop, at_rest, whole_samples
+from seaopt.errors import SimulationError, suggestion
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant, state_space
+from seaopt.records import record
+
+__all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
+
+MAX_SUBSTEPS = 512
+RTOL = 1e-6
+RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
+Rows = Float[np.ndarray, "runs n"]
+
+
+@record(eq=False)
+class LoopRun:
+    """What runs did, sample by sample.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds.
+    reference : array, shape (runs, n)
+        N.
+    outputs : mapping of name to array, shape (runs, n)
+        The plant's outputs (as they are, not as measured), and "energy" (J) where the plant declares it.
+    current : array, shape (runs, n)
+        A, in force at the end of the sample.
+    states : array, shape (runs, n, nx)
+        The plant's states.
+    peaks : mapping of name to array, shape (runs,)
+        Largest magnitude of each output over all integration steps.
+    end : LoopState
+        One sample after the last.
+    error : float
+        Estimated integration error of the worst sample, over the state's largest value.
+    substeps : int
+        Integration steps a sample.
+    wall_s : float
+        Time the simulation took, with steps that were too long, but not compilation.
+
+    """
+
+    time: Float[np.ndarray, " n"]
+    reference: Rows
+    outputs: Mapping[str, Rows]
+    current: Rows
+    states: Float[np.ndarray, "runs n nx"]
+    peaks: Mapping[str, Float[np.ndarray, " runs"]]
+    end: LoopState
+    error: float
+    substeps: int
+    wall_s: float
+
+    def __repr__(self) -> str:
+        return told(
+            "LoopRun", f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s", self.current, self.peaks, self.error
+        )
+
+
+def told(
+    kind: str, span: str, current: Rows, peaks: Mapping[str, Float[np.ndarray, " runs"]], error: float, more: str = ""
+) -> str:
+    """Say in a line what simulated runs came to: how many, of how many samples, and the largest magnitudes."""
+    runs, samples = current.shape
+    largest = ", ".join(f"{name} {np.max(value):.4g}" for name, value in peaks.items())
+    return (
+        f"{kind} of {runs} run{'' if runs == 1 else 's'} of {samples} samples, {span}: largest magnitudes {largest}, "
+        f"current {np.max(np.abs(current)):.4g} A; {more}integration error {error:.1g}"
+    )
+
+
+def run_loop(
+    loop: SampledLoop,
+    params: Sequence[ParameterSet],
+    reference: Float[np.ndarray, "..."],
+    *,
+    start: LoopState | None = None,
+    external: Mapping[str, Float[np.ndarray, " n"]] | None = None,
+    seed: int = 0,
+    start_s: float = 0.0,
+    rtol: float = RTOL,
+) -> LoopRun:
+    """Run a loop, once for each set of parameters.
+
+    Parameters
+    ----------
+    loop : SampledLoop
+        Plant, law and devices.
+    params : sequence of ParameterSet
+        One a run; `delay_s` among them is delay besides the controller's, exact between samples too.
+    reference : array, shape (n,) or (runs, n)
+        F_ref at each sample, N.
+    start : LoopState, optional
+        At rest at zero if left out.
+    external : mapping of input name to array, shape (n,), optional
+        The plant's other inputs, such as Fe2, held between samples; zero where left out.
+    seed : int
+        Of the sensor noise, the same in every run: what differs between runs is the parameters.
+    start_s : float
+        Time of the first sample.
+    rtol : float
+        Of the integration, see the module's docstring.
+
+    Returns
+    -------
+    LoopRun
+        Not finite where a run left what floats can hold.
+
+    Raises
+    ------
+    SimulationError
+        No number of steps reaches `rtol`, or an argument does not fit.
+
+    Examples
+    --------
+    >>> import numpy as np, seaopt as so
+    >>> from seaopt.control.laws.realisation import runnable
+    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6))
+    >>> loop = SampledLoop(plant=stand, law=runnable(controller), measured="F1", delay_samples=1)
+    >>> run = run_loop(loop, [thor], np.full(1000, 100.0))
+    >>> round(float(run.outputs["F1"][0, -1]))
+    100
+
+    """
+    if not params:
+        raise SimulationError("run_loop got no parameters; give one ParameterSet a run")
+    runs = len(params)
+    wanted = np.atleast_2d(reference).astype(float)
+    if wanted.ndim != 2 or wanted.shape[0] not in (1, runs) or not wanted.shape[1]:
+        raise SimulationError(f"reference has the shape {reference.shape}; give (n,) or ({runs}, n)")
+    n = wanted.shape[1]
+    job = Job(
+        reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
+        noise=_noise(loop, runs, n, seed),
+        external=_external(loop.plant, external or {}, n),
+        p=np.array([loop.plant.parameter_values(item) for item in params]).reshape(runs, -1),
+        **_lags(loop, params),
+        start=start if start is not None else at_rest(loop, runs),
+        start_s=start_s,
+    )
+    if job.start.x.shape != (runs, len(loop.plant.states)):
+        raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state a run")
+    substeps, before, wall_s = _first_guess(loop, params, rtol), None, 0.0
+    execute = kernel(loop)
+    while True:
+        begin = time.perf_counter()
+        found = execute(job, substeps)
+        wall_s += time.perf_counter() - begin
+        kept = _lost(found) == n
+        error = float(np.max(_errors(found)[kept], initial=0.0))
+        told = bool(np.all(kept)) or (before is not None and bool(np.all(kept | _alike(before, found))))
+        if error <= rtol and told:
+            return _result(loop, job, found, error, substeps, wall_s)
+        if 2 * substeps > MAX_SUBSTEPS:
+            raise SimulationError(
+                f"plant {loop.plant.name}: {2 * substeps} steps a sample leave an error of {error:.1e} of a state "
+                f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
+                if told
+                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not tell whether the loop runs away "
+                "or they are too long; check the parameters"
+            )
+        substeps, before = 2 * substeps, found
+
+
+def _errors(found: Trace) -> Float[np.ndarray, " runs"]:
+    """Return the largest error of a sample, over the state's largest value.
+
+    A state that rests has rounding for a value: it is measured by the largest of the others.
+    """
+    size = np.maximum(found.size, RESTS * np.max(found.size, axis=1, keepdims=True))
+    scale = np.where(size > 0.0, size, 1.0)
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.max(found.error / scale, axis=1) / 15.0, nan=np.inf)
+
+
+def _lost(found: Trace) -> Int[np.ndarray, " runs"]:
+    """Return each run's first sample that is not finite; the number of samples where all are."""
+    finite = np.all(np.isfinite(found.states), axis=2) & np.all(np.isfinite(found.y), axis=2)
+    finite[:, -1] &= np.all(np.isfinite(found.x), axis=1)
+    return np.where(np.all(finite, axis=1), finite.shape[1], np.argmin(finite, axis=1))
+
+
+def _alike(before: Trace, found: Trace) -> Bool[np.ndarray, " runs"]:
+    """Tell which runs two numbers of steps lose in the same way: about the same sample, states as large before it."""
+    lost = np.stack([_lost(before), _lost(found)])
+    last, rows = np.maximum(np.min(lost, axis=0) - 1, 0), np.arange(lost.shape[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.log([np.max(np.abs(item.states[rows, last]), axis=1) for item in (before, found)])
+        return (np.abs(lost[1] - lost[0]) <= 1) & (np.abs(size[1] - size[0]) <= 1.0)
+
+
+def _result(loop: SampledLoop, job: Job, found: Trace, error: float, substeps: int, wall_s: float) -> LoopRun:
+    names = loop.watched
+    return LoopRun(
+        time=job.start_s + loop.law.sample_time_s * np.arange(job.reference.shape[1]),
+        reference=job.reference,
+        outputs={name: found.y[:, :, i] for i, name in enumerate(names)},
+        current=found.applied,
+        states=found.states,
+        peaks={name: found.peak[:, i] for i, name in enumerate(names)},
+        end=LoopState(x=found.x, z=found.z),
+        error=error,
+        substeps=2 * substeps,
+        wall_s=wall_s,
+    )
+
+
+def _noise(loop: SampledLoop, runs: int, n: int, seed: int) -> Rows:
+    std = loop.sensors.noise_std.get(loop.measured, 0.0)
+    if not std:
+        return np.zeros((runs, n))
+    return np.tile(std * np.random.default_rng(seed).normal(size=n), (runs, 1))
+
+
+def _external(plant: Plant, given: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:
+    names = list(plant.inputs)[1:]
+    for name, values in given.items():
+        if name not in names:
+            raise SimulationError(f'external = {{"{name}": ...}} is no such input; {suggestion(name, names)}')
+        if values.shape != (n,):
+            raise SimulationError(f"external {name} has the shape {values.shape}; give ({n},), one value a sample")
+    columns = [given.get(name, np.zeros(n)) for name in names]
+    return np.ascontiguousarray(np.column_stack(columns) if columns else np.zeros((n, 0)), dtype=float)
+
+
+def _lags(loop: SampledLoop, params: Sequence[ParameterSet]) -> dict[str, Any]:
+    """Return which commands are in force in each run, and from when; `lag` and `late_s` of a job."""
+    queue = loop.waiting
+    lag, late = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
+    for run, item in enumerate(params):
+        delay = conditions_of(loop.plant, item).get(DELAY, 0.0)
+        if not 0.0 <= delay <= loop.longest_delay_s:
+            raise SimulationError(
+                f"{DELAY} = {delay:g} is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "
+                "longest of all runs"
+            )
+        whole, late[run] = whole_samples(delay, loop.law.sample_time_s)
+        newer = loop.delay_samples + whole
+        lag[run, 0, newer + (late[run] > 0.0)] = lag[run, 1, newer] = 1.0
+    return {"lag": lag.reshape(len(params), -1), "late_s": late}
+
+
+def _first_guess(loop: SampledLoop, params: Sequence[ParameterSet], rtol: float) -> int:
+    """Return half the steps that a mode of the first plant, at rest, needs: n (|s| T/n)^5 / 120 = rtol for the 2n."""
+    fastest = float(np.max(np.abs(np.linalg.eigvals(state_space(loop.plant, params[0])[0])), initial=0.0))
+    steps = ((fastest * loop.law.sample_time_s) ** 5 / (120.0 * rtol)) ** 0.25
+    return int(np.clip(math.ceil(0.5 * steps), 1, 64))

@@ -1,0 +1,120 @@
+r"""A sampled loop at rest where a run's conditions are, such as an angle, instead of at zero.
+
+The plant rests in the state x and under the current I of `seaopt.control.loops.sampled_plant.resting`, its measured
+force being y. The law rests with it where :math:`x_c = A x_c + B_r r - B_y y` and :math:`C x_c + D_r r - D_y y = I/g`:
+one linear equation for its state and for the reference r that keeps the plant there. With an integrator r is y;
+without one it is what makes the law command I. The commands that wait are all I.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.loops.sampled_plant import resting
+from seaopt.control.running.sampled_loop import LoopState, SampledLoop
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.records import record
+
+Runs = Float[np.ndarray, " runs"]
+
+
+@record(eq=False)
+class Equilibrium:
+    """Where runs rest.
+
+    Parameters
+    ----------
+    state : LoopState
+        Of plant, law and waiting commands.
+    reference, force, current_A, energy_J : arrays, shape (runs,)
+        F_ref and the measured output (N); the current; what the plant stores, zero where it declares no energy.
+
+    """
+
+    state: LoopState
+    reference: Runs
+    force: Runs
+    current_A: Runs
+    energy_J: Runs
+
+    def __repr__(self) -> str:
+        rows = zip(self.force, self.current_A, strict=True)
+        return "Equilibrium at " + ", ".join(f"{force:.4g} N, {current:.4g} A" for force, current in rows)
+
+
+def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibrium:
+    """Return where a loop rests at the conditions among each run's parameters; at zero without any.
+
+    Parameters
+    ----------
+    loop : SampledLoop
+        Plant and law; the current's limit is not looked at.
+    params : sequence of ParameterSet
+        One a run, with a state of the plant (phi) among them where it is to rest elsewhere.
+
+    Raises
+    ------
+    ControlError
+        The plant cannot rest there, or no reference makes the law command what it takes.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control.laws.realisation import runnable
+    >>> stand, swing, thor = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    >>> loop = SampledLoop(plant=swing, law=runnable(controller), measured="F1", delay_samples=1)
+    >>> raised = thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad"))
+    >>> equilibrium(loop, [raised])
+    Equilibrium at -88.7 N, -0.3691 A
+
+    """
+    law, plant = loop.law, loop.plant
+    observe = _observe(loop)
+    names, rows = list(plant.outputs), [resting(plant, item) for item in params]
+    found = np.zeros((len(params), 4))
+    z = np.zeros((len(params), law.c.size + loop.waiting))
+    for run, ((x, u), item) in enumerate(zip(rows, params, strict=True)):
+        if not (np.any(x) or np.any(u)):
+            continue
+        y = np.array(observe(x, u, plant.parameter_values(item))).ravel()
+        force = float(y[names.index(loop.measured)])
+        inner, reference = _law_at_rest(law, force, float(u[0]))
+        z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])
+        found[run] = reference, force, u[0], y[-1]
+    reference, force, current, energy = found.T.copy()
+    state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
+    return Equilibrium(state=state, reference=reference, force=force, current_A=current, energy_J=energy)
+
+
+def _law_at_rest(law: RunnableLaw, force: float, current_A: float) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return the law's state and the reference at which it commands a current, unlimited, under a constant force."""
+    n = law.c.size
+    left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
+    right = np.append(-law.b_measurement * force, current_A / law.current_per_force_A_per_N + law.d_measurement * force)
+    try:
+        found = np.linalg.solve(left, right)
+    except np.linalg.LinAlgError:
+        found = np.full(n + 1, np.nan)
+    if not np.all(np.isfinite(found)):
+        raise ControlError(
+            f"no reference makes the law command the {current_A:.4g} A that rest takes at {force:.4g} N; its reference "
+            "path is blocked at 0 Hz"
+        )
+    return found[:-1], float(found[-1])
+
+
+def _observe(loop: SampledLoop) -> ca.Function:
+    """Return the CasADi function (x, u, p) -> outputs, and the energy behind them."""
+    plant, key = loop.plant, "outputs and energy"
+    if key not in plant.cache:
+        energy = plant.stored_energy() if plant.energy is not None else ca.SX(0)
+        both = ca.substitute(ca.densify(ca.vertcat(plant.output, energy)), plant.t, 0.0)
+        plant.cache[key] = ca.Function("observe", [plant.x, plant.u, plant.p], [both])
+    return plant.cache[key]

@@ -1,0 +1,242 @@
+"""A digital law that is a Python function, such as a predictive one, on a plant as it is, nonlinear and continuous.
+
+A law that is a `RunnableLaw` runs in `seaopt.control.running.closed_loop`, compiled and over many draws at once. Here
+is what that cannot do: any callable, called once a sample. The plant between the samples is the same, with the same
+steps and the same error: each sample is integrated with n and with 2n of them, and n doubled until they agree to
+`rtol`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.loops.sampled_plant import DELAY, conditions_of
+from seaopt.control.running.closed_loop import MAX_SUBSTEPS, RESTS, RTOL
+from seaopt.control.running.loop_kernel import EXPANDED, runge_kutta
+from seaopt.control.running.sampled_loop import whole_samples
+from seaopt.errors import ControlError, SimulationError, suggestion
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+
+State = TypeVar("State")
+FIRST = 2  # coarse steps a sample to begin with
+
+
+@record(eq=False)
+class ForceRun:
+    """What a closed loop did.
+
+    Parameters
+    ----------
+    time, reference, force, current, law_time_s : arrays, shape (n,)
+        Seconds; N; N at the samples, without the sensor's noise; A as commanded; and the time (s) that each step of the
+        law took.
+    state : array, shape (n, nx)
+        Of the plant.
+    error : float
+        Estimated integration error of the worst sample, over the state's largest value until then.
+    substeps : int
+        Integration steps a sample, at the end.
+
+    """
+
+    time: Float[np.ndarray, " n"]
+    reference: Float[np.ndarray, " n"]
+    force: Float[np.ndarray, " n"]
+    current: Float[np.ndarray, " n"]
+    law_time_s: Float[np.ndarray, " n"]
+    state: Float[np.ndarray, "n nx"]
+    error: float
+    substeps: int
+
+    @property
+    def overshoot(self) -> float:
+        """How far the force goes beyond the last reference, as a fraction of the step from the first sample's force."""
+        step = self.reference[-1] - self.force[0]
+        return max(float(np.max((self.force - self.reference[-1]) / step)), 0.0)
+
+    def __repr__(self) -> str:
+        return (
+            f"ForceRun of {self.time.size} samples, {self.time[-1]:.4g} s: reference to {self.reference[-1]:.4g} N, "
+            f"force up to {np.max(np.abs(self.force)):.4g} N and {self.force[-1]:.4g} N at the end, current up to "
+            f"{np.max(np.abs(self.current)):.4g} A"
+        )
+
+    def settling_time_s(self, band: float = 0.02) -> float:
+        """Return the time from the reference's first change until the force stays within `band` of the step.
+
+        Infinite where it has not at the last sample.
+        """
+        changed = np.flatnonzero(np.diff(self.reference)) + 1
+        first = float(self.time[changed[0]] if changed.size else self.time[0])
+        step = abs(self.reference[-1] - self.force[0])
+        outside = np.flatnonzero(np.abs(self.force - self.reference[-1]) > band * step)
+        if not outside.size:
+            return 0.0
+        return float(self.time[outside[-1] + 1]) - first if outside[-1] + 1 < self.time.size else np.inf
+
+
+def close_loop(
+    step: Callable[[State, float, float], tuple[float, State]],
+    start: State,
+    plant: Plant,
+    params: ParameterSet,
+    reference: Float[np.ndarray, " n"],
+    *,
+    measured: str = "F1",
+    sample_time_s: float = 1e-3,
+    delay_samples: int = 1,
+    sensor_std: float = 0.0,
+    disturbance_A: float | Float[np.ndarray, " n"] = 0.0,
+    seed: int = 0,
+    rtol: float = RTOL,
+) -> ForceRun:
+    """Run a law on a plant from rest at zero.
+
+    Parameters
+    ----------
+    step : callable ``(state, reference, measurement) -> (current, state)``
+        The law, such as ``mpc.command``; it sees the measurement before its current.
+    start
+        Its state at the first sample.
+    plant, params
+        As it is, not only as the law was designed for; `delay_s` among the parameters is delay besides `delay_samples`.
+    reference : array, shape (n,)
+        N, one value a sample.
+    measured : str
+        The output that the law sees.
+    sample_time_s : float
+        Seconds.
+    delay_samples : int
+        Whole samples from a command to the plant.
+    sensor_std : float
+        White noise on the measurement.
+    disturbance_A : float or array, shape (n,)
+        Added to the current inside the plant.
+    seed : int
+        Of the noise.
+    rtol : float
+        Of the integration, of each state's largest value so far.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output or shows the present current in it, the parameters hold another condition than
+        `delay_s`, or the loop runs away.
+    SimulationError
+        No number of steps reaches `rtol`.
+
+    """
+    late = _checked(plant, params, measured, delay_samples)
+    whole, rest_s = whole_samples(late, sample_time_s)
+    newer, n, p = delay_samples + whole, reference.size, ca.DM(plant.parameter_values(params))
+    output, held = _output(plant), _Held(plant=plant, rtol=rtol)
+    row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
+    noise = sensor_std * np.random.default_rng(seed).normal(size=n)
+    disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
+    x, law, clock = np.zeros(len(plant.states)), start, sample_time_s * np.arange(n)
+    force, current, took, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
+
+    def inputs(k: int, sample: int) -> list[float]:
+        return [(current[sample] if sample >= 0 else 0.0) + disturbance[k], *others]
+
+    for k in range(n):
+        older = k - newer - (rest_s > 0.0)
+        force[k] = float(output(clock[k], x, inputs(k, min(older, k - 1)), p)[row])
+        began = time.perf_counter()
+        current[k], law = step(law, float(reference[k]), float(force[k] + noise[k]))
+        took[k] = time.perf_counter() - began
+        states[k] = x
+        if rest_s > 0.0:
+            x = held.over(clock[k], x, inputs(k, older), p, rest_s)
+        x = held.over(clock[k] + rest_s, x, inputs(k, k - newer), p, sample_time_s - rest_s)
+    return ForceRun(
+        time=clock, reference=reference, force=force, current=current, law_time_s=took, state=states,
+        error=held.error, substeps=2 * held.substeps,
+    )  # fmt: skip
+
+
+def _checked(plant: Plant, params: ParameterSet, measured: str, delay_samples: int) -> float:
+    """Return the delay besides the whole samples, s, of arguments that fit together."""
+    if measured not in plant.outputs:
+        raise ControlError(
+            f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
+        )
+    given = conditions_of(plant, params)
+    moved = [name for name, value in given.items() if name != DELAY and value]
+    if moved:
+        raise ControlError(
+            f"the parameters hold {', '.join(moved)}, but close_loop starts at rest at zero; leave it out"
+        )
+    late = given.get(DELAY, 0.0)
+    if not delay_samples and not late and ca.depends_on(plant.output[list(plant.outputs).index(measured)], plant.u[0]):
+        raise ControlError(
+            f"{measured} of {plant.name} contains the present current, which a law without delay sets from it; give "
+            "delay_samples = 1 or more, or measure another output"
+        )
+    return late
+
+
+@dataclass(slots=True, kw_only=True)
+class _Held:
+    """A plant integrated while its inputs are held, in as many steps as it has needed so far."""
+
+    plant: Plant
+    rtol: float
+    substeps: int = FIRST
+    error: float = 0.0
+    size: Any = 0.0
+
+    def over(self, t: float, x: Float[np.ndarray, " nx"], u: list[float], p: Any, lasting: float) -> Any:
+        """Return the states after a time."""
+        while True:
+            coarse, fine = (np.array(end).ravel() for end in _ends(self.plant, self.substeps)(t, x, u, p, lasting))
+            size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
+            scale = np.maximum(size, RESTS * np.max(size))
+            with np.errstate(invalid="ignore"):
+                error = float(np.max(np.abs(fine - coarse) / np.where(scale > 0.0, scale, 1.0))) / 15.0
+            if error <= self.rtol:
+                self.error, self.size = max(self.error, error), size
+                return fine
+            if 2 * self.substeps > MAX_SUBSTEPS:
+                break
+            self.substeps *= 2
+        if not np.all(np.isfinite(fine)):
+            raise ControlError(f"the loop on {self.plant.name} runs away at t = {t:g} s; tune it again")
+        raise SimulationError(
+            f"plant {self.plant.name}: {2 * self.substeps} steps a sample leave an error of {error:.1e} of a state at "
+            f"t = {t:g} s (rtol = {self.rtol:g}); check the parameters and that the loop does not run away, smooth the "
+            "friction (v_s), or raise rtol"
+        )
+
+
+def _ends(plant: Plant, substeps: int) -> Any:
+    """Return the CasADi function (t, x, u, p, T) -> x after T in `substeps` steps and in twice as many."""
+    key = f"held {substeps}"
+    if key not in plant.cache:
+        step = runge_kutta(plant)
+        t, x, u, p, lasting = (ca.MX.sym(name, step.numel_in(i)) for i, name in enumerate("txupT"))
+        ends: list[Any] = []
+        for count in (substeps, 2 * substeps):
+            at, h = x, lasting / count
+            for i in range(count):
+                at = step(t + i * h, at, u, p, h)
+            ends.append(at)
+        whole = ca.Function("held", [t, x, u, p, lasting], ends)
+        plant.cache[key] = whole.expand() if substeps <= EXPANDED else whole
+    return plant.cache[key]
+
+
+def _output(plant: Plant) -> Any:
+    """Return the CasADi function (t, x, u, p) -> y."""
+    if "output" not in plant.cache:
+        plant.cache["output"] = ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+    return plant.cache["output"]

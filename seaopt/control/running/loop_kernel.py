@@ -1,0 +1,292 @@
+"""The numbers of a sampled loop: two CasADi functions, run by compiled code or by CasADi's virtual machine.
+
+`seaopt_sample` is sensor, law and delay at one sample; `seaopt_advance` is one Runge-Kutta step of the plant.
+Parameters and the law's matrices are data, so that one compilation serves every draw and every controller of a
+structure. The two ways give the same numbers to rounding, of which a quantiser can make a step.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+from collections.abc import Callable
+from importlib.resources import files
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.running.sampled_loop import LoopState, SampledLoop
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.simulation.compiled import threads, workers
+from seaopt.simulation.compiler import load_library
+
+CHUNK = 250  # samples that the virtual machine chains in one call
+EXPANDED = 8  # coarse steps up to which a sample is one flat list of operations there
+Rows = Float[np.ndarray, "runs n"]
+
+
+@record(eq=False)
+class Job:
+    """The data of runs, checked.
+
+    `lag` picks, of the newest command and those that wait, the one in force at the start of a sample and the one after
+    `late_s` seconds of it.
+    """
+
+    reference: Rows
+    noise: Rows
+    external: Float[np.ndarray, "n ne"]
+    p: Float[np.ndarray, "runs np"]
+    lag: Float[np.ndarray, "runs w"]
+    late_s: Float[np.ndarray, " runs"]
+    start: LoopState
+    start_s: float
+
+
+@record(eq=False)
+class Trace:
+    """What a kernel leaves behind: arrays of one row a run."""
+
+    x: Float[np.ndarray, "runs nx"]
+    z: Float[np.ndarray, "runs nz"]
+    peak: Float[np.ndarray, "runs ny"]
+    error: Float[np.ndarray, "runs nx"]
+    size: Float[np.ndarray, "runs nx"]
+    y: Float[np.ndarray, "runs n ny"]
+    applied: Rows
+    states: Float[np.ndarray, "runs n nx"]
+    wall_s: float = 0.0
+
+
+def _sample_function(loop: SampledLoop) -> Any:
+    """Return the CasADi function (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y): sensor, law and delay at a sample.
+
+    `u` holds the current in force at first, `late` is the one after it.
+    """
+    plant, n, queue = loop.plant, loop.law.c.size, loop.waiting
+    z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
+    e, c = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("c", _constants(loop).size)
+    observe = _observe(loop)
+    lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
+    first, second = lag[: queue + 1], lag[queue + 1 :]
+    waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
+    reading = observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)[list(plant.outputs).index(loop.measured)] + w
+    size = n * n
+    a = ca.reshape(c[:size], n, n)
+    b_r, b_y, out, windup = (ca.reshape(c[size + i * n : size + (i + 1) * n], n, 1) for i in range(4))
+    d_r, d_y, limit, gain, offset, highest, quantum, step, most = ca.vertsplit(c[size + 4 * n :])
+    reading = reading + offset
+    if loop.sensors.saturation.get(loop.measured) is not None:
+        reading = ca.fmin(ca.fmax(reading, -highest), highest)
+    if loop.sensors.quantisation.get(loop.measured):
+        reading = quantum * ca.floor(reading / quantum + 0.5)
+    x = ca.reshape(z[:n], n, 1)
+    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - d_y * reading
+    limited = ca.fmin(ca.fmax(force, -limit), limit) if math.isfinite(loop.law.current_limit_A) else force
+    after = ca.mtimes(a, x) + b_r * r - b_y * reading + windup * (limited - force)
+    current = gain * limited
+    if loop.current_step_A:
+        current = step * ca.floor(current / step + 0.5)
+        if math.isfinite(loop.law.current_limit_A):
+            current = ca.fmin(ca.fmax(current, -most), most)
+    moved = ca.vertcat(after, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
+    known = ca.vertcat(current, behind)
+    u, late = ca.vertcat(ca.dot(first, known), e), ca.dot(second, known)
+    arguments = [plant.t, plant.x, z, e, r, w, plant.p, c, lag]
+    return ca.Function("seaopt_sample", arguments, [ca.densify(moved), u, late, observe(plant.t, plant.x, u, plant.p)])
+
+
+def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
+    law, sensors, name = loop.law, loop.sensors, loop.measured
+    limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.current_limit_A) else (0.0, 0.0)
+    numbers = [
+        law.d_reference, law.d_measurement, limit, law.current_per_force_A_per_N, sensors.offset.get(name, 0.0),
+        sensors.saturation.get(name, 0.0), sensors.quantisation.get(name, 0.0), loop.current_step_A,
+        most,
+    ]  # fmt: skip
+    return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
+
+
+def _observe(loop: SampledLoop) -> Any:
+    plant = loop.plant
+    rows = [plant.output] + ([plant.stored_energy()] if plant.energy is not None else [])
+    return ca.Function("observe", [plant.t, plant.x, plant.u, plant.p], [ca.densify(ca.vertcat(*rows))])
+
+
+def runge_kutta(plant: Plant) -> Any:
+    """Return the CasADi function (t, x, u, p, h) -> x+: a step of Runge's and Kutta's fourth order, u held."""
+    rate = ca.Function("rate", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
+    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    k1 = rate(t, x, u, p)
+    k2 = rate(t + h / 2, x + h / 2 * k1, u, p)
+    k3 = rate(t + h / 2, x + h / 2 * k2, u, p)
+    k4 = rate(t + h, x + h * k3, u, p)
+    return ca.Function("step", [t, x, u, p, h], [ca.densify(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))])
+
+
+def _advance_function(loop: SampledLoop) -> Any:
+    """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one Runge-Kutta step, and the largest |y|."""
+    plant = loop.plant
+    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    peak = ca.SX.sym("peak", len(loop.watched))
+    after = runge_kutta(plant)(t, x, u, p, h)
+    top = ca.fmax(peak, ca.fabs(_observe(loop)(t + h, after, u, p)))
+    return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
+
+
+def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:
+    """Return what runs a job: compiled where there is a compiler, CasADi's virtual machine else; once a structure."""
+    sensors = loop.sensors
+    key = (
+        f"closed loop {loop.measured} {loop.law.c.size} {loop.waiting} {bool(loop.current_step_A)} "
+        f"{sensors.saturation.get(loop.measured) is None} {bool(sensors.quantisation.get(loop.measured))} "
+        f"{math.isfinite(loop.law.current_limit_A)}"
+    )
+    if key not in loop.plant.cache:
+        sample, advance = _sample_function(loop), _advance_function(loop)
+        library = load_library(_source(loop, sample, advance))
+        if library is not None:
+            library.seaopt_loops.argtypes, library.seaopt_loops.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
+        loop.plant.cache[key] = (sample, advance, library, {})
+    sample, advance, library, chains = loop.plant.cache[key]
+    constants = _constants(loop)
+
+    def execute(job: Job, substeps: int) -> Trace:
+        if library is not None:
+            return _compiled(loop, job, substeps, constants, library)
+        return _interpreted(loop, job, substeps, constants, sample, advance, chains)
+
+    return execute
+
+
+def _source(loop: SampledLoop, sample: Any, advance: Any) -> str:
+    both = (sample, advance)
+    constants = {
+        "NX": len(loop.plant.states), "NU": len(loop.plant.inputs), "NE": len(loop.plant.inputs) - 1,
+        "NY": len(loop.watched), "NZ": loop.law.c.size + loop.waiting,
+        "SZ_W": max(f.sz_w() for f in both), "SZ_ARG": max(f.sz_arg() for f in both),
+        "SZ_RES": max(f.sz_res() for f in both), "SZ_IW": max(f.sz_iw() for f in both),
+    }  # fmt: skip
+    generator = ca.CodeGenerator("closed_loop")
+    for function in both:
+        generator.add(function)
+    code = re.sub(r"CASADI_SYMBOL_EXPORT int (seaopt_(?:sample|advance))\(", r"static inline int \1(", generator.dump())
+    defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
+    return "\n".join(
+        (defines, code, files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8"))
+    )
+
+
+def _empty(loop: SampledLoop, job: Job) -> Trace:
+    runs, n = job.reference.shape
+    nx, ny = len(loop.plant.states), len(loop.watched)
+    return Trace(
+        x=np.array(job.start.x, dtype=float, order="C"), z=np.array(job.start.z, dtype=float, order="C"),
+        peak=np.zeros((runs, ny)), error=np.zeros((runs, nx)), size=np.zeros((runs, nx)),
+        y=np.zeros((runs, n, ny)), applied=np.zeros((runs, n)), states=np.zeros((runs, n, nx)),
+    )  # fmt: skip
+
+
+_POINTERS = ("p", "c", "lag", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
+_ARGUMENTS = np.dtype(
+    [
+        ("n", np.int64),
+        ("substeps", np.int64),
+        ("t0", float),
+        ("period", float),
+        ("late_s", float),
+        *((name, np.uint64) for name in _POINTERS),
+    ]
+)
+
+
+def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], library: Any) -> Trace:
+    trace = _empty(loop, job)
+    runs, n = job.reference.shape
+    arguments = np.zeros(runs, dtype=_ARGUMENTS)
+    arguments["n"], arguments["substeps"] = n, substeps
+    arguments["t0"], arguments["period"] = job.start_s, loop.law.sample_time_s
+    arguments["late_s"] = job.late_s
+    rows = {"p": job.p, "lag": job.lag, "r": job.reference, "w": job.noise} | {
+        name: getattr(trace, name) for name in ("x", "z", "peak", "error", "size", "y", "applied", "states")
+    }
+    for name, array in rows.items():
+        arguments[name] = array.ctypes.data + array.strides[0] * np.arange(runs)
+    arguments["c"], arguments["e"] = c.ctypes.data, job.external.ctypes.data
+    bounds = np.linspace(0, runs, min(runs, workers()) + 1).astype(int)
+    size = arguments.dtype.itemsize
+    if len(bounds) == 2:
+        library.seaopt_loops(arguments.ctypes.data, runs)
+        return trace
+    jobs = [
+        threads().submit(library.seaopt_loops, arguments.ctypes.data + int(a) * size, int(b - a))
+        for a, b in pairwise(bounds)
+    ]
+    for done in jobs:
+        done.result()
+    return trace
+
+
+def _interpreted(
+    loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], sample: Any, advance: Any,
+    chains: dict[tuple[int, int, bool], Any],
+) -> Trace:  # fmt: skip
+    """Run in CasADi's virtual machine: the same two functions, chained in a third."""
+    trace = _empty(loop, job)
+    runs, n = job.reference.shape
+    chunk = min(n, CHUNK)
+    split = bool(np.any(job.late_s))
+    key = (substeps, chunk, split)
+    if key not in chains:
+        period = _period_function(loop, sample, advance, substeps, split)
+        chains[key] = (period.expand() if substeps <= EXPANDED else period).mapaccum(chunk)
+    times = job.start_s + loop.law.sample_time_s * np.arange(n)
+    for run in range(runs):
+        state = np.concatenate([getattr(trace, name)[run] for name in ("x", "z", "peak", "error", "size")])
+        shared = [
+            np.repeat(item[:, None], chunk, axis=1) for item in (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
+        ]
+        signals = np.vstack([times, job.external.T, job.reference[run], job.noise[run]])
+        for first in range(0, n, chunk):
+            count = min(chunk, n - first)
+            piece = signals[:, np.minimum(np.arange(first, first + chunk), n - 1)]  # the last one is filled up
+            after, y, applied, states = (
+                np.array(item)[:, :count]
+                for item in chains[key](state, piece[:1], piece[1:-2], piece[-2:-1], piece[-1:], *shared)
+            )
+            rows = slice(first, first + count)
+            trace.y[run, rows], trace.applied[run, rows], trace.states[run, rows] = y.T, applied[0], states.T
+            state = after[:, -1]
+        for name in ("x", "z", "peak", "error", "size"):
+            width = getattr(trace, name).shape[1]
+            getattr(trace, name)[run], state = state[:width], state[width:]
+    return trace
+
+
+def _period_function(loop: SampledLoop, sample: Any, advance: Any, substeps: int, split: bool) -> Any:
+    """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
+    sizes = [len(loop.plant.states), loop.law.c.size + loop.waiting, len(loop.watched)]
+    state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
+    t, r, w, late_s = (ca.MX.sym(name) for name in ("t", "r", "w", "late_s"))
+    e, p, c, lag = (ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("p", 6), ("c", 7), ("lag", 8)))
+    x, z, peak, error, size = ca.vertsplit(state, np.cumsum([0, *sizes, sizes[0], sizes[0]]).tolist())
+    after, u, late, y = sample(t, x, z, e, r, w, p, c, lag)
+    newer, period = ca.vertcat(late, e), loop.law.sample_time_s
+    pieces = [(u, t, late_s), (newer, t + late_s, period - late_s)] if split else [(newer, t, period)]
+    top = ca.fmax(peak, ca.fabs(y))
+    ends: list[tuple[Any, Any]] = []
+    for steps in (substeps, 2 * substeps):
+        at, highest = x, top
+        for command, begin, lasting in pieces:
+            h = lasting / steps
+            for i in range(steps):
+                at, highest = advance(begin + i * h, at, highest, command, p, h)
+        ends.append((at, highest))
+    (coarse, _), (fine, top) = ends
+    grown = ca.vertcat(fine, after, top, ca.fmax(error, ca.fabs(fine - coarse)), ca.fmax(size, ca.fabs(fine)))
+    return ca.Function("seaopt_period", [state, t, e, r, w, p, c, lag, late_s], [grown, y, late, x])

@@ -1,0 +1,140 @@
+"""A plant, the law that runs, and what stands between them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import field
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.bench import Sensors
+from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.errors import SimulationError, suggestion
+from seaopt.plants import Plant
+from seaopt.records import record
+
+ENERGY = "energy"
+DELAY = "delay_s"  # of a run's parameters: seconds of delay besides the controller's whole samples
+
+
+@record(eq=False)
+class SampledLoop:
+    """A plant, the law that runs, and what stands between them.
+
+    Parameters
+    ----------
+    plant : Plant
+        Its first input is the motor current.
+    law : RunnableLaw
+        As exported.
+    measured : str
+        The output that is fed back.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    sensors : Sensors
+        Noise, offset, range and quantisation of the measured output.
+    current_step_A : float
+        What the current is rounded to; 0 for not at all. The largest is the last whole step within the law's limit.
+    longest_delay_s : float
+        The longest `delay_s` that a run's parameters hold: delay besides `delay_samples`, of any length.
+
+    Raises
+    ------
+    SimulationError
+        The plant has no such output, a number is out of range, or the loop is algebraic.
+
+    """
+
+    plant: Plant
+    law: RunnableLaw
+    measured: str
+    delay_samples: int
+    sensors: Sensors = field(default_factory=Sensors)
+    current_step_A: float = 0.0
+    longest_delay_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        plant = self.plant
+        if self.measured not in plant.outputs:
+            raise SimulationError(
+                f'measured = "{self.measured}" is not an output of {plant.name}; '
+                + suggestion(self.measured, plant.outputs)
+            )
+        for what in ("current_step_A", "longest_delay_s"):
+            if not getattr(self, what) >= 0.0:
+                raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")
+        for what in ("noise_std", "quantisation", "saturation"):
+            if not getattr(self.sensors, what).get(self.measured, 0.0) >= 0.0:
+                raise SimulationError(f"{what} of {self.measured} is negative; give zero or more")
+        if self.current_step_A and not self.most_A:
+            raise SimulationError(
+                f"current_step_A = {self.current_step_A:g} is above the limit of {self.law.current_limit_A:g} A, so "
+                "that every current but zero is; give the amplifier's step"
+            )
+        row = plant.output[list(plant.outputs).index(self.measured)]
+        if self.delay_samples == 0 and ca.depends_on(row, plant.u[0]):
+            raise SimulationError(
+                f"{self.measured} of {plant.name} contains the present current, which a law without delay sets from "
+                "it; give delay_samples = 1 or more, or measure another output"
+            )
+
+    @property
+    def waiting(self) -> int:
+        """How many commands wait, or act, behind the newest."""
+        if not self.longest_delay_s:
+            return self.delay_samples
+        return self.delay_samples + whole_samples(self.longest_delay_s, self.law.sample_time_s)[0] + 1
+
+    @property
+    def most_A(self) -> float:
+        """The largest current: the law's limit, or the last whole step of the amplifier within it."""
+        return largest_current(self.law.current_limit_A, self.current_step_A)
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """The outputs, and the energy where the plant declares it."""
+        return (*self.plant.outputs, *((ENERGY,) if self.plant.energy is not None else ()))
+
+
+@record(eq=False)
+class LoopState:
+    """Where runs stand: states of the plant, and of the law with the commands that still wait.
+
+    Parameters
+    ----------
+    x : array, shape (runs, nx)
+    z : array, shape (runs, n + waiting)
+
+    """
+
+    x: Float[np.ndarray, "runs nx"]
+    z: Float[np.ndarray, "runs nz"]
+
+
+def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None = None) -> LoopState:
+    """Return `runs` loops whose law is at zero and whose plant is in state x, zero if left out."""
+    start = np.zeros(len(loop.plant.states)) if x is None else x
+    return LoopState(x=np.tile(start, (runs, 1)), z=np.zeros((runs, loop.law.c.size + loop.waiting)))
+
+
+def whole_samples(delay_s: float, sample_time_s: float) -> tuple[int, float]:
+    """Return a delay as whole samples and the rest in seconds."""
+    whole = math.floor(delay_s / sample_time_s + 1e-9)
+    rest = delay_s - whole * sample_time_s
+    return whole, rest if rest > 1e-9 * sample_time_s else 0.0
+
+
+def largest_current(limit_A: float, step_A: float) -> float:
+    """Return the last whole step within a current limit; the limit itself without a step.
+
+    Examples
+    --------
+    >>> round(largest_current(9.0, 0.07), 9), largest_current(9.0, 0.0)
+    (8.96, 9.0)
+
+    """
+    if not step_A or math.isinf(limit_A):
+        return limit_A
+    return step_A * math.floor(limit_A / step_A * (1.0 + 1e-12))

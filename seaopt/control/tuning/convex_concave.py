@@ -1,0 +1,260 @@
+r"""Gains by successive quadratic programs: the convex-concave procedure on the Nyquist curves of all plants.
+
+At fixed filters C_r and C_y, and with them every :math:`L_m = P_m C_y`, are affine in the gains
+:math:`\theta = (k_p, k_i, k_d)`. At the last iterate let :math:`\alpha_m = \arg(1 + L_m)`. Then
+
+.. math:: |1 + L_m(\theta)| \ge \rho_m(\theta) = \mathrm{Re}\, e^{-j\alpha_m} (1 + L_m(\theta)),
+
+an affine function that is exact at the iterate: a limit :math:`|1 + L| \ge 1/M_s` is kept by
+:math:`\rho \ge 1/M_s`, an inner approximation (Karimi, Galdos 2010; Hast, Astrom, Bernhardsson, Boyd, ECC 2013). As
+:math:`\rho > 0` at every frequency turns 1 + L by less than a quarter from a curve that does not encircle the origin,
+stability is kept too, where the frequencies are dense enough; eigenvalues decide. A limit :math:`|X| \le M |1 + L|`, X
+one of L, 1 - L, C_y, P C_r, becomes
+
+.. math:: \mathrm{Re}\, e^{-j \arg X_k} X(\theta) \le M \rho(\theta),
+
+one side of the disk, whose other points a trust region keeps in reach. Passivity of the port, Re
+conj(u) (1 + G C_y) >= 0 with u and G known, is affine as it stands. The objective
+:math:`\int |S|\, d\ln f \le \int d\ln f / \rho` is majorised by a convex function, of which the program takes value,
+gradient and curvature; the peak of :math:`|C_y S|` enters by its own rows. Bandwidth is a linearised equality. One
+slack, at a price, is added to every row, so that the program always has a solution and a start that breaks limits
+is repaired in as even a way as possible.
+
+A step is kept if the merit, objective and price of the worst usage, falls, and if all loops are stable; otherwise the
+trust region shrinks. Rows are in units of their limit, variables in units of the gains. Of all rows only those
+that matter are given to the solver. OSQP's status is checked, and its answer by the merit, which knows all rows: an
+answer that is cut off after 500 iterations, as half of them are, is good enough to go on from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.tuning.optimisation_problem import Grid, Point, Task, prominent
+from seaopt.records import record
+
+STEPS = 8
+ROWS = 10  # per kind of limit
+RADIUS = 0.4
+SMALLEST = 0.01  # trust region, as a fraction of the gains
+PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of the objective
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
+
+    value: list[Float[np.ndarray, " n"]] = field(default_factory=list)
+    slope: list[Float[np.ndarray, "n 3"]] = field(default_factory=list)
+
+    def add(self, value: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n 3"]) -> None:
+        self.value.append(value)
+        self.slope.append(slope)
+
+
+@record(eq=False)
+class _Affine:
+    """C_y and C_r at the iterate, and their derivatives by the gains, shape (3, m)."""
+
+    c_y: Complex[np.ndarray, " m"]
+    c_r: Complex[np.ndarray, " m"]
+    by_y: Complex[np.ndarray, "3 m"]
+    by_r: Complex[np.ndarray, "3 m"]
+
+
+def improved(task: Task, grid: Grid, start: Point, steps: int = STEPS) -> tuple[float, Point]:
+    """Return the merit and the numbers after successive quadratic programs in the gains, filters as they are.
+
+    Parameters
+    ----------
+    task : Task
+        What is to be tuned.
+    grid : Grid
+        Frequencies that the limits are looked at on.
+    start : array, shape (8,)
+        Stable.
+    steps : int
+        Programs solved at most.
+
+    """
+    x, radius = start, RADIUS
+    scale = np.maximum(np.abs(start[:3]), _floor(task, grid))
+    merit = _merit(task, grid, x)
+    for _ in range(steps):
+        step = _step(task, grid, x, radius * scale)
+        if step is None:
+            break
+        trial = x.copy()
+        trial[:3] += step
+        trial = task.tidy(trial)
+        found = _merit(task, grid, trial)
+        if found < merit and task.stable(trial):
+            small = merit - found < 1e-3
+            x, merit, radius = trial, found, min(1.5 * radius, 1.0)
+            scale = np.maximum(np.abs(x[:3]), 0.1 * scale)
+            if small:
+                break
+        else:
+            radius *= 0.35
+            if radius < SMALLEST:
+                break
+    return merit, x
+
+
+def _floor(task: Task, grid: Grid) -> Float[np.ndarray, " 3"]:
+    """Return gains that make a difference: a tenth of the inverse plant's at the bandwidth."""
+    w_b = 2 * np.pi * task.spec.bandwidth_hz
+    inverse = 1.0 / abs(np.interp(task.spec.bandwidth_hz, grid.f, np.abs(grid.p[0])))
+    return 0.1 * inverse * np.array([1.0, 0.1 * w_b, 1.0 / w_b])
+
+
+def _merit(task: Task, grid: Grid, x: Point) -> float:
+    """Return the logarithm of the objective and the price of the worst usage."""
+    usage = task.usage(grid, x)
+    worst = max(float(np.max(curve)) for curve in usage.values())
+    worst = max(worst, 1.0 + abs(task.miss(grid, x)), _integral(task, x) + 1.0)
+    return float(np.log(task.objective(grid, x))) + PRICE * max(0.0, worst - 1.0)
+
+
+def _integral(task: Task, x: Point) -> float:
+    return task.least_rate * (1 + x[0]) - x[1]
+
+
+def _affine(task: Task, grid: Grid, x: Point) -> _Affine:
+    series, integral, rate, _ = task.terms(grid, x)
+    c_r, c_y = task.law(grid, x)
+    by_y = series * np.array([np.ones_like(grid.q), integral, rate])
+    by_r = by_y.copy()
+    if task.spec.derivative == "measurement":
+        by_r[2] = 0.0
+    return _Affine(c_y=c_y, c_r=c_r, by_y=by_y, by_r=by_r)
+
+
+def _along(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 3"]:
+    """Return the derivative of abs(value): the part of `by` along it."""
+    size = np.maximum(np.abs(value), 1e-300)
+    return np.real(np.conj(value) / size * by).T
+
+
+def _rows(task: Task, grid: Grid, x: Point, law: _Affine) -> _Rows:
+    """Return the linearised limits at the frequencies and plants where they matter."""
+    rows, limits, m = _Rows(), task.limits(), grid.f.size
+    usage = task.usage(grid, x)
+
+    def chosen(name: str) -> tuple[Any, Any, Any, Any]:
+        """Return usage, plant response, law's columns, and 1 + L of the points that matter."""
+        index = prominent(usage[name], ROWS)
+        index = index[usage[name].ravel()[index] > 0.4]
+        p, column = grid.p.ravel()[index], index % m
+        return usage[name].ravel()[index], p, column, 1.0 + p * law.c_y[column]
+
+    for name in ("ms", "slow"):
+        used, p, column, one = chosen(name)
+        slope = _along(one, p * law.by_y[:, column]) / np.abs(one)[:, None]
+        rows.add(2.0 - 1.0 / used, -slope / used[:, None])
+    kinds: dict[str, tuple[float, Any]] = {
+        "mt": (limits.mt, lambda p, k: (p * law.c_y[k], p * law.by_y[:, k])),
+        "disk": (limits.disk, lambda p, k: (1.0 - p * law.c_y[k], -p * law.by_y[:, k])),
+        "peak": (limits.peak, lambda p, k: (p * law.c_r[k], p * law.by_r[:, k])),
+        "noise": (limits.noise, lambda p, k: (law.c_y[k], law.by_y[:, k])),
+    }
+    for name, (limit, of) in kinds.items():
+        used, p, column, one = chosen(name)
+        value, by = of(p, column)
+        near = _along(one, p * law.by_y[:, column])
+        size = limit * np.abs(one)[:, None]
+        rows.add(used, (_along(value, by) - limit * used[:, None] * near) / size)
+    used, p, column, one = chosen("low")
+    through, by = p * law.c_r[column], p * law.by_r[:, column]
+    near = _along(one, p * law.by_y[:, column]) / np.abs(one)[:, None]
+    rows.add(used, used[:, None] * (near - _along(through, by) / np.abs(through)[:, None]))
+    if task.port is not None:
+        used, _, column, _ = chosen("passive")
+        turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
+        rows.add(used, -np.real(turned * law.by_y[:, column]).T / (limits.passive * size[:, None]))
+    _bandwidth_rows(task, grid, x, law, rows)
+    rows.add(np.array([1.0 + _integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
+    return rows
+
+
+def _bandwidth_rows(task: Task, grid: Grid, x: Point, law: _Affine, rows: _Rows) -> None:
+    at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
+    p, one = grid.p[0, at], np.array([1.0 + grid.p[0, at] * law.c_y[at]])
+    through = np.array([p * law.c_r[at]])
+    slope = _along(through, p * law.by_r[:, [at]]) / np.abs(through) - _along(one, p * law.by_y[:, [at]]) / np.abs(one)
+    miss = task.miss(grid, x)
+    rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
+
+
+def _objective(
+    task: Task, grid: Grid, x: Point, law: _Affine
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
+    if task.spec.objective == "noise":
+        used = np.abs(law.c_y / (1.0 + grid.p[0] * law.c_y))[None]
+        index = prominent(used / np.max(used), ROWS)
+        one, used, column = 1.0 + grid.p[0, index] * law.c_y[index], used[0, index], law.by_y[:, index]
+        slope = _along(law.c_y[index], column) - used[:, None] * _along(one, grid.p[0, index] * column)
+        size = np.max(used)
+        return np.zeros((3, 3)), used / size, slope / np.abs(one)[:, None] / size
+    w = task.weights(grid.f)
+    inside = w > 0.0
+    one = 1.0 + grid.p[:, inside] * law.c_y[inside]
+    rho = np.abs(one)
+    values = (1.0 / rho) @ w[inside]
+    size, worst = np.max(values), int(np.argmax(values))
+    along = np.real((np.conj(one) / rho * grid.p[:, inside])[:, None] * law.by_y[None, :, inside])
+    slopes = -np.einsum("nkm,nm,m->nk", along, rho**-2, w[inside])
+    curvature = 2.0 * np.einsum("km,lm,m,m->kl", along[worst], along[worst], rho[worst] ** -3, w[inside])
+    return curvature / size, values / size, slopes / size
+
+
+def _step(task: Task, grid: Grid, x: Point, reach: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"] | None:
+    """Return the change of the gains that the quadratic program takes; None if it has no answer."""
+    law = _affine(task, grid, x)
+    rows = _rows(task, grid, x, law)
+    curvature, values, slopes = _objective(task, grid, x, law)
+    low, high = (ends[:3] for ends in task.bounds())
+    # Variables: the gains' changes in units of `reach`, the objective, the slack.
+    value, slope = np.concatenate(rows.value), np.concatenate(rows.slope) * reach
+    n = value.size
+    matrix = np.zeros((n + values.size + 4, 5))
+    matrix[:n, :3], matrix[:n, 4] = slope, -1.0
+    matrix[n : n + values.size, :3], matrix[n : n + values.size, 3] = slopes * reach, -1.0
+    matrix[-4:-1, :3], matrix[-1, 4] = np.eye(3), 1.0
+    upper = np.concatenate([1.0 - value, -values, np.minimum(1.0, (high - x[:3]) / reach), [np.inf]])
+    lower = np.full(upper.size, -np.inf)
+    lower[-4:-1], lower[-1] = np.maximum(-1.0, (low - x[:3]) / reach), 0.0
+    size = np.maximum(1.0, np.max(np.abs(matrix), axis=1))
+    quadratic = np.zeros((5, 5))
+    quadratic[:3, :3] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(3)
+    found = solve_qp(
+        quadratic, np.array([0.0, 0.0, 0.0, 1.0, PRICE]), matrix / size[:, None], lower / size, upper / size
+    )
+    return None if found is None else found[:3] * reach
+
+
+def solve_qp(
+    quadratic: Float[np.ndarray, "n n"], linear: Float[np.ndarray, " n"], matrix: Float[np.ndarray, "m n"],
+    lower: Float[np.ndarray, " m"], upper: Float[np.ndarray, " m"],
+) -> Float[np.ndarray, " n"] | None:  # fmt: skip
+    """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where its status is not one of a solution."""
+    import osqp
+    from scipy.sparse import csc_matrix
+
+    solver = osqp.OSQP()
+    solver.setup(
+        P=csc_matrix(np.triu(quadratic)), q=linear, A=csc_matrix(matrix), l=lower, u=upper, verbose=False, eps_abs=1e-5,
+        eps_rel=1e-5, max_iter=500, check_termination=10,
+    )  # fmt: skip
+    found = solver.solve(raise_error=False)
+    status: Any = osqp.SolverStatus
+    usable = found.info.status_val in (
+        status.OSQP_SOLVED, status.OSQP_SOLVED_INACCURATE, status.OSQP_MAX_ITER_REACHED
+    )  # fmt: skip
+    x = np.asarray(found.x, dtype=float)
+    return x if usable and np.all(np.isfinite(x)) else None

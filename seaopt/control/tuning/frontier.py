@@ -1,0 +1,155 @@
+"""What a bandwidth costs: one tuned controller for each of several bandwidths, and their figures side by side."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.loop import LoopFigures
+from seaopt.control.tuning.optimisation_problem import Point, Task
+from seaopt.control.tuning.tuner import controller_of, disturbance, make_task, solved
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+
+SCHEMA = "seaopt/frontier/1"
+MOST_ROWS = 1000
+
+
+@record
+class FrontierRow:
+    """One bandwidth; what is not said to be of the worst plant is of the design plant.
+
+    Parameters
+    ----------
+    bandwidth_hz : float
+        Asked.
+    feasible : bool
+        Whether every limit is met; if not, the figures are those of the controller that misses them least.
+    noise_gain : float
+        N/N.
+    ms, ms_plant : float, str
+        Largest Ms of all plants, and whose it is.
+    disturbance : float
+        Integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant.
+    sensitivity_bandwidth_hz : float
+        abs(S) stays below -3 dB up to here.
+    phase_margin_deg, disk_margin
+        As in `LoopFigures`.
+    force_limit_N : float or None
+        Largest amplitude of the reference at the bandwidth before the current saturates; None without a limit.
+    blocked_by : tuple of str
+        The limits that are broken.
+
+    """
+
+    bandwidth_hz: float
+    feasible: bool
+    noise_gain: float
+    ms: float
+    ms_plant: str
+    disturbance: float
+    sensitivity_bandwidth_hz: float
+    phase_margin_deg: float | None
+    disk_margin: float
+    force_limit_N: float | None
+    blocked_by: tuple[str, ...]
+
+
+@record(eq=False)
+class Frontier:
+    """The rows of a sweep, and their controllers."""
+
+    rows: tuple[FrontierRow, ...]
+    controllers: tuple[Controller, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of frontier.json (schema seaopt/frontier/1)."""
+        rows = [{field.name: getattr(row, field.name) for field in fields(FrontierRow)} for row in self.rows]
+        return {
+            "schema": SCHEMA,
+            "rows": rows,
+            "controllers": [controller.to_dict() for controller in self.controllers],
+        }
+
+    def __repr__(self) -> str:
+        lines = ["  Hz    met   noise gain    Ms    disturbance  phase margin  force limit"]
+        for row in self.rows:
+            phase = "none" if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg"
+            force = "none" if row.force_limit_N is None else f"{row.force_limit_N:.4g} N"
+            lines.append(
+                f"{row.bandwidth_hz:5g}  {'yes' if row.feasible else 'no':4} {row.noise_gain:10.4g}  {row.ms:6.3f}"
+                f"  {row.disturbance:9.4g}    {phase:>10}  {force:>12}  {' and '.join(row.blocked_by)}".rstrip()
+            )
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def sweep(
+    plant: Plant,
+    params: ParameterSet,
+    spec: ControllerSpec,
+    bandwidths_hz: Sequence[float],
+    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    *,
+    draws: Sequence[Mapping[str, float]] = (),
+) -> Frontier:
+    """Tune at each of several bandwidths, every one from the one before too; an infeasible row is a result.
+
+    Parameters
+    ----------
+    plant, params, spec, robust_to, draws
+        As `tune`; the specification's own bandwidth is not used.
+    bandwidths_hz : sequence of float
+        In the specification's range.
+
+    Raises
+    ------
+    ControlError
+        As `tune`; or there is no bandwidth, too many, or one is outside the range.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import sweep
+    >>> spec = so.ControllerSpec(max_sensitivity=1.6, max_noise_gain=25)
+    >>> found = sweep(so.plants.high_impedance(), so.plants.thor(), spec, [20, 30])
+    >>> [row.feasible for row in found.rows], found.rows[0].noise_gain <= 25
+    ([True, True], True)
+
+    """
+    if not 0 < len(bandwidths_hz) <= MOST_ROWS:
+        raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
+    # What is wrong with any row is said before the first is tuned.
+    specs = [replace(spec, bandwidth_hz=float(f)) for f in bandwidths_hz]
+    task = make_task(plant, params, specs[0], robust_to or {}, draws)
+    rows: list[FrontierRow] = []
+    controllers: list[Controller] = []
+    warm: tuple[Point, ...] = ()
+    for one in specs:
+        present = replace(task, spec=one)
+        x, figures = solved(present, warm)
+        controller = controller_of(present, x, figures, (plant, params))
+        rows.append(_row(present, x, figures, controller))
+        controllers.append(controller)
+        warm = (x,)
+    return Frontier(rows=tuple(rows), controllers=tuple(controllers))
+
+
+def _row(task: Task, x: Point, figures: list[LoopFigures], controller: Controller) -> FrontierRow:
+    design, f_b = figures[0], task.spec.bandwidth_hz
+    worst = max(range(len(figures)), key=lambda i: figures[i].ms)
+    return FrontierRow(
+        bandwidth_hz=f_b, feasible=controller.feasible, noise_gain=design.noise_gain, ms=figures[worst].ms,
+        ms_plant=task.names[worst], disturbance=max(disturbance(task.loop(x, i), f_b) for i in range(len(figures))),
+        sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz, phase_margin_deg=design.phase_margin_deg,
+        disk_margin=design.disk_margin, force_limit_N=controller.force_limit(f_b),
+        blocked_by=controller.blocked_by,
+    )  # fmt: skip

@@ -1,0 +1,268 @@
+r"""The last step of the tuner: all eight numbers at once, by an interior-point method on exact derivatives.
+
+The quadratic programs leave filters where the scan put them and stop at a first-order step. Here gains, T_f, T_q and
+notch move together: minimise the objective subject to
+
+.. math:: \ln u_i(x) \le s, \qquad \ln (\sqrt2\,|P C_r| / |1 + L|)_{f_b} = 0, \qquad k_i \ge \omega_i (1 + k_p)
+
+with :math:`u_i` the usages of `seaopt.control.tuning.optimisation_problem` at the points of plant and frequency that
+matter (in the passive band :math:`u_i - 1` in place of the logarithm), and one slack :math:`s \ge 0` at a price that
+is beyond any gain of the objective, so that limits that cannot all be kept are missed by one common factor, the least
+possible. Derivatives, first and second, are CasADi's; the solver is IPOPT. A program of given numbers of points is
+built once and used for every plant and specification.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.control.laws.structures import terms
+from seaopt.control.tuning.optimisation_problem import EVERYWHERE, NAMES, ON_DESIGN, Grid, Point, Task, prominent
+
+POINTS = 24  # of each kind of limit
+SPREAD = 10  # of them, at even distances
+REACH = 3.0  # factor by which a number may change in one solution
+WORST = 2  # plants whose objective is followed
+CHUNK = 64  # quadrature points come in multiples of this
+PRICE = 1e3
+NEGLIGIBLE = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class _Complex:
+    """A complex CasADi vector; with it, formulas for NumPy arrays make expressions."""
+
+    re: Any
+    im: Any
+
+    @staticmethod
+    def of(value: Any) -> _Complex:
+        return value if isinstance(value, _Complex) else _Complex(value, 0.0)
+
+    def __add__(self, other: Any) -> _Complex:
+        o = _Complex.of(other)
+        return _Complex(self.re + o.re, self.im + o.im)
+
+    def __neg__(self) -> _Complex:
+        return _Complex(-self.re, -self.im)
+
+    def __sub__(self, other: Any) -> _Complex:
+        return self + -_Complex.of(other)
+
+    def __rsub__(self, other: Any) -> _Complex:
+        return -self + other
+
+    def __mul__(self, other: Any) -> _Complex:
+        o = _Complex.of(other)
+        return _Complex(self.re * o.re - self.im * o.im, self.re * o.im + self.im * o.re)
+
+    def __truediv__(self, other: Any) -> _Complex:
+        o = _Complex.of(other)
+        top = self * _Complex(o.re, -o.im)
+        size = o.square()
+        return _Complex(top.re / size, top.im / size)
+
+    def __rtruediv__(self, other: Any) -> _Complex:
+        return _Complex.of(other) / self
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def square(self) -> Any:
+        """Return the squared magnitude."""
+        return self.re * self.re + self.im * self.im
+
+
+def polished(task: Task, grid: Grid, start: Point, rounds: int = 5) -> Point:
+    """Return the numbers at a local optimum, or the start if no better ones are found.
+
+    Parameters
+    ----------
+    task : Task
+        What is to be tuned.
+    grid : Grid
+        Frequencies that the limits are looked at on.
+    start : array, shape (8,)
+        Stable.
+    rounds : int
+        Solutions at most; each adds the points where the one before broke a limit.
+
+    """
+    x, chosen = start, _choose(task, grid, start)
+    rank = task.rank(grid, start)
+    for _ in range(rounds):
+        trial = _solve(task, grid, x, chosen)
+        if trial is None:
+            break
+        again = _add_missed(task, grid, trial, chosen)
+        found = task.rank(grid, trial)
+        if found < rank and task.stable(trial):
+            again = again or bool(np.any(trial > 0.99 * REACH * x)) or bool(np.any(trial < 1.01 / REACH * x))
+            x, rank = trial, found
+        if not again:
+            break
+    return x
+
+
+def _add_missed(task: Task, grid: Grid, x: Point, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
+    """Add the points where more of a limit is used than at any chosen one, in place of the last; tell if there are."""
+    missed = False
+    for name, curve in task.usage(grid, x).items():
+        if np.max(curve) > max(1.0, float(np.max(curve.ravel()[chosen[name]]))) + 1e-4:
+            missed = True
+            keep = POINTS - SPREAD
+            worst = np.concatenate([prominent(curve, keep // 2), chosen[name][:keep]])[:keep]
+            chosen[name] = np.concatenate([worst, chosen[name][keep:]])
+    return missed
+
+
+def _choose(task: Task, grid: Grid, x: Point) -> dict[str, Int[np.ndarray, " n"]]:
+    """Return, for each limit, flat indices of POINTS points: those that matter most, and some at even distances."""
+    chosen: dict[str, Int[np.ndarray, " n"]] = {}
+    for name, curve in task.usage(grid, x).items():
+        worst = np.argmax(curve, axis=0)
+        used = np.flatnonzero(np.max(curve, axis=0) > 0.0)
+        even = used[np.linspace(0, used.size - 1, SPREAD).astype(int)] if used.size else np.zeros(1, dtype=int)
+        index = np.concatenate([prominent(curve, POINTS - SPREAD), worst[even] * grid.f.size + even])
+        chosen[name] = np.resize(index, POINTS)
+    return chosen
+
+
+@lru_cache(maxsize=32)
+def _program(
+    quadrature: int, observer: bool, notch: bool, feedback_only: bool, noise: bool, passive: bool
+) -> tuple[Any, list[str]]:
+    """Return the IPOPT solver and the names of its data, in order."""
+    kinds = (*EVERYWHERE, *ON_DESIGN, *(["passive"] * passive))
+    n = POINTS * len(kinds)
+    total = n + quadrature * WORST * (not noise)
+    shapes = {
+        "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
+        "inv_im": total, "weight": quadrature, "ln_limit": n, "at": 8, "ts": 1, "kff": 1, "scale": 8, "rate": 1,
+        "unit": 2 * POINTS * passive,
+    }  # fmt: skip
+    data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
+    v, t, slack = ca.MX.sym("v", 8), ca.MX.sym("t"), ca.MX.sym("slack")
+    x = v * data["scale"]
+
+    def law(part: dict[str, Any]) -> tuple[_Complex, _Complex, _Complex]:
+        """Return P, C_y and C_r at some points."""
+        q = _Complex(part["q_re"], part["q_im"])
+        kept, inverse = _Complex(part["kept_re"], part["kept_im"]), _Complex(part["inv_re"], part["inv_im"])
+        series, integral, rate, more = terms(
+            q, data["ts"], x[3], (x[4], kept, inverse) if observer else None, (x[5], x[6], x[7]) if notch else None
+        )
+        both = integral * x[1] + x[0]
+        c_y = (both + rate * x[2] + more) * series
+        c_r = (both + data["kff"] if feedback_only else both + rate * x[2] + data["kff"]) * series
+        return _Complex(part["p_re"], part["p_im"]), c_y, c_r
+
+    names = [name for name in shapes if name.endswith(("_re", "_im"))]
+    p, c_y, c_r = law({name: data[name][:n] for name in names})
+    open_loop, through = p * c_y, p * c_r
+    distance = (open_loop + 1.0).square() + NEGLIGIBLE
+    slices = {kind: slice(POINTS * i, POINTS * (i + 1)) for i, kind in enumerate(kinds)}
+    above: dict[str, Any] = {
+        "ms": 1.0, "mt": open_loop.square(), "disk": (1.0 - open_loop).square(), "peak": through.square(),
+        "noise": c_y.square(), "slow": 1.0, "low": 1.0,
+    }  # fmt: skip
+    usage: dict[str, Any] = {}
+    for kind, where in slices.items():
+        if kind == "passive":  # P is the port's loop here
+            u, one = _Complex(data["unit"][:POINTS], data["unit"][POINTS:]), open_loop + 1.0
+            cosine = (u.re * one.re[where] + u.im * one.im[where]) / ca.sqrt(distance[where])
+            usage[kind] = (1 - cosine) / ca.exp(data["ln_limit"][where]) - 1
+            continue
+        top = above[kind] if isinstance(above[kind], float) else above[kind][where]
+        size = 0.5 * ca.log((top + NEGLIGIBLE) / distance[where])
+        if kind == "low":
+            size = 0.5 * ca.log(distance[where] / (2 * through.square()[where] + NEGLIGIBLE))
+        usage[kind] = size - data["ln_limit"][where]
+    point = {name: data["at"][i] for i, name in enumerate(names)}
+    p, c_y, c_r = law(point)
+    bandwidth = 0.5 * ca.log(2 * (p * c_r).square() / (p * c_y + 1.0).square())
+    if noise:
+        where = slices["noise"]
+        worst = [usage["noise"] + data["ln_limit"][where] - t]
+    else:
+        p, c_y, _ = law({name: data[name][n:] for name in names})
+        size = 1 / ca.sqrt((p * c_y + 1.0).square() + NEGLIGIBLE)
+        worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST)]
+    g = ca.vertcat(
+        bandwidth,
+        (data["rate"] * (1 + x[0]) - x[1]) / data["scale"][1],
+        *worst,
+        *(rows - slack for rows in usage.values()),
+    )
+    nlp = {"x": ca.vertcat(v, t, slack), "p": ca.vertcat(*data.values()), "f": t + PRICE * slack, "g": g}
+    options = {
+        "print_time": False, "error_on_fail": False, "show_eval_warnings": False,
+        "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 80, "tol": 1e-6, "acceptable_tol": 1e-4,
+                  "mu_init": 1e-3, "acceptable_iter": 5, "warm_start_init_point": "no", "max_wall_time": 5.0},
+    }  # fmt: skip
+    return ca.nlpsol("polish", "ipopt", nlp, options), list(data)
+
+
+def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarray, " n"]]) -> Point | None:
+    """Solve the program on the chosen points; None if its answer is not of numbers."""
+    spec, noise = task.spec, task.spec.objective == "noise"
+    limits = task.limits()._asdict() | {"low": 1.0}
+    limits["slow"] = 1.0 / limits["slow"]
+    m, kinds, passive = grid.f.size, (*EVERYWHERE, *ON_DESIGN), task.port is not None
+    flat = np.concatenate([chosen[kind] for kind in kinds])
+    columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
+    if passive:
+        own, kinds = chosen["passive"], (*kinds, "passive")
+        columns, p = np.concatenate([columns, own]), np.concatenate([p, grid.port[own]])
+        unit = np.where(grid.unit[own] == 0.0, 1.0, grid.unit[own])  # outside the band nothing is asked
+    weights = np.zeros(0)
+    if not noise:
+        inside = np.flatnonzero(task.weights(grid.f) > 0.0)
+        padded = np.resize(inside, CHUNK * (1 + (inside.size - 1) // CHUNK))
+        weights = np.where(np.arange(padded.size) < inside.size, task.weights(grid.f)[padded], 0.0)
+        worst = np.resize(np.argsort(-_integrals(task, grid, start))[:WORST], WORST)
+        columns = np.concatenate([columns, np.tile(padded, WORST)])
+        p = np.concatenate([p, grid.p[worst][:, padded].ravel()])
+    at = int(np.argmin(np.abs(grid.f - spec.bandwidth_hz)))
+    low, high = task.bounds()
+    scale = np.maximum(np.abs(start), [0.1, 0.1, 1e-4, 0.1 * spec.sample_time_s, 1e-4, 1e-3, 1e-2, 1e-2])
+    every = (p, grid.q[columns], grid.kept[columns], grid.inverse[columns])
+    parts = [part for z in every for part in (np.real(z), np.imag(z))]
+    one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
+    data = [
+        *parts, weights, np.repeat(np.log([limits[kind] for kind in kinds]), POINTS),
+        np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
+        [task.least_rate], np.real(unit), np.imag(unit),
+    ]  # fmt: skip
+    solver, _ = _program(
+        weights.size,
+        task.nominal is not None,
+        spec.notch is not None,
+        spec.derivative == "measurement",
+        noise,
+        passive,
+    )
+    used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
+    value = task.objective(grid, start)
+    x0 = np.concatenate([start / scale, [np.log(value) if noise else value, max(0.0, np.log(used)) + 0.01]])
+    count = int(solver.size_out("g")[0])
+    lower, upper = np.full(count, -np.inf), np.zeros(count)
+    lower[0] = 0.0
+    found = solver(
+        x0=x0, p=np.concatenate([np.asarray(item, dtype=float) for item in data]), lbg=lower, ubg=upper,
+        lbx=[*(np.maximum(low, start / REACH) / scale), -np.inf, 0.0],
+        ubx=[*(np.minimum(high, REACH * np.maximum(start, 0.3 * scale)) / scale), np.inf, np.inf],
+    )  # fmt: skip
+    x = np.array(found["x"]).ravel()[: len(NAMES)] * scale
+    return task.tidy(x) if np.all(np.isfinite(x)) else None
+
+
+def _integrals(task: Task, grid: Grid, x: Point) -> Float[np.ndarray, " n"]:
+    """Return the integral of abs(S) of every plant."""
+    _, c_y = task.law(grid, x)
+    return (1.0 / np.abs(1.0 + grid.p * c_y)) @ task.weights(grid.f)

@@ -1,0 +1,332 @@
+r"""What is to be tuned: plants, frequencies and limits as arrays, and a law as a vector of eight numbers.
+
+Every limit is one curve over frequency, its *usage*, which must not exceed 1:
+
+.. math::
+    \frac{1}{M_s |1 + L|}, \quad \frac{|L|}{M_t |1 + L|}, \quad \frac{\alpha\,|1 - L|}{2\,|1 + L|}
+    \qquad \text{(every plant)} \\
+    \frac{|P C_r|}{M_r |1 + L|}, \quad \frac{|C_y|}{N |1 + L|}, \quad
+    \frac{\sqrt 2}{|1 + L|} \; (f \le f_s), \quad \frac{|1 + L|}{\sqrt 2 |P C_r|} \; (f < f_b)
+    \qquad \text{(design plant)}
+
+with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`. In the passive band there is a further one,
+1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.laws.passivity`), the gap that the reserve leaves
+taken off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from seaopt.control.laws.passivity import least_cosine
+from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
+from seaopt.control.laws.structures import Gains, Nominal, Notch, Observer, Terms, terms
+from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.port import Port, sight
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.records import record
+
+OBJECTIVE_HZ = 0.1  # disturbances count from here
+INTEGRAL_RAD_S = 2 * np.pi * 0.05  # k_i / (1 + k_p) at least, so that the integral does something
+FREQUENCIES = 300
+SLOW = 40  # frequencies below 0.1 Hz
+MORE_FREQUENCIES = 300  # about lightly damped modes
+LIGHT = 0.2  # damping ratio below which a mode is resolved
+NO_RATE = 1e-3  # rad/s
+NO_LIMIT = 1e9
+NEARLY_KEPT = 1.001
+SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
+LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
+HIGHEST_NOTCH = 0.45  # of the sample rate
+NAMES = ("k_p", "k_i", "k_d", "T_f", "T_q", "notch_w", "notch_width", "notch_depth")
+EVERYWHERE = ("ms", "mt", "disk")  # limits of every plant
+ON_DESIGN = ("peak", "noise", "slow", "low")
+
+Point = Float[np.ndarray, " 8"]
+
+
+class Limits(NamedTuple):
+    """Peak limits with the reserve taken off; NO_LIMIT where none is imposed."""
+
+    ms: float
+    mt: float
+    disk: float  # 2 over the disk margin
+    peak: float
+    noise: float
+    slow: float  # abs(1 + L) at least
+    passive: float  # 1 - Re Z/abs(Z)
+
+
+@record(eq=False)
+class Grid:
+    """Responses at frequencies.
+
+    Parameters
+    ----------
+    f, q
+        Frequencies in Hz, and exp(-j omega T_s).
+    p : array, shape (plants, m)
+        Plants with hold and delay; the first is the design plant.
+    kept, inverse
+        The nominal plant's parts at q; zeros without an observer.
+    port, unit
+        The loop with link 2 held but for C_y, and G_22/abs(G_22), in the passive band; zeros elsewhere.
+
+    """
+
+    f: Float[np.ndarray, " m"]
+    q: Complex[np.ndarray, " m"]
+    p: Complex[np.ndarray, "n m"]
+    kept: Complex[np.ndarray, " m"]
+    inverse: Complex[np.ndarray, " m"]
+    port: Complex[np.ndarray, " m"]
+    unit: Complex[np.ndarray, " m"]
+
+    def at(self, index: Int[np.ndarray, " k"]) -> Grid:
+        """Return some of the frequencies."""
+        return Grid(
+            f=self.f[index], q=self.q[index], p=self.p[:, index], kept=self.kept[index], inverse=self.inverse[index],
+            port=self.port[index], unit=self.unit[index],
+        )  # fmt: skip
+
+
+@record(eq=False)
+class Task:
+    """A specification with the plants it is to hold for; the first is the design plant, whose port must be passive."""
+
+    spec: ControllerSpec
+    plants: tuple[DigitalPlant, ...]
+    names: tuple[str, ...]
+    k_ff: float
+    nominal: Nominal | None
+    port: Port | None = None
+
+    @property
+    def least_rate(self) -> float:
+        """The least k_i/(1 + k_p), rad/s: an integral does something, and a disturbance observer integrates itself."""
+        return INTEGRAL_RAD_S if self.spec.structure == "pid" else 0.0
+
+    def tidy(self, x: Point) -> Point:
+        """Return numbers within their bounds; beside an observer an integral that does nothing becomes none."""
+        x = np.clip(x, *self.bounds())
+        if self.nominal is not None and x[1] < NO_RATE * (1 + x[0]):
+            x[1] = 0.0
+        return x
+
+    def limits(self) -> Limits:
+        """Return the limits to keep while tuning."""
+        keep, s = 1.0 - self.spec.reserve, self.spec
+        given = (
+            s.max_sensitivity, s.max_complementary, None if s.min_disk_margin is None else 2.0 / s.min_disk_margin,
+            s.max_reference_peak, s.max_noise_gain,
+        )  # fmt: skip
+        peaks = (NO_LIMIT if value is None else max(value * keep, 1e-6) for value in given)
+        return Limits(*peaks, slow=np.sqrt(2.0) / keep, passive=keep)
+
+    def bounds(self) -> tuple[Point, Point]:
+        """Return the least and largest values of the eight numbers; equal where a number is fixed or absent."""
+        spec, ts = self.spec, self.spec.sample_time_s
+        notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
+        if spec.notch is not None:
+            centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_NOTCH / ts)
+            notch = (
+                (float(np.tan(np.pi * centre[0] * ts)), float(np.tan(np.pi * centre[1] * ts))),
+                _range(spec.notch.width, 0.02, 1.0),
+                _range(spec.notch.depth, 0.01, 1.0),
+            )
+        ranges = [
+            (0.0, np.inf), (0.0, 0.0) if self.spec.structure == "pd" else (0.0, np.inf), (0.0, np.inf),
+            (0.0, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
+            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0), *notch,
+        ]  # fmt: skip
+        low, high = (np.array(ends, dtype=float) for ends in zip(*ranges, strict=True))
+        return low, high
+
+    def gains(self, x: Point) -> Gains:
+        """Return a vector's numbers by name."""
+        ts, notch = self.spec.sample_time_s, None
+        if self.spec.notch is not None:
+            notch = Notch(frequency_hz=float(np.arctan(x[5]) / (np.pi * ts)), width=float(x[6]), depth=float(x[7]))
+        return Gains(
+            k_p=float(x[0]), k_i=float(x[1]), k_d=float(x[2]), T_f=float(x[3]), k_ff=self.k_ff,
+            derivative=self.spec.derivative, notch=notch,
+            observer=None if self.nominal is None else Observer(nominal=self.nominal, T_q=float(x[4])),
+        )  # fmt: skip
+
+    def loop(self, x: Point, plant: int = 0) -> Loop:
+        """Return the loop around one plant."""
+        reference, measurement = self.gains(x).transfer_functions(self.spec.structure, self.spec.sample_time_s)
+        return Loop(plant=self.plants[plant], reference=reference, measurement=measurement)
+
+    def stable(self, x: Point) -> bool:
+        """Tell whether every plant's loop is stable, by its eigenvalues."""
+        return all(np.max(np.abs(self.loop(x, i).eigenvalues())) < 1.0 for i in range(len(self.plants)))
+
+    def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:
+        """Return the responses of the plants, or of some of them, at frequencies."""
+        q = np.exp(-2j * np.pi * f * self.spec.sample_time_s)
+        kept = inverse = np.zeros(f.size, dtype=complex)
+        if self.nominal is not None:
+            kept = np.polynomial.polynomial.polyval(q, self.nominal.kept)
+            inverse = self.nominal.inverse.response(f, self.spec.sample_time_s)
+        chosen = self.plants if rows is None else [self.plants[row] for row in rows]
+        p = np.array([plant.response(f) for plant in chosen])
+        port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
+        if self.port is not None and self.spec.passive_band_hz is not None:
+            low, high = self.spec.passive_band_hz
+            inside = np.flatnonzero((f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9)))
+            port[inside], unit[inside] = sight(
+                self.port, self.spec.sample_time_s, self.spec.delay_samples, f[inside]
+            )  # fmt: skip
+        return Grid(f=f, q=q, p=p, kept=kept, inverse=inverse, port=port, unit=unit)
+
+    def terms(self, grid: Grid, x: Point) -> Terms:
+        """Return the law's terms on a grid."""
+        observer = None if self.nominal is None else (x[4], grid.kept, grid.inverse)
+        notch = None if self.spec.notch is None else (x[5], x[6], x[7])
+        return terms(grid.q, self.spec.sample_time_s, x[3], observer, notch)
+
+    def law(self, grid: Grid, x: Point) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
+        """Return C_r and C_y on a grid."""
+        series, integral, rate, observer = self.terms(grid, x)
+        both = x[0] + x[1] * integral
+        c_y = series * (both + x[2] * rate + observer)
+        on_reference = x[2] * rate if self.spec.derivative == "error" else 0.0
+        return series * (both + on_reference + self.k_ff), c_y
+
+    def usage(self, grid: Grid, x: Point, *, design: bool = True) -> dict[str, Float[np.ndarray, "k m"]]:
+        """Return how much of each limit is used, by its name, arrays of one row a plant.
+
+        The limits of the design plant, which is then the grid's first, are left out on request.
+        """
+        c_r, c_y = self.law(grid, x)
+        out = self.everywhere(grid.p, c_y)
+        if design:
+            out |= {name: value[None] for name, value in self.on_design(grid, c_y, c_r).items()}
+        return out
+
+    def everywhere(self, p: Complex[np.ndarray, "*k m"], c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
+        """Return the usage of the limits that every plant must keep."""
+        limits, open_loop = self.limits(), p * c_y
+        distance = np.abs(1.0 + open_loop)
+        return {
+            "ms": 1.0 / (limits.ms * distance), "mt": np.abs(open_loop) / (limits.mt * distance),
+            "disk": np.abs(1.0 - open_loop) / (limits.disk * distance),
+        }  # fmt: skip
+
+    def on_design(
+        self, grid: Grid, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
+    ) -> dict[str, np.ndarray]:
+        """Return the usage of the limits of the design plant, the grid's first."""
+        f, p, limits = grid.f, grid.p[0], self.limits()
+        distance, through = np.abs(1.0 + p * c_y), np.abs(p * c_r)
+        out = {
+            "peak": through / (limits.peak * distance), "noise": np.abs(c_y) / (limits.noise * distance),
+            "slow": np.where(self.slow(f), limits.slow / distance, 0.0),
+            "low": np.where(self.low(f), distance / np.maximum(np.sqrt(2.0) * through, 1e-12), 0.0),
+        }  # fmt: skip
+        if self.port is not None:
+            held = 1.0 + grid.port * c_y
+            cosine = np.real(grid.unit * np.conj(held)) / np.maximum(np.abs(held), 1e-300)
+            out["passive"] = np.where(grid.unit != 0.0, (1.0 - cosine) / limits.passive, 0.0)
+        return out
+
+    def least_cosine(self, x: Point) -> tuple[float, float] | None:
+        """Return the least Re Z/abs(Z) in the passive band and where it is; None where none is asked for."""
+        spec, band = self.spec, self.spec.passive_band_hz
+        if self.port is None or band is None:
+            return None
+        _, law = self.gains(x).transfer_functions(spec.structure, spec.sample_time_s)
+        return least_cosine(self.port, law, spec.sample_time_s, spec.delay_samples, band)
+
+    def slow(self, f: Float[np.ndarray, " m"]) -> np.ndarray:
+        """Tell where abs(S) must be below -3 dB."""
+        return f <= self.spec.sensitivity_bandwidth_limit_hz * (1 + 1e-9)
+
+    def low(self, f: Float[np.ndarray, " m"]) -> np.ndarray:
+        """Tell where abs(F/F_ref) must be above -3 dB."""
+        return f < 0.97 * self.spec.bandwidth_hz
+
+    def weights(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
+        first, last = np.searchsorted(f, [OBJECTIVE_HZ * (1 - 1e-9), self.spec.bandwidth_hz * (1 + 1e-9)])
+        out, step = np.zeros(f.size), 0.5 * np.diff(np.log(f[first:last]))
+        out[first : last - 1] += step
+        out[first + 1 : last] += step
+        return out
+
+    def miss(self, grid: Grid, x: Point) -> float:
+        """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
+        at = grid.at(np.array([int(np.argmin(np.abs(grid.f - self.spec.bandwidth_hz)))]))
+        c_r, c_y = self.law(at, x)
+        return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * c_r / (1 + at.p[0] * c_y)))[0])
+
+    def rank(self, grid: Grid, x: Point) -> tuple[float, float]:
+        """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
+
+        A bandwidth that is missed counts ten times a limit that is.
+        """
+        worst = max(float(np.max(curve)) for curve in self.usage(grid, x).values())
+        worst = max(worst, 1.0 + 10.0 * abs(self.miss(grid, x)))
+        return (worst if worst > NEARLY_KEPT else 0.0), self.objective(grid, x)
+
+    def objective(self, grid: Grid, x: Point) -> float:
+        """Return the objective on a grid."""
+        _, c_y = self.law(grid, x)
+        distance = np.abs(1.0 + grid.p * c_y)
+        if self.spec.objective == "noise":
+            return float(np.max(np.abs(c_y) / distance[0]))
+        return float(np.max((1.0 / distance) @ self.weights(grid.f)))
+
+
+def _range(given: float | None, low: float, high: float) -> tuple[float, float]:
+    return (low, high) if given is None else (given, given)
+
+
+def light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
+    """Return frequency (Hz) and damping ratio of the modes that are lightly damped."""
+    values = np.linalg.eigvals(plant.a).astype(complex)
+    poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
+    found = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles]
+    return [(float(f), float(max(zeta, 1e-9))) for f, zeta in found if zeta < LIGHT]
+
+
+def frequencies(task: Task) -> Float[np.ndarray, " m"]:
+    """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
+
+    About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
+    what falls between is found afterwards.
+    """
+    spec, nyquist = task.spec, 0.5 / task.spec.sample_time_s
+    near: list[Float[np.ndarray, " _"]] = []
+    for f, zeta in {mode for plant in task.plants for mode in light_modes(plant)}:
+        reach = max(4 * zeta, 0.02) * f
+        near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
+    extra = np.sort(np.concatenate([np.zeros(0), *near]))
+    extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
+    slow, base = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW), np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
+    ends = [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz, *(spec.passive_band_hz or ())]
+    grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
+    return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
+
+
+def prominent(usage: Float[np.ndarray, "k m"], count: int) -> Int[np.ndarray, " c"]:
+    """Return flat indices of up to `count` points that matter most: local maxima first, then the largest of others.
+
+    Of the others every third is looked at: neighbours say the same.
+    """
+    rows, m = usage.shape
+    wide = np.full((rows, m + 2), -np.inf)
+    wide[:, 1:-1] = usage
+    top = (usage >= wide[:, :-2]) & (usage >= wide[:, 2:])
+    rank = np.where(
+        top, usage + 10.0 * (usage > 0.5), -np.inf
+    )  # a maximum outranks what is none, if it is near its limit
+    rank[:, ::3] = np.maximum(rank[:, ::3], usage[:, ::3])
+    flat = rank.ravel()
+    count = min(count, int(np.count_nonzero(np.isfinite(flat))))
+    return np.argpartition(-flat, count - 1)[:count]

@@ -1,0 +1,317 @@
+r"""Place a bandwidth under limits on several plants at once.
+
+The law is eight numbers at most: gains k_p, k_i, k_d; filters T_f, T_q; a notch's frequency, width and depth. Every
+limit is a curve over frequency on every plant (`seaopt.control.tuning.optimisation_problem`), and the design plant's
+bandwidth an equality. That is solved in four steps, each the next one's start:
+
+1. a scan over filters and two gains, the third from the bandwidth equality in closed form (`starts`);
+2. from the best, successive quadratic programs in the gains, the convex-concave procedure (`convex`);
+3. an interior-point method in all numbers at once, on exact derivatives (`polish`);
+4. a recheck on frequencies that resolve every pole of plants and closed loops; where a limit is broken between the
+   frequencies, those are added and step 3 is repeated.
+
+The result is then measured by `Loop.figures`, which uses none of these frequencies. What is returned as feasible has
+been measured to be so. Where limits cannot all be kept, the result misses them by one common factor, the least
+found, and the largest bandwidth at which they can be kept is found by bisection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Complex
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
+from seaopt.control.laws.spec_checks import check_current, check_delay
+from seaopt.control.laws.structures import Nominal
+from seaopt.control.laws.verdict import BANDWIDTH_TOLERANCE as BANDWIDTH_TOLERANCE
+from seaopt.control.laws.verdict import active, broken, explained
+from seaopt.control.loops.loop import GROWING, Loop, LoopFigures
+from seaopt.control.loops.port import port_of
+from seaopt.control.loops.sampled_plant import sample
+from seaopt.control.tuning.convex_concave import improved
+from seaopt.control.tuning.interior_point import polished
+from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, Point, Task, frequencies
+from seaopt.control.tuning.starts import starts
+from seaopt.errors import ControlError, suggestion
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+
+STARTS = 3  # two more where an observer or a notch makes more valleys
+POLISHED = 2  # of them; one more with an observer, all with a notch
+RECHECKS = 3
+FINEST = 0.01  # of the largest bandwidth
+OUT_OF_REACH = 1.03  # usage
+PROBES = 5  # bandwidths tried when the lowest cannot be met
+
+
+def current_per_force(plant: Plant, params: ParameterSet) -> float:
+    """Return r/(eta K_tau) of (2) and (3), A/N; one over the torque constant where the plant has no screw.
+
+    Raises
+    ------
+    ControlError
+        The plant's parameters do not say what force a current makes.
+
+    """
+    complete = plant.complete(params)
+    if all(name in complete for name in ("l", "N_p", "K_tau", "eta")):
+        lead, ratio, torque, eta = complete.values_of(("l", "N_p", "K_tau", "eta"))
+        if torque * eta <= 0.0 or ratio <= 0.0:
+            raise ControlError(f"K_tau = {torque:g}, eta = {eta:g}, N_p = {ratio:g}: all must be positive")
+        return lead / (2 * np.pi * ratio) / (eta * torque)
+    raise ControlError(
+        f"plant {plant.name} has no l, N_p, K_tau, eta that say what force a current makes; "
+        "use a plant with the actuator's parameters"
+    )
+
+
+def tune(
+    plant: Plant,
+    params: ParameterSet,
+    spec: ControllerSpec,
+    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    *,
+    draws: Sequence[Mapping[str, float]] = (),
+) -> Controller:
+    """Tune a digital force controller.
+
+    Parameters
+    ----------
+    plant, params
+        The design plant, the test stand as a rule, and its parameters.
+    spec : ControllerSpec
+        Bandwidth and limits.
+    robust_to : mapping of name to Plant or (Plant, ParameterSet), optional
+        Plants that must be stable and meet Ms, Mt and disk margin too, driven by the same current.
+    draws : sequence of mappings of parameter to value, optional
+        Values at which the design plant and every plant of robust_to must do so too; see `corners` and `draw`.
+
+    Returns
+    -------
+    Controller
+        With `feasible` False, and the limits that block in `active_constraints`, when the limits cannot all be met;
+        it is then the controller found that misses them least, and `largest_bandwidth_hz` says what can be had.
+
+    Raises
+    ------
+    ControlError
+        The measured output does not respond to the motor at 0 Hz, the plant is unstable without control, a draw names
+        a parameter that no plant has, delay or current limit rule the request out for every controller, or a passive
+        band is asked of a plant without a port at link 2, or with an elastic screw before it.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
+    >>> controller.feasible, round(controller.achieved.bandwidth_hz)
+    (True, 30)
+
+    """
+    task = make_task(plant, params, spec, robust_to or {}, draws)
+    check_delay(spec, task.plants[0])
+    values = plant.complete(params)
+    friction = values["f_c"].value if "f_c" in values else 0.0
+    check_current(spec, task.k_ff, current_per_force(plant, params), friction)
+    x, figures = solved(task)
+    largest = None
+    if broken(spec, task.names, figures, task.least_cosine(x)):
+        largest, near = largest_bandwidth(task, x)
+        # From there another answer may be in reach: a better compromise, or none needed.
+        if near is not None:
+            x, figures = solved(task, (x, near))
+    return controller_of(task, x, figures, (plant, params), largest)
+
+
+def make_task(
+    plant: Plant, params: ParameterSet, spec: ControllerSpec,
+    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]] = (),
+) -> Task:  # fmt: skip
+    """Return what is to be tuned.
+
+    Raises
+    ------
+    ControlError
+        As `tune`.
+
+    """
+    gain = current_per_force(plant, params)
+    if not isinstance(robust_to, Mapping):
+        raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
+    models = {"design plant": (plant, params)}
+    models |= {str(name): p if isinstance(p, tuple) else (p, params) for name, p in robust_to.items()}
+    names, pairs = [*models], [*models.values()]
+    for name, pair in _drawn(models, draws):
+        names.append(name)
+        pairs.append(pair)
+    plants = tuple(
+        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.delay_samples) for model, values in pairs
+    )
+    static = plants[0].static_gain
+    if not np.isfinite(static) or abs(static) < 1e-6:
+        raise ControlError(
+            f"measured = {spec.measured}: the static gain of {plant.name} from motor force is {static:g}, which "
+            "feedforward cannot invert; tune on the stand and name this plant in robust_to"
+        )
+    for name, sampled in zip(names, plants, strict=True):
+        if np.max(np.abs(np.linalg.eigvals(sampled.a))) > GROWING:
+            raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
+    nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
+    port = None if spec.passive_band_hz is None else port_of(plant, params, spec.measured, gain)
+    return Task(spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal, port=port)
+
+
+def _drawn(
+    models: Mapping[str, tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]]
+) -> list[tuple[str, tuple[Plant, ParameterSet]]]:
+    """Return every plant at every draw, under a name; a draw that changes nothing of a plant is left out."""
+    whole = {name: (model, model.complete(values)) for name, (model, values) in models.items()}
+    known = {name for model, _ in whole.values() for name in model.parameters}
+    out: list[tuple[str, tuple[Plant, ParameterSet]]] = []
+    for number, values in enumerate(draws, start=1):
+        for parameter in values:
+            if parameter not in known:
+                raise ControlError(f'draws name "{parameter}", which no plant has; {suggestion(parameter, known)}')
+        for name, (model, nominal) in whole.items():
+            own = {key: float(value) for key, value in values.items() if key in model.parameters}
+            if not own:
+                continue
+            label = (
+                ", ".join(f"{key} = {value:.4g}" for key, value in own.items()) if len(own) < 3 else f"draw {number}"
+            )
+            out.append((f"{name}, {label}", (model, nominal.update(**own))))
+    return out
+
+
+def solved(task: Task, warm: Sequence[Point] = ()) -> tuple[Point, list[LoopFigures]]:
+    """Return the best numbers found, and the figures of every plant with them.
+
+    Parameters
+    ----------
+    task : Task
+        What is to be tuned.
+    warm : sequence of arrays, shape (8,)
+        Numbers to start from besides those of the scan, which then tries one less.
+
+    """
+    grid = task.grid(frequencies(task))
+    x = best(task, grid, warm)
+    for _ in range(RECHECKS):
+        missed = _missed(task, x, grid)
+        if not missed.size:
+            break
+        grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
+        x = polished(task, grid, x)
+    return x, [task.loop(x, i).figures() for i in range(len(task.plants))]
+
+
+def best(task: Task, grid: Grid, warm: Sequence[Point] = ()) -> Point:
+    """Return the best numbers on a grid."""
+    more = task.nominal is not None or task.spec.notch is not None
+    given = [task.tidy(x) for x in warm]
+    first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + 2 * more - bool(given))
+    ranked = sorted((improved(task, grid, x) for x in first), key=lambda item: item[0])
+    polish = len(ranked) if task.spec.notch is not None else POLISHED + more
+    chosen: list[Point] = []
+    for _, x in ranked:
+        if len(chosen) < polish and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
+            chosen.append(x)
+    return min((polished(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
+
+
+def _missed(task: Task, x: Point, grid: Grid) -> np.ndarray:
+    """Return frequencies between the grid's at which more of a limit is used than anywhere on it."""
+    allowed = {name: max(1.0, float(np.max(curve))) for name, curve in task.usage(grid, x).items()}
+    out: list[float] = []
+    for row in range(len(task.plants)):
+        dense = task.loop(x, row).grid()
+        f = dense[(dense >= LOWEST_HZ) & (dense < grid.f[-1])]
+        for name, curve in task.usage(task.grid(f, [row]), x, design=row == 0).items():
+            top = int(np.argmax(curve))
+            if curve[0, top] > allowed[name] * (1.0 + max(0.4 * task.spec.reserve, 1e-6)):
+                out.append(float(f[top]))
+    return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
+
+
+def largest_bandwidth(task: Task, x: Point) -> tuple[float, Point | None]:
+    """Return the largest bandwidth in range that keeps the limits, and its numbers; 0 and None if there is none.
+
+    Found by bisection from the bandwidth asked, which does not keep them, towards the lowest; if that does not either,
+    a few others are tried first. It is right to a hundredth, if limits that can be kept at one bandwidth can be kept
+    at a lower one.
+    """
+    spec, asked = task.spec, task.spec.bandwidth_hz
+    low = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
+    near: list[Point] = []
+
+    def possible(bandwidth_hz: float) -> bool:
+        found = _possible(
+            replace(task, spec=replace(spec, bandwidth_hz=bandwidth_hz)), near[-1] if near else x, near=bool(near)
+        )
+        near.extend([] if found is None else [found])
+        return found is not None
+
+    tried = [low, *np.geomspace(low, asked, PROBES + 2)[-2:0:-1]] if low < asked else []
+    first = next((k for k, f in enumerate(tried) if possible(float(f))), None)
+    if first is None:
+        return 0.0, None
+    lower, upper = tried[first], tried[first - 1] if first > 1 else asked
+    while upper / lower > 1.0 + FINEST:
+        middle = float(np.sqrt(lower * upper))
+        lower, upper = (middle, upper) if possible(middle) else (lower, middle)
+    return float(lower), near[-1]
+
+
+def _possible(task: Task, x: Point, *, near: bool) -> Point | None:
+    """Return numbers that keep all limits on the frequencies looked at, if found: from x first, then from anywhere.
+
+    Near a bandwidth that is possible what x misses clearly is not looked for anywhere else.
+    """
+    grid = task.grid(frequencies(task))
+    x = task.tidy(x)
+    if task.stable(x):
+        x = polished(task, grid, x)
+        usage, _ = task.rank(grid, x)
+        if usage == 0.0 or (near and usage > OUT_OF_REACH):
+            return x if usage == 0.0 else None
+    found = best(task, grid, [x])
+    return found if task.rank(grid, found)[0] == 0.0 else None
+
+
+def controller_of(
+    task: Task, x: Point, figures: list[LoopFigures], design: tuple[Plant, ParameterSet], largest: float | None = None
+) -> Controller:
+    """Return the controller of tuned numbers."""
+    spec, gains = task.spec, task.gains(x)
+    port = task.least_cosine(x)
+    blocked = broken(spec, task.names, figures, port)
+    reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
+    return Controller(
+        structure=spec.structure,
+        gains=gains.named(),
+        sample_time_s=spec.sample_time_s,
+        delay_samples=spec.delay_samples,
+        reference=reference,
+        measurement=measurement,
+        current_per_force_A_per_N=current_per_force(*design),
+        spec=spec,
+        achieved=figures[0],
+        feasible=not blocked,
+        active_constraints=tuple(blocked or active(spec, task.names, figures, port)),
+        robust_to=task.names[1:],
+        design=design,
+        observer=gains.observer,
+        blocked_by=explained(spec, task.names, figures, task.loop(x), port),
+        largest_bandwidth_hz=largest,
+    )
+
+
+def disturbance(loop: Loop, bandwidth_hz: float) -> float:
+    """Return the integral over ln f of abs(S) from 0.1 Hz to the bandwidth."""
+    f = np.geomspace(OBJECTIVE_HZ, bandwidth_hz, 2000)
+    s: Complex[np.ndarray, " m"] = loop.sensitivity(f)
+    return float(np.trapezoid(np.abs(s), np.log(f)))

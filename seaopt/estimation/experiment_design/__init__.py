@@ -1,0 +1,1 @@
+"""What to measure: excitations that tell most of the free parameters within limits."""

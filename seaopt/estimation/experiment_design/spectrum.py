@@ -1,0 +1,282 @@
+r"""Spectra: which powers at which frequencies tell most of the parameters of a linear plant, and with which phases.
+
+In the periodic steady state of a multisine :math:`u = \sum_k a_k \sin(\omega_k t + \varphi_k)` the sensitivities of
+the outputs are sines too, so that over whole periods of n samples the Fisher information is linear in the powers
+:math:`P_k = a_k^2/2` (Goodwin and Payne, Dynamic System Identification, 1977, Sec. 6.4),
+
+.. math:: F = \sum_k P_k F_k, \qquad
+          F_k = n \sum_o \sigma_o^{-2} \Re\left(\frac{\partial H_o}{\partial\theta}
+                \frac{\partial H_o}{\partial\theta}^{*}\right)(e^{i\omega_k T}),
+
+and every measure of its inverse is convex in them. Limits on the mean square of the input or of any response
+:math:`|H_m|` are linear. H is the response of the sampled plant, its derivatives are exact. Constant offsets of the
+sensors are orthogonal to every line and take nothing from F.
+
+Phases do not change F. They decide the peaks, and are found from Schroeder's (IEEE Trans. Inf. Theory 16, 1970) by
+minimising norms of rising order of all limited signals together (Guillaume et al., IEEE Trans. Instrum. Meas. 40,
+1991).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from seaopt.errors import EstimationError
+from seaopt.records import record
+from seaopt.simulation import Clock, Model, linearised, transition
+
+ORDERS = (2, 8, 32)  # half the orders of the norms that become the peak
+SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of the largest are zero
+
+
+@record(eq=False)
+class Spectrum:
+    """What one ampere squared at each of K frequencies tells, and what it moves.
+
+    Parameters
+    ----------
+    harmonics : array, shape (K,)
+        Multiples of rate/n.
+    information : array, shape (K, p, p)
+        Fisher information of a unit mean square at each line.
+    gains : array, shape (m, K)
+        Responses of the limited signals.
+
+    """
+
+    harmonics: Int[np.ndarray, " K"]
+    information: Float[np.ndarray, "K p p"]
+    gains: Complex[np.ndarray, "m K"]
+
+
+def harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Int[np.ndarray, " K"]:
+    """Return at most `lines` log-spaced multiples of rate_hz/n in a band.
+
+    Raises
+    ------
+    EstimationError
+        No multiple lies in the band.
+
+    Examples
+    --------
+    >>> harmonics(400, 400.0, (1.0, 100.0), 3)
+    array([  1,  10, 100])
+
+    """
+    low, high = band_hz
+    first, last = max(int(np.ceil(low * n / rate_hz - 1e-9)), 1), min(int(high * n / rate_hz + 1e-9), (n - 1) // 2)
+    if not 0.0 < low < high or first > last:
+        raise EstimationError(
+            f"band_hz = [{low:g}, {high:g}] holds no multiple of 1/duration = {rate_hz / n:g} Hz below half the sample "
+            "rate; give [low, high] with 0 < low < high, or a longer duration"
+        )
+    return np.unique(np.round(np.geomspace(first, last, lines)).astype(int))
+
+
+def spectrum(
+    model: Model,
+    theta: Float[np.ndarray, " np"],
+    clock: Clock,
+    places: Int[np.ndarray, " K"],
+    *,
+    n: int,
+    sigma: Float[np.ndarray, " nm"],
+    channel: int,
+    signals: list[int],
+) -> Spectrum:
+    """Return the spectrum of a plant, linearised at rest where it is not linear.
+
+    Parameters
+    ----------
+    model, theta, clock
+        The plant, its free parameters and the hold.
+    places : array, shape (K,)
+        The lines, in multiples of 1/(n period).
+    n : int
+        Samples.
+    sigma : array, shape (nm,)
+        Noise of the first nm outputs, those that are measured.
+    channel : int
+        The input that is excited.
+    signals : list of int
+        Limited signals: -1 is the input, then the outputs, then the states.
+
+    """
+    linear = linearised(model)
+    blocks = transition(linear, theta, clock)
+    z = np.exp(2j * np.pi * places / n)
+    response = np.array([_response(blocks, linear.nx, linear.nu, channel, clock, zk) for zk in z])
+    slopes = response[:, 1:, linear.nx : linear.nx + sigma.size] / sigma
+    information = n * np.einsum("kio,kjo->kij", slopes, slopes.conj()).real
+    order = np.concatenate([response[:, 0, linear.nx :], response[:, 0, : linear.nx], np.ones((z.size, 1))], axis=1)
+    return Spectrum(harmonics=places, information=information, gains=order[:, signals].T)
+
+
+def _response(
+    blocks: Float[np.ndarray, "nd r c"], nx: int, nu: int, channel: int, clock: Clock, z: complex
+) -> Complex[np.ndarray, "nd r"]:
+    """Return the responses of states and outputs to one input at z, and their derivatives."""
+    early, late = (z ** -float(lag) for lag in clock.lags)
+    drive = blocks[:, :, nx + channel] * early + blocks[:, :, nx + nu + channel] * late
+    resolvent = np.linalg.inv(z * np.eye(nx) - blocks[0, :nx, :nx])
+    x = resolvent @ drive[0, :nx]
+    out = np.zeros(drive.shape, dtype=complex)
+    out[0, :nx], out[0, nx:] = x, blocks[0, nx:, :nx] @ x + drive[0, nx:]
+    for row, block, change in zip(out[1:], blocks[1:], drive[1:], strict=True):
+        row[:nx] = resolvent @ (block[:nx, :nx] @ x + change[:nx])
+        row[nx:] = block[nx:, :nx] @ x + blocks[0, nx:, :nx] @ row[:nx] + change[nx:]
+    return out
+
+
+def optimal_powers(
+    information: Float[np.ndarray, "K p p"],
+    budget: Float[np.ndarray, "m K"],
+    *,
+    weight: Float[np.ndarray, "p p"] | None,
+    prior: Float[np.ndarray, "p p"] | None = None,
+) -> Float[np.ndarray, " K"]:
+    """Return the powers that minimise trace(W F^-1), or -log det F, within linear limits.
+
+    Parameters
+    ----------
+    information : array, shape (K, p, p)
+        F = sum_k P_k information[k] + prior.
+    budget : array, shape (m, K)
+        budget @ P <= 1; not negative, and no column zero.
+    weight : array, shape (p, p), or None
+        W; None for the determinant.
+    prior : array, shape (p, p), optional
+        Information from elsewhere.
+
+    Returns
+    -------
+    array, shape (K,)
+
+    Raises
+    ------
+    EstimationError
+        Some direction of the parameters shows at no line.
+
+    Examples
+    --------
+    Of two lines, the one that tells four times as much gets twice the power if sum of variances counts less:
+
+    >>> lines = np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
+    >>> optimal_powers(lines, np.ones((1, 2)), weight=np.eye(2)).round(4)
+    array([0.3333, 0.6667])
+
+    """
+    k, p = information.shape[:2]
+    even = np.full(k, 1.0 / np.max(np.sum(budget, axis=1)))
+    known = np.zeros((p, p)) if prior is None else prior
+    root = _inverse_root(np.einsum("k,kij->ij", even, information) + known)
+    normal = np.einsum("ai,k,kij,jb->kab", root.T, even, information, root)
+    q = ca.SX.sym("q", k)
+    total = ca.reshape(ca.mtimes(ca.DM(normal.reshape(k, p * p).T), q), p, p) + ca.DM(root.T @ known @ root)
+    cost = _cost(total, None if weight is None else root.T @ weight @ root, p)
+    nlp = {"x": q, "f": cost, "g": ca.mtimes(ca.DM(budget * even), q)}
+    options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "error_on_fail": True}
+    solver = ca.nlpsol("powers", "ipopt", nlp, options)
+    try:
+        found = solver(x0=np.full(k, 0.9), lbx=0.0, ubg=1.0)
+    except RuntimeError as error:
+        raise EstimationError("the powers were not found; use fewer lines, or narrow band_hz") from error
+    return np.maximum(np.array(found["x"]).ravel(), 0.0) * even
+
+
+def _cost(total: Any, weight: Float[np.ndarray, "p p"] | None, p: int) -> Any:
+    """Return the criterion of an information matrix as an expression, near 1 at the start."""
+    upper = ca.chol(0.5 * (total + total.T))
+    if weight is None:
+        return -2.0 * ca.sum1(ca.log(ca.diag(upper)))
+    values, vectors = np.linalg.eigh(weight / np.trace(weight))
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    return ca.sumsqr(_forward(upper, ca.DM(half), p))
+
+
+def _forward(upper: Any, right: Any, p: int) -> Any:
+    """Return (R')^-1 B by forward substitution: |.|^2 is then trace(B' (R'R)^-1 B)."""
+    rows: list[Any] = []
+    for i in range(p):
+        rest = right[i, :]
+        for j in range(i):
+            rest -= upper[j, i] * rows[j]
+        rows.append(rest / upper[i, i])
+    return ca.vertcat(*rows)
+
+
+def _inverse_root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Return S with S' M S = 1.
+
+    Raises
+    ------
+    EstimationError
+        M is singular.
+
+    """
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    if not np.all(np.isfinite(values)) or values[0] <= SINGULAR * values[-1]:
+        raise EstimationError(
+            "no line shows every free parameter by itself; fix one, give it a prior, or measure another output"
+        )
+    return vectors / np.sqrt(values) / size[:, None]
+
+
+def schroeder_phases(powers: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
+    """Return Schroeder's phases, -2 pi sum_(j<k) (k - j) P_j / sum P: a line's delay grows with the power before it."""
+    share = np.concatenate([[0.0], np.cumsum(powers)[:-1]]) / np.sum(powers)
+    return -2.0 * np.pi * np.cumsum(share)
+
+
+def low_peak_phases(
+    lines: Complex[np.ndarray, "m K"], places: Int[np.ndarray, " K"], n: int, start: Float[np.ndarray, " K"]
+) -> Float[np.ndarray, " K"]:
+    """Return phases that make the largest of m periodic signals over n samples small.
+
+    Parameters
+    ----------
+    lines : array, shape (m, K)
+        Signal m is Im sum_k lines[m, k] exp(i (phase_k + 2 pi places_k t/n)).
+    places : array, shape (K,)
+        Harmonics.
+    n : int
+        Samples.
+    start : array, shape (K,)
+        First phases.
+
+    """
+    from scipy.optimize import minimize  # deferred: 0.3 s
+
+    phases = start
+    for order in ORDERS:
+        found = minimize(
+            lambda x, q: _norm(x, lines, places, n, q), phases, args=(order,), jac=True, method="L-BFGS-B",
+            options={"maxiter": 40},
+        )  # fmt: skip
+        phases = np.asarray(found.x)
+    return phases
+
+
+def _norm(
+    phases: Float[np.ndarray, " K"], lines: Complex[np.ndarray, "m K"], places: Int[np.ndarray, " K"], n: int, q: int
+) -> tuple[float, Float[np.ndarray, " K"]]:
+    """Return log of the 2q-norm of all signals, and its gradient."""
+    turned = lines * np.exp(1j * phases)
+    y = periodic(turned, places, n)
+    peak = float(np.max(np.abs(y)))
+    power = (y / peak) ** (2 * q)
+    total = float(np.sum(power))
+    pull = np.fft.fft(power / np.where(y == 0.0, 1.0, y), axis=1)[:, places] / total
+    return np.log(peak) + np.log(total) / (2 * q), np.sum((turned * pull.conj()).real, axis=0)
+
+
+def periodic(lines: Complex[np.ndarray, "m K"], places: Int[np.ndarray, " K"], n: int) -> Float[np.ndarray, "m n"]:
+    """Return the signals Im sum_k lines[m, k] exp(2 pi i places_k t/n) over one period of n samples."""
+    bins = np.zeros((lines.shape[0], n), dtype=complex)
+    bins[:, places] = lines
+    return np.fft.ifft(bins, axis=1).imag * n

@@ -1,0 +1,1 @@
+"""The least-squares problem: experiments, unknowns, residuals, losses, methods and normal equations."""

@@ -1,0 +1,173 @@
+r"""Correlations of a residual: with itself, and with an input.
+
+The residual of a right model follows no input. Its correlation with each is compared with what chance would give
+(Ljung, System Identification, 2nd ed., sec. 16.6): for N samples
+
+.. math:: \hat R_{eu}(\tau) = \frac1N \sum_t e(t)\, u(t - \tau), \qquad
+          \operatorname{var} \hat R_{eu}(\tau) = \frac1N \sum_k R_e(k)\, R_u(k),
+
+at any lag, for an input that is what it is and a residual of any colour. R_u is the input's own; R_e is estimated
+under a Parzen window. Lags above zero tell of what the model lacks, lags below of feedback, or of an input that was
+logged late.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.records import record
+
+LAGS = 25
+QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
+
+
+@record(eq=False)
+class CrossCorrelation:
+    """The correlation of a residual with an input.
+
+    Parameters
+    ----------
+    lags : array of int, shape (n,)
+        The residual is compared with the input so many samples before.
+    values : array, shape (n,)
+        Correlation, -1 to 1.
+    bound : float
+        What chance exceeds at one lag with a probability of 1 %.
+    p : float
+        Probability that chance exceeds the largest value at some lag (Bonferroni's bound).
+
+    """
+
+    lags: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, " n"]
+    bound: float
+    p: float
+
+    @property
+    def worst_lag(self) -> int:
+        """Lag of the largest correlation."""
+        return int(self.lags[int(np.argmax(np.abs(self.values)))])
+
+    @property
+    def worst(self) -> float:
+        """Largest correlation over its bound."""
+        return float(np.max(np.abs(self.values))) / self.bound
+
+    @property
+    def outside(self) -> bool:
+        """Whether the largest correlation is outside the bound."""
+        return self.worst > 1.0
+
+
+def transforms() -> tuple[Any, Any, Any]:
+    """Return SciPy's irfft, next_fast_len and rfft."""
+    from scipy import fft  # deferred: scipy is slow to load
+
+    return fft.irfft, fft.next_fast_len, fft.rfft
+
+
+def lagged_size(samples: int, lags: int) -> int:
+    """Return a length at which transforms of so many samples tell their products at so many lags, and are quick."""
+    return int(transforms()[1](samples + lags, real=True))
+
+
+class LaggedSums:
+    """Sums over t of x_a(t) x_b(t - k), k = 0..lags, of stretches of at most `longest` samples, added one by one."""
+
+    def __init__(self, rows: int, longest: int, lags: int) -> None:
+        self.lags, self.size = lags, lagged_size(longest, lags)
+        lines = self.size // 2 + 1
+        self.own = np.zeros((rows, 2 * lines))  # squares of real and imaginary parts, side by side
+        self.cross = {(a, b): np.zeros(lines, dtype=complex) for a in range(rows) for b in range(a)}
+
+    def add(self, x: Float[np.ndarray, "rows n"]) -> None:
+        """Add a stretch."""
+        spectrum = np.asarray(transforms()[2](x, self.size))
+        self.own += np.square(spectrum.view(float))
+        for (a, b), total in self.cross.items():
+            total += spectrum[a] * np.conj(spectrum[b])
+
+    def sums(self) -> Float[np.ndarray, "lags1 rows rows"]:
+        """Return the sums by lag."""
+        irfft, rows, count = transforms()[0], len(self.own), self.lags + 1
+        found = np.empty((count, rows, rows))
+        power = np.sum(self.own.reshape(rows, -1, 2), axis=2)
+        for a, own in enumerate(np.asarray(irfft(power, self.size))):
+            found[:, a, a] = own[:count]
+        for (a, b), total in self.cross.items():
+            both = np.asarray(irfft(total, self.size))
+            found[:, a, b] = both[:count]
+            found[0, b, a], found[1:, b, a] = both[0], both[:-count:-1]
+        return found
+
+
+def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
+    """Return Parzen's lag window at lags 0 to `reach`, where it ends; its spectrum is nowhere negative."""
+    x = np.arange(reach + 1) / max(reach, 1)
+    return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * (1 - x) ** 3)
+
+
+def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " lags1"]:
+    """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
+    irfft, next_fast_len, rfft = transforms()
+    used = r != 0.0
+    centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
+    size = next_fast_len(len(r) + lags + 1, real=True)
+    found = np.asarray(irfft(np.abs(np.asarray(rfft(centred, size))) ** 2, size))[: lags + 1]
+    return found / found[0] if found[0] > 0.0 else np.zeros(lags + 1)
+
+
+def cross_correlation(
+    residuals: list[Float[np.ndarray, "..."]], inputs: list[Float[np.ndarray, "..."]], lags: int = LAGS
+) -> CrossCorrelation | None:
+    """Return the correlation of a residual with an input over some segments; None if either does not move.
+
+    A residual of exactly zero is one that does not count.
+    """
+    from scipy.special import erfc  # deferred: scipy is slow to load
+
+    used = [r != 0.0 for r in residuals]
+    count = sum(int(np.sum(mask)) for mask in used)
+    if count < 2 * lags:
+        return None
+    mean_e = sum(float(np.sum(r)) for r in residuals) / count
+    mean_u = float(np.mean(np.concatenate([u[mask] for u, mask in zip(inputs, used, strict=True)])))
+    span = np.arange(-lags, lags + 1)
+    longest = max(len(r) for r in residuals)
+    long = int(min(max(32, 4 * np.sqrt(longest)), longest - 1))
+    cross, own_e, own_u = np.zeros(span.size), np.zeros(long + 1), np.zeros(long + 1)
+    for r, u, mask in zip(residuals, inputs, used, strict=True):
+        e, v = np.where(mask, r - mean_e, 0.0), u - mean_u
+        cross += _products(e, v, lags) / count
+        own_e += _products(e, e, long)[long:] / count
+        own_u += _products(v * mask, v * mask, long)[long:] / count
+    if own_e[0] <= 0.0 or own_u[0] <= 1e-24 * max(mean_u**2, 1e-300):
+        return None
+    own_e *= parzen(long)
+    variance = (own_e[0] * own_u[0] + 2.0 * float(own_e[1:] @ own_u[1:])) / count
+    size = float(np.sqrt(own_e[0] * own_u[0]))
+    deviation = float(np.sqrt(max(variance, 1e-12 * own_e[0] * own_u[0] / count)))
+    worst = float(np.max(np.abs(cross))) / deviation
+    return CrossCorrelation(
+        lags=span.astype(float), values=cross / size, bound=QUANTILE * deviation / size,
+        p=min(span.size * float(erfc(worst / np.sqrt(2.0))), 1.0),
+    )  # fmt: skip
+
+
+def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:
+    """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
+    irfft, next_fast_len, rfft = transforms()
+    size = next_fast_len(len(a) + lags + 1, real=True)
+    whole = np.asarray(irfft(np.asarray(rfft(a, size)) * np.conj(np.asarray(rfft(b, size))), size))
+    return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]
+
+
+def ljung_box(rho: Float[np.ndarray, " lags"], n: float) -> float:
+    """Return the p-value of the Ljung-Box test (1978) that correlations at lags 1, 2, ... of n samples are chance."""
+    from scipy.special import gammaincc  # deferred: scipy.stats takes a second
+
+    statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, rho.size + 1))))
+    return float(gammaincc(rho.size / 2, statistic / 2))

@@ -1,0 +1,308 @@
+"""An experiment: a plant, its log, and what is known about sensors, delay and initial state."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import field, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.errors import EstimationError, suggestion
+from seaopt.logs import Log
+from seaopt.logs.mask import mask_saturated
+from seaopt.parameters import Parameter
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.simulation import Hold, Segment
+from seaopt.simulation.simulate import input_samples
+from seaopt.units import same_dimension
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+MAX_DRIFT = 5
+SHORTEST = 4  # samples of a shot
+Mask = Literal["auto", "declared", "none"]
+InitialState = Literal["estimate", "rest"] | Mapping[str, float]
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+@record(eq=False, repr=False)
+class Experiment:
+    """One log of one plant.
+
+    Parameters
+    ----------
+    plant : Plant
+        The model of what was on the bench.
+    log : Log
+        Channels with the names of the plant's inputs, and of the outputs that were measured.
+    name : str
+        For results and messages.
+    outputs : tuple of str
+        Measured outputs; every output of the plant that the log has, if empty.
+    sigma : mapping of output to float
+        Standard deviation of the sensor noise, in the output's unit; estimated where left out.
+    initial_state : "estimate", "rest" or mapping
+        Unknown in each segment; zero; or known (zero where left out).
+    offset : bool or mapping
+        One unknown offset an output; none; or known ones.
+    drift : int
+        Slow drift of the sensors: order, up to 5, of a polynomial over the log that is added to each output
+        (Legendre's, so that the offset stays the mean). 0: none.
+    gain : mapping of output to float or Parameter
+        measured = gain * output + offset + drift; 1 where left out. A free Parameter is estimated.
+    delay_s : float or Parameter
+        Of the input; a free Parameter is estimated.
+    hold : {"zero", "first"}
+        The input between samples: a command is held, a measured current is better drawn as a line.
+    gaps : {"split", "error"}
+        A gap in the log starts a new segment with its own initial state, or is an error.
+    saturation : mapping of output to (low, high)
+        Ranges of the sensors: samples at an end or beyond it become missing.
+    mask : {"auto", "declared", "none"}
+        Saturated samples of outputs become missing, which `notes` says: those outside the declared ranges, and those at
+        clear flat tops where no range is declared; the declared ones alone; or none. An input that saturates is what
+        the plant got.
+    shots : int
+        Cut each segment into so many that start from states of their own: for a plant that runs away in simulation, at
+        the price of what the joints would tell.
+
+    Attributes
+    ----------
+    stretches : tuple of slice
+        The log's samples between gaps.
+
+    Raises
+    ------
+    EstimationError
+        The log has no measured output or lacks an input, a unit has the wrong dimension, or a name is unknown.
+    LogError
+        The log is not uniformly sampled.
+
+    """
+
+    plant: Plant
+    log: Log
+    name: str = "experiment"
+    outputs: tuple[str, ...] = ()
+    sigma: Mapping[str, float] = field(default_factory=dict[str, float])
+    initial_state: InitialState = "estimate"
+    offset: bool | Mapping[str, float] = True
+    drift: int = 0
+    gain: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
+    delay_s: float | Parameter = 0.0
+    hold: Hold = "zero"
+    gaps: Literal["split", "error"] = "split"
+    saturation: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    mask: Mask = "auto"
+    shots: int = 1
+    stretches: tuple[slice, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not NAME.fullmatch(self.name):
+            raise EstimationError(
+                f'experiment name "{self.name[:40]}" is not a name; start with a letter, then letters, digits, _ and -'
+            )
+        chosen = self.outputs or tuple(name for name in self.plant.outputs if name in self.log.signals)
+        if not chosen:
+            raise EstimationError(
+                f"experiment {self.name}: the log has none of the outputs of {self.plant.name} "
+                f"({', '.join(self.plant.outputs)}); name a channel after each measured output"
+            )
+        object.__setattr__(self, "outputs", chosen)
+        for name in chosen:
+            if name not in self.plant.outputs:
+                raise EstimationError(
+                    f'experiment {self.name}: output "{name}" is not one of {self.plant.name}; '
+                    f"{suggestion(name, self.plant.outputs)}"
+                )
+            if not np.any(np.isfinite(self.log[name])):
+                raise EstimationError(
+                    f"experiment {self.name}: output {name} has no finite sample; leave it out of outputs"
+                )
+        self._check_units()
+        object.__setattr__(self, "stretches", tuple(self.log.segments))
+        self._check_settings()
+        self._mask()
+
+    def _mask(self) -> None:
+        """Make saturated samples missing in the experiment's own log."""
+        if self.mask not in ("auto", "declared", "none"):
+            raise EstimationError(
+                f'experiment {self.name}: mask = "{self.mask}" is not known; use "auto", "declared" or "none"'
+            )
+        for name, ends in self.saturation.items():
+            if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
+                raise EstimationError(
+                    f"experiment {self.name}: saturation of {name} = {ends} is no range; give [low, high]"
+                )
+        if self.mask == "none":
+            return
+        log = mask_saturated(self.log, self.outputs, ranges=self.saturation, search=self.mask == "auto")
+        for name in self.outputs:
+            if not np.any(np.isfinite(log[name])):
+                raise EstimationError(
+                    f"experiment {self.name}: every sample of {name} is saturated; correct saturation, or leave it out"
+                )
+        object.__setattr__(self, "log", log)
+
+    def _check_units(self) -> None:
+        for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
+            for name, unit in names.items():
+                found = self.log.signals[name].unit if name in self.log.signals else ""
+                if found and found != unit and not same_dimension(found, unit):
+                    raise EstimationError(
+                        f"experiment {self.name}: channel {name} is in {found}, but the {kind} of {self.plant.name} "
+                        f"is in {unit or 'no unit'}; correct the column's unit"
+                    )
+
+    def _check_settings(self) -> None:
+        for what, given in (("sigma", self.sigma), ("gain", self.gain), ("saturation", self.saturation)):
+            if not isinstance(given, Mapping):
+                raise EstimationError(f"experiment {self.name}: {what} = {given!r}; give a mapping of output to value")
+        known = {
+            "sigma": self.sigma,
+            "gain": self.gain,
+            "offset": self.offset if self.offset is not True else {},
+            "saturation": self.saturation,
+        }
+        for what, given in known.items():
+            for name in given if isinstance(given, Mapping) else ():
+                if name not in self.outputs:
+                    raise EstimationError(
+                        f'experiment {self.name}: {what} names "{name}", which is not a measured output; '
+                        f"{suggestion(name, self.outputs)}"
+                    )
+        for name, value in self.sigma.items():
+            if not 0.0 < value < np.inf:
+                raise EstimationError(
+                    f"experiment {self.name}: sigma of {name} = {value:g} is not positive; leave it out to estimate it"
+                )
+        if isinstance(self.drift, bool) or not 0 <= self.drift <= MAX_DRIFT:
+            raise EstimationError(
+                f"experiment {self.name}: drift = {self.drift!r} is not the order of a polynomial; "
+                f"give 0 (none) to {MAX_DRIFT}"
+            )
+        if isinstance(self.initial_state, str):
+            if self.initial_state not in ("estimate", "rest"):
+                raise EstimationError(
+                    f'experiment {self.name}: initial_state = "{self.initial_state}" is not known; '
+                    'use "estimate", "rest" or a state-by-state mapping'
+                )
+        else:
+            for name in self.initial_state:
+                if name not in self.plant.states:
+                    raise EstimationError(
+                        f'experiment {self.name}: initial_state names "{name}", which is not a state of '
+                        f"{self.plant.name}; {suggestion(name, self.plant.states)}"
+                    )
+        if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
+            raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
+        if self.gaps not in ("split", "error"):
+            raise EstimationError(f'experiment {self.name}: gaps = "{self.gaps}" is not known; use "split" or "error"')
+        if self.gaps == "error" and len(self.stretches) > 1:
+            count = _counted(len(self.stretches) - 1, "gap")
+            raise EstimationError(
+                f'experiment {self.name}: the log has {count} and gaps = "error"; '
+                'use gaps = "split", or slice_s to choose a stretch'
+            )
+
+    def __repr__(self) -> str:
+        count = _counted(len(self.stretches), "segment")
+        return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the log, and which of its samples have no weight, one sentence each."""
+        log, pieces = self.log, self.log.segments
+        notes = list(log.notes)
+        if log.gaps:
+            alone = len(log) - sum(piece.stop - piece.start for piece in pieces)
+            notes.append(
+                f"{_counted(len(log.gaps), 'gap')} split the log into {_counted(len(pieces), 'segment')}"
+                + (f", {_counted(alone, 'sample')} alone between gaps left out" if alone else "")
+            )
+        for name in self.outputs:
+            missing = int(np.count_nonzero(~np.isfinite(log[name])))
+            if missing:
+                notes.append(f"{name}: {missing} of {len(log)} samples are missing or masked and have no weight")
+        for name in (*self.plant.inputs, *self.outputs):
+            if name in log.signals and is_constant(log[name]):
+                text = f"{name}: is constant at {np.fmax.reduce(log[name]):.6g} {log.signal(name).unit}".rstrip()
+                notes += [text] if text not in notes else []  # reading a file says it already
+        return tuple(notes)
+
+    def segments(self, holdout: float = 0.0) -> list[Segment]:
+        """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""
+        u = input_samples(self.plant, self.log)
+        y = tuple(self.log[name] for name in self.outputs)
+        time, first, whole = self.log.time, float(self.log.time[0]), self.log.duration_s
+        used = (time <= first + (1.0 - holdout) * whole).astype(np.uint8) if holdout else None
+        step = 2.0 * self.log.period / whole
+        stretches = [whole for whole in self.stretches for _ in self._cuts(whole)[1:]]
+        return [
+            Segment(
+                u=tuple(channel[stretch.start : piece.stop] for channel in u),
+                y=tuple(channel[piece] for channel in y),
+                keep=() if used is None else (used[piece],) * len(y),
+                lead=piece.start - stretch.start,
+                start_s=float(time[piece.start]),
+                drift_span=(2.0 * (float(time[piece.start]) - first) / whole - 1.0, step),
+            )
+            for piece, stretch in zip(self.pieces, stretches, strict=True)
+        ]
+
+    @property
+    def pieces(self) -> list[slice]:
+        """The stretches that are simulated each from a state of its own."""
+        return [slice(a, b) for whole in self.stretches for a, b in pairwise(self._cuts(whole))]
+
+    def _cuts(self, stretch: slice) -> list[int]:
+        """Return the rows at which a stretch is cut into shots, its ends included."""
+        return (stretch.start + shot_edges(stretch.stop - stretch.start, self.shots)).tolist()
+
+    def renamed(self, name: str) -> Experiment:
+        """Return the experiment under another name."""
+        return replace(self, name=name)
+
+
+def is_constant(values: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether all samples are the same, as far as they are there."""
+    return bool(np.fmin.reduce(values) == np.fmax.reduce(values))
+
+
+def shot_edges(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
+    """Return the first rows of shots of about equal length, and one past the last; no shot is under four samples."""
+    return np.linspace(0, n, max(1, min(shots, n // SHORTEST)) + 1).astype(int)
+
+
+def check_shots(experiment: Experiment, longest: int, shots: int, given: str) -> None:
+    """Refuse shots too short for the states they start from.
+
+    So many samples of one output as there are states tell the state at a shot's start, where they tell it at all; with
+    no more than that, a shot would follow its log whatever the parameters are. Stretches shorter than the longest are
+    cut into fewer.
+
+    Raises
+    ------
+    EstimationError
+        The longest stretch does not have a sample more than the plant has states, and at least four, for each shot.
+
+    """
+    states = len(experiment.plant.states)
+    least = max(SHORTEST, states + 1)
+    if longest >= shots * least or shots == 1:
+        return
+    possible = longest // least
+    remedy = f"give {possible} or fewer" if possible > 1 else "leave it out, and use a longer log or OutputError()"
+    raise EstimationError(
+        f"experiment {experiment.name}: {given} leaves {longest / shots:.3g} samples a shot, of {longest} in the "
+        f"longest stretch; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least "
+        f"{least} samples: {remedy}"
+    )

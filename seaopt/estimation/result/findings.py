@@ -1,0 +1,94 @@
+"""What a fit finds besides parameters: of each output, of each experiment, and what follows from the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import field
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.records import record
+
+
+@record
+class OutputFit:
+    """How well one output of one experiment is explained.
+
+    Parameters
+    ----------
+    fit_percent : float
+        100 (1 - |y - yhat| / |y - mean(y)|) over the samples used.
+    holdout_fit_percent : float or None
+        The same over the samples kept back; None if there are none.
+    band_fit_percent : float or None
+        The same for the signals filtered to the fit's band; None without one.
+    one_step_fit_percent : float or None
+        The same for the prediction one sample ahead, of a prediction-error fit; None otherwise.
+    rms_residual : float
+        Of the samples used, unfiltered, in `unit`.
+    sigma : float
+        The standard deviation that residuals were weighted with (of the filtered residual, with a band).
+    unit : str
+        The output's.
+    whiteness_p : float
+        Ljung-Box p-value of the weighted residual; small means coloured.
+
+    """
+
+    fit_percent: float
+    holdout_fit_percent: float | None
+    rms_residual: float
+    sigma: float
+    unit: str
+    whiteness_p: float
+    band_fit_percent: float | None = None
+    one_step_fit_percent: float | None = None
+
+
+@record
+class Nuisance:
+    """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment.
+
+    `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise
+    over each state's size (of a prediction-error fit), `substeps` how many integration steps a sample took (a linear
+    plant needs one).
+    """
+
+    delay_s: float
+    gain: dict[str, float]
+    offset: dict[str, float]
+    initial_state: tuple[dict[str, float], ...]
+    substeps: int = 1
+    drift: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
+    noise: dict[str, float] = field(default_factory=dict[str, float])
+    std: dict[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def told(self) -> list[str]:
+        """What was estimated of delay and gains, in words."""
+        found = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (g, "") for name, g in self.gain.items()}
+        return [f"{key} = {found[key][0]:.5g} ± {std:.2g} {found[key][1]}".rstrip() for key, std in self.std.items()]
+
+
+@record
+class Derived:
+    """A figure that follows from the parameters, with its standard deviation from the covariance."""
+
+    value: float
+    unit: str
+    std: float
+
+    @property
+    def ci95(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
+
+
+@record(eq=False)
+class Prediction:
+    """Measured and model outputs of an experiment on its clock; NaN where there is nothing."""
+
+    time: Float[np.ndarray, " n"]
+    inputs: dict[str, Float[np.ndarray, " n"]]
+    measured: dict[str, Float[np.ndarray, " n"]]
+    model: dict[str, Float[np.ndarray, " n"]]

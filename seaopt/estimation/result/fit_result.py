@@ -1,0 +1,341 @@
+"""The result of a fit: parameters with their uncertainty, what the data cannot tell, and how well it went."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import EstimationError, FileError
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.residual_statistics import Errors, errors
+from seaopt.estimation.problem.residuals import Residuals
+from seaopt.estimation.result.covariance import Covariance
+from seaopt.estimation.result.findings import Derived, Nuisance, OutputFit, Prediction
+from seaopt.estimation.result.identifiability import Identifiability
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.records import record
+from seaopt.simulation import Clock, Point, make_model, run_passes
+from seaopt.units import unit_after
+
+SCHEMA = "seaopt/fit/1"
+STATUSES = ("converged", "max_iterations", "stalled", "not_identifiable")
+
+
+@record(eq=False)
+class Minimum:
+    """The problem that was solved, with its sigma and steps, and the unknowns where its cost is least."""
+
+    problem: Residuals
+    z: Float[np.ndarray, " n"]
+
+    def errors(self) -> list[list[Errors]]:
+        """Return the residuals of each experiment and segment, by a simulation of them all."""
+        return errors(self.problem, self.z)
+
+
+@record(eq=False)
+class Fit:
+    """What `fit` returns; ``print(fit)`` is a report.
+
+    Parameters
+    ----------
+    status : str
+        "converged", "max_iterations", "stalled" or "not_identifiable"; `message` says it in words.
+    parameters : ParameterSet
+        Every parameter of the plants, free ones with their std (infinite where not identifiable); `identified` is False
+        of those that the data do not tell.
+    covariance : Covariance
+        Of the free parameters; posterior, and allowing for coloured residuals.
+    white_covariance : Covariance
+        What it would be if the residuals were white: beside the other, it shows what their colour costs.
+    derived : mapping
+        Figures that follow from the parameters.
+    outputs : mapping of experiment to mapping of output to OutputFit
+    nuisance : mapping of experiment to Nuisance
+    identifiability : Identifiability
+    cost : float
+        Half the squared norm of the residuals in sigma, priors included.
+    iterations, samples : int
+        Least-squares iterations; samples that counted, all outputs together.
+    wall_s : float
+        Seconds from call to result.
+    step_error_sigma, step_error_parameter : float
+        Largest integration error in an output, in sigma, and in a parameter, in its standard deviations; zero for
+        linear plants, which are discretised exactly.
+    log_likelihood : float
+        Gaussian, with each output's sigma at its best value.
+    unknowns : int
+        All that was estimated, experiments' own included, sigmas not.
+    method : str
+        "output_error", "multiple_shooting" or "prediction_error".
+    notes : tuple of str
+        What was done to the logs, and which samples had no weight, one sentence each.
+    experiments : tuple of Experiment
+        The data; empty when read from a file.
+    minimum : Minimum or None
+        The problem and its unknowns, from which refits start; None when read from a file.
+
+    """
+
+    status: str
+    message: str
+    parameters: ParameterSet
+    covariance: Covariance
+    white_covariance: Covariance
+    derived: Mapping[str, Derived]
+    outputs: Mapping[str, Mapping[str, OutputFit]]
+    nuisance: Mapping[str, Nuisance]
+    identifiability: Identifiability
+    cost: float
+    iterations: int
+    samples: int
+    wall_s: float
+    step_error_sigma: float = 0.0
+    step_error_parameter: float = 0.0
+    log_likelihood: float = math.nan
+    unknowns: int = 0
+    method: str = "output_error"
+    notes: tuple[str, ...] = ()
+    experiments: tuple[Experiment, ...] = field(default=(), repr=False)
+    minimum: Minimum | None = field(default=None, repr=False)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the search converged and every free parameter can be told."""
+        return self.status == "converged"
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, -2 log L + 2 k, with k the unknowns and one sigma an output."""
+        return 2.0 * self._count - 2.0 * self.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, -2 log L + k log N."""
+        return self._count * math.log(max(self.samples, 1)) - 2.0 * self.log_likelihood
+
+    @property
+    def _count(self) -> int:
+        return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
+
+    def at_minimum(self, what: str) -> Minimum:
+        """Return the minimum, for `what` needs it.
+
+        Raises
+        ------
+        EstimationError
+            The fit was read from a file.
+
+        """
+        if self.minimum is None:
+            raise EstimationError(f"{what} needs the fit itself, and this one was read from a file; call fit again")
+        return self.minimum
+
+    def predict(self, experiment: Experiment) -> Prediction:
+        """Return measured and model outputs of one of the fit's experiments."""
+        own = self.nuisance[experiment.name]
+        model = make_model(experiment.plant, self.parameters, (), experiment.outputs)
+        n = len(experiment.log)
+        y = np.full((n, len(experiment.outputs)), np.nan)
+        point = Point(
+            theta=np.zeros(0),
+            gain=np.array([own.gain[name] for name in experiment.outputs]),
+            offset=np.array([own.offset[name] for name in experiment.outputs]),
+            clock=Clock(period=experiment.log.period, hold=experiment.hold, delay_s=own.delay_s),
+            drift=np.zeros((len(experiment.outputs), 0)),
+            substeps=own.substeps,
+        )
+        for segment, piece, state in zip(experiment.segments(), experiment.pieces, own.initial_state, strict=True):
+            start = np.array([list(state.values())])
+            found = run_passes(model, segment, point, start, sums=False, outputs=True).outputs
+            assert found is not None
+            y[piece] = found * point.gain + point.offset
+            for o, name in enumerate(experiment.outputs):
+                drift = np.array(own.drift.get(name, ()))
+                y[piece, o] += segment.drift_basis(slice(0, segment.n), drift.size) @ drift
+        log = experiment.log
+        return Prediction(
+            time=log.time,
+            inputs={name: log[name] for name in experiment.plant.inputs if name in log.signals},
+            measured={name: log[name] for name in experiment.outputs},
+            model={name: y[:, i] for i, name in enumerate(experiment.outputs)},
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of fit.json (schema seaopt/fit/1)."""
+        return {
+            "schema": SCHEMA,
+            "status": self.status,
+            "message": self.message,
+            "cost": self.cost,
+            "iterations": self.iterations,
+            "samples": self.samples,
+            "wall_s": self.wall_s,
+            "parameters": {name: _parameter_dict(item) for name, item in self.parameters.items()},
+            "derived": {
+                name: {"value": item.value, "unit": item.unit, "std": item.std, "ci95": list(item.ci95)}
+                for name, item in self.derived.items()
+            },
+            "covariance": {"names": list(self.covariance.names), "matrix": self.covariance.matrix},
+            "white_covariance": {"names": list(self.white_covariance.names), "matrix": self.white_covariance.matrix},
+            "outputs": {
+                name: {output: _fields(item) for output, item in row.items()} for name, row in self.outputs.items()
+            },
+            "identifiability": {
+                "rank": self.identifiability.rank,
+                "free": self.identifiability.free,
+                "condition": self.identifiability.condition,
+                "unidentifiable": list(self.identifiability.unidentifiable),
+                "weak": list(self.identifiability.weak),
+                "structural_rank": self.identifiability.structural_rank,
+            },
+            "experiments": {name: _fields(item) for name, item in self.nuisance.items()},
+            "step_error_sigma": self.step_error_sigma,
+            "step_error_parameter": self.step_error_parameter,
+            "method": self.method,
+            "log_likelihood": self.log_likelihood,
+            "unknowns": self.unknowns,
+            "aic": self.aic,
+            "bic": self.bic,
+            "notes": list(self.notes),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], experiments: tuple[Experiment, ...] = ()) -> Fit:
+        """Return the fit of a fit.json; `experiments` brings the data back for predictions.
+
+        Raises
+        ------
+        FileError
+            A field is missing or malformed.
+
+        """
+        try:
+            return _from_dict(content, experiments)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise FileError(f"fit.json: field {error} is missing or malformed; run the fit again") from error
+
+    def __repr__(self) -> str:
+        lines = [f"Fit: {self.status} ({self.message})"]
+        lines.append(f"  {self.samples} samples, {self.iterations} iterations, {self.wall_s:.2f} s")
+        shown = ParameterSet(item for item in self.parameters.values() if item.free)
+        lines += [f"  {line}" for line in repr(shown).splitlines()]
+        lines += [
+            f"  {name} = {item.value:.5g} ± {item.std:.2g}{unit_after(item.unit)}"
+            for name, item in self.derived.items()
+        ]
+        for name, own in self.nuisance.items():
+            lines += [f"  {name}: {line}" for line in own.told]
+            if len(own.initial_state) > 1:
+                lines.append(f"  {name}: {len(own.initial_state)} segments with initial states of their own")
+        for name, row in self.outputs.items():
+            for output, item in row.items():
+                held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"
+                held += "" if item.band_fit_percent is None else f", in the band {item.band_fit_percent:.2f} %"
+                held += "" if item.one_step_fit_percent is None else f", one step {item.one_step_fit_percent:.2f} %"
+                lines.append(
+                    f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
+                    f"rms residual {item.rms_residual:.4g}{unit_after(item.unit)}"
+                )
+        lines += [f"  {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _fields(item: Any) -> dict[str, Any]:
+    return {name: getattr(item, name) for name in item.__dataclass_fields__}
+
+
+def _parameter_dict(item: Parameter) -> dict[str, Any]:
+    ci95 = list(item.ci95) if item.ci95 is not None else None
+    return {
+        "value": item.value, "unit": item.unit, "free": item.free, "std": item.std, "ci95": ci95,
+        "at_bound": item.at_bound, "min": item.min, "max": item.max, "prior_std": item.prior_std,
+        "description": item.description, "identified": item.identified,
+    }  # fmt: skip
+
+
+def _number(value: Any, missing: float) -> float:
+    return missing if value is None else float(value)
+
+
+def _covariance(item: Mapping[str, Any]) -> Covariance:
+    names = tuple(item["names"])
+    rows = [[_number(value, math.inf) for value in row] for row in item["matrix"]]
+    matrix = np.array(rows, dtype=float).reshape(len(names), len(names))
+    seen = np.isfinite(np.diag(matrix))
+    if np.any(np.linalg.eigvalsh(matrix[np.ix_(seen, seen)]) < -1e-9 * np.max(np.diag(matrix)[seen], initial=0.0)):
+        raise ValueError("covariance, which has a negative variance,")
+    return Covariance(names=names, matrix=matrix)
+
+
+def _std(item: Mapping[str, Any]) -> float | None:
+    """Return a parameter's std: null stands for an infinite one, and for none of a parameter that is not free."""
+    return _number(item["std"], math.inf) if item["free"] else None
+
+
+def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) -> Fit:
+    parameters = ParameterSet(
+        Parameter(
+            name=name, value=float(item["value"]), unit=item["unit"], free=bool(item["free"]),
+            min=_number(item.get("min"), -math.inf), max=_number(item.get("max"), math.inf),
+            prior_std=item.get("prior_std"), description=item.get("description", ""), std=_std(item),
+            identified=bool(item.get("identified", _std(item) != math.inf)),
+        )
+        for name, item in content["parameters"].items()
+    )  # fmt: skip
+    found = content["identifiability"]
+    if content["status"] not in STATUSES:
+        raise ValueError(f'status "{content["status"]}"')
+    covariance = _covariance(content["covariance"])
+    if set(covariance.names) != {name for name, item in parameters.items() if item.free}:
+        raise ValueError("covariance.names, other than the free parameters,")
+    return Fit(
+        status=content["status"],
+        message=content["message"],
+        parameters=parameters,
+        covariance=covariance,
+        white_covariance=_covariance(content.get("white_covariance", content["covariance"])),
+        derived={
+            name: Derived(value=float(item["value"]), unit=item["unit"], std=_number(item["std"], math.inf))
+            for name, item in content["derived"].items()
+        },
+        outputs={
+            name: {output: OutputFit(**item) for output, item in row.items()}
+            for name, row in content["outputs"].items()
+        },
+        nuisance={
+            name: Nuisance(
+                delay_s=item["delay_s"], gain=item["gain"], offset=item["offset"],
+                initial_state=tuple(item["initial_state"]), substeps=int(item.get("substeps", 1)),
+                drift={output: tuple(row) for output, row in item.get("drift", {}).items()},
+                noise=dict(item.get("noise", {})),
+                std={key: _number(value, math.inf) for key, value in item.get("std", {}).items()},
+            )
+            for name, item in content.get("experiments", {}).items()
+        },
+        identifiability=Identifiability(
+            rank=found["rank"], free=found["free"], condition=_number(found["condition"], math.inf),
+            unidentifiable=tuple(found["unidentifiable"]), weak=tuple(found.get("weak", ())),
+            structural_rank=int(found.get("structural_rank", -1)),
+        ),
+        cost=_number(content["cost"], math.inf),
+        iterations=content["iterations"],
+        samples=content["samples"],
+        wall_s=content["wall_s"],
+        step_error_sigma=float(content.get("step_error_sigma", 0.0)),
+        step_error_parameter=float(content.get("step_error_parameter", 0.0)),
+        log_likelihood=_number(content.get("log_likelihood"), math.nan),
+        unknowns=int(content.get("unknowns", 0)),
+        method=str(content.get("method", "output_error")),
+        notes=tuple(str(note) for note in content.get("notes", ())),
+        experiments=experiments,
+    )  # fmt: skip

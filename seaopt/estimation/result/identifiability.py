@@ -1,0 +1,162 @@
+r"""What the data tell of the parameters, and what they cannot: rank, condition, and the unseen directions in words.
+
+The Hessian of the parameters, everything else an experiment has of its own eliminated, is scaled to a unit diagonal. An
+eigenvalue that is zero to rounding is a direction in which the parameters can change together without any effect on
+any output (a null direction of the sensitivities); a small one is a direction that only the parameters' different
+shares in the noise tell apart. Whether a null direction belongs to the plant or to the log is told by a second look:
+the sensitivities to a rich made-up input. What that does not show, no log of these outputs can show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.estimation.problem.normal_equations import RANK, eliminated
+from seaopt.estimation.problem.residuals import Residuals
+from seaopt.parameters import ParameterSet
+from seaopt.records import record
+from seaopt.simulation import Segment, run_passes
+from seaopt.units import unit_after
+
+WEAK = 1e-5  # eigenvalues below this part of the largest: standard deviations a few hundred times those of one alone
+RICH = 600  # samples of made-up input
+
+
+@record
+class Identifiability:
+    """What the data tell of the free parameters.
+
+    Parameters
+    ----------
+    rank, free : int
+        Directions seen in the data (and priors), and free parameters.
+    condition : float
+        Ratio of the largest to the smallest singular value of the normalised sensitivities.
+    unidentifiable : tuple of mappings
+        One a direction that is not seen: relative changes {NAME: weight} that leave every output as it is.
+    weak : tuple of mappings
+        The same for directions that are hardly seen.
+    structural_rank : int
+        Directions that a rich input would show on the same outputs; below `free`, no log can tell.
+
+    """
+
+    rank: int
+    free: int
+    condition: float
+    unidentifiable: tuple[dict[str, float], ...]
+    weak: tuple[dict[str, float], ...] = ()
+    structural_rank: int = -1
+
+
+def identifiability(
+    hessian: Float[np.ndarray, "n n"], names: tuple[str, ...], values: Float[np.ndarray, " p"]
+) -> Identifiability:
+    """Return what the normalised Hessian says of the first ``len(names)`` unknowns, the others eliminated.
+
+    `values` are the unknowns' own, to which changes along an unseen direction are relative.
+    """
+    p = len(names)
+    left, own = eliminated(hessian, p), np.diag(hessian)[:p]
+    size = np.sqrt(np.where(own > 0.0, own, 1.0))
+    eigenvalues, vectors = np.linalg.eigh(left / np.outer(size, size))
+    largest = max(float(eigenvalues[-1]), 1e-300)
+    smallest = max(float(eigenvalues[0]), 0.0)
+    relative = size * np.where(values != 0.0, np.abs(values), 1.0)
+
+    def directions(chosen: Float[np.ndarray, " p"], cut: float) -> tuple[dict[str, float], ...]:
+        found: list[dict[str, float]] = []
+        for k in np.flatnonzero(chosen):
+            weights = vectors[:, k] / relative
+            weights = weights / np.max(np.abs(weights))
+            found.append({name: float(w) for name, w in zip(names, weights, strict=True) if abs(w) > cut})
+        return tuple(found)
+
+    unseen = eigenvalues <= RANK * largest
+    return Identifiability(
+        rank=p - int(np.count_nonzero(unseen)),
+        free=p,
+        condition=float(np.sqrt(largest / smallest)) if smallest > RANK * largest else np.inf,
+        unidentifiable=directions(unseen.astype(float), 1e-3),
+        weak=directions((~unseen & (eigenvalues <= WEAK * largest)).astype(float), 0.1),
+    )
+
+
+def structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
+    """Return how many directions of the parameters a rich input would show on the outputs that were measured.
+
+    The input is white noise of the log's own size on every input that the log excites, from rest and without noise.
+    """
+    p = problem.unknowns.shared
+    information = np.diag(problem.unknowns.precision[:p])
+    rng = np.random.default_rng(0)
+    for e, model in enumerate(problem.unknowns.models):
+        index = np.array(problem.unknowns.theta_index(model), dtype=int)
+        log = problem.segments[e][0]
+        spans = [float(np.ptp(channel)) for channel in log.u]
+        u = tuple(span * rng.normal(size=RICH) for span in spans)
+        piece = Segment(u=u, y=(np.zeros(RICH),) * model.ny, start_s=log.start_s)
+        point = replace(problem.point(e, z), correction=None)
+        found = run_passes(model, piece, point, np.zeros((1, model.nx)))
+        for o in range(model.ny):
+            gram = found.gram[0, o, 1 : 1 + index.size, 1 : 1 + index.size] / problem.sigma[e][o] ** 2
+            information[np.ix_(index, index)] += gram
+    if not np.all(np.isfinite(information)):
+        return -1
+    size = np.sqrt(np.where(np.diag(information) > 0.0, np.diag(information), 1.0))
+    values = np.linalg.eigvalsh(information / np.outer(size, size))
+    return int(np.count_nonzero(values > RANK * max(float(values[-1]), 1e-300)))
+
+
+def told(direction: dict[str, float], alone_seen: bool) -> str:
+    """Say in words what cannot be told.
+
+    Parameters
+    ----------
+    direction : mapping
+        Relative changes that have no effect.
+    alone_seen : bool
+        Whether the outputs depend on the parameter, if it is one alone.
+
+    """
+    names = sorted(direction)
+    if len(names) == 1:
+        if alone_seen:
+            return f"{names[0]} cannot be told from an experiment's own unknowns (gain, offset, delay, initial state)"
+        return f"{names[0]} has no effect on any output"
+    if len(names) == 2 and abs(abs(direction[names[0]]) - abs(direction[names[1]])) < 1e-2:
+        how = "product" if direction[names[0]] * direction[names[1]] < 0.0 else "ratio"
+        return f"{names[0]} and {names[1]} enter only together, as their {how}"
+    changes = ", ".join(f"{name} {100 * direction[name]:+.3g} %" for name in names)
+    return f"{listed(names)} enter only together: {changes} change no output"
+
+
+def resting_on(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
+    """Say which values come from a fit that cannot tell them; nothing where there are none.
+
+    Parameters
+    ----------
+    params : ParameterSet
+        What is computed with.
+    used : container of str, optional
+        The names that matter; all if left out.
+
+    """
+    names = [name for name in params.unidentified_names if used is None or name in used]
+    if not names:
+        return ()
+    values = ", ".join(f"{name} = {params[name].value:.4g}{unit_after(params[name].unit)}" for name in names)
+    return (
+        f"the fit does not identify {listed(names)}: {values} {'is' if len(names) == 1 else 'are'} one choice among "
+        "others that fit as well, and what follows at these values holds for no other; excite more, or give a value, a "
+        "prior, or a range to certify over",
+    )
+
+
+def listed(names: list[str]) -> str:
+    """Return names as a sentence lists them."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

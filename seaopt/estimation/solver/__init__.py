@@ -1,0 +1,1 @@
+"""The solver: least squares, shooting, first guess and step size."""

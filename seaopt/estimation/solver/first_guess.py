@@ -1,0 +1,229 @@
+"""A first guess from frequency responses: where time-domain least squares starts when the given values are far off.
+
+The H1 estimate of each input-output pair is compared with the linearised plant, in log magnitude and phase, which has
+no local minima to speak of in inertias, stiffnesses and dampings. The given values are refined by Gauss-Newton with
+CasADi's derivatives; where that leaves the responses unexplained, candidates are drawn over two decades around the
+given values, screened, and the best are refined.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from seaopt.errors import LogError
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.unknowns import Unknowns
+from seaopt.frequency.response import FrequencyResponse, responses
+from seaopt.records import record
+from seaopt.simulation import Model, linearised
+
+CANDIDATES = 128
+REFINED = 8
+POINTS = 60
+EXPLAINED = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
+LONGEST = 1 << 14  # samples a stretch: resolution enough for a guess
+
+
+@record(eq=False)
+class _Target:
+    """The measured responses of an experiment's outputs to its input, and the linearised model of them.
+
+    Rows are frequencies, columns outputs; the weight is zero where an output has no response to be matched.
+    """
+
+    model: Model
+    index: list[int]
+    input: int
+    outputs: list[int]
+    s: Complex[np.ndarray, " m"]
+    shift: Complex[np.ndarray, "m ny"]
+    log_response: Complex[np.ndarray, "m ny"]
+    weight: Float[np.ndarray, "m ny"]
+
+
+def first_guess(
+    experiments: tuple[Experiment, ...],
+    unknowns: Unknowns,
+    band_hz: tuple[float, float] | None,
+    rng: np.random.Generator,
+) -> tuple[list[Float[np.ndarray, " n"]], bool]:
+    """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
+
+    None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
+    """
+    found_targets = (_target(experiment, unknowns, e, band_hz) for e, experiment in enumerate(experiments))
+    targets = [target for target in found_targets if target is not None]
+    if not targets:
+        return [], False
+    start = unknowns.start[: unknowns.shared]
+    low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
+    prior = unknowns.prior_std[: unknowns.shared]
+    spread = np.isinf(prior) & (start != 0.0)
+    found = [_refine(targets, start, low, high, spread)]
+    enough = 0.5 * EXPLAINED**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
+    if found[0][0] > enough:
+        candidates = [
+            np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
+            for _ in range(CANDIDATES)
+        ]
+        ranked = np.argsort(_misfits(targets, candidates), kind="stable")
+        found += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED]]
+    guesses: list[Float[np.ndarray, " n"]] = []
+    ranked_guesses = sorted(found, key=_first)
+    for _, theta in ranked_guesses:
+        guess = unknowns.start.copy()
+        guess[: unknowns.shared] = theta
+        guesses.append(guess)
+    return guesses, ranked_guesses[0][0] <= enough
+
+
+def _first(pair: tuple[float, Any]) -> float:
+    return pair[0]
+
+
+def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> _Target | None:
+    log = experiment.log
+    active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
+    if len(active) != 1 or len(experiment.stretches) != 1:
+        return None
+    whole = [o for o, output in enumerate(experiment.outputs) if np.all(np.isfinite(log[output]))]
+    measured = [log[experiment.outputs[o]] for o in whole]
+    try:
+        stretch_s = _stretch(len(log)) * log.period
+        estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
+    except LogError:
+        return None
+    chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, " m"]]] = {}
+    low, high = band_hz if band_hz is not None else (0.0, np.inf)
+    for o, estimate in zip(whole, estimated, strict=True):
+        f = estimate.frequency_hz
+        good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
+        if np.count_nonzero(good) >= 8:
+            chosen[o] = estimate, _log_spaced(f, good)
+    if not chosen:
+        return None
+    rows = np.unique(np.concatenate([own for _, own in chosen.values()]))
+    estimates = [estimate for estimate, _ in chosen.values()]
+    used = np.column_stack([np.isin(rows, own) for _, own in chosen.values()])
+    response = np.column_stack([estimate.response[rows] for estimate in estimates])
+    spread = np.column_stack([np.maximum(estimate.relative_std[rows], 0.02) for estimate in estimates])
+    delay = unknowns.locals_of[e].delay.value + (0.5 * log.period if experiment.hold == "zero" else 0.0)
+    s = 2j * np.pi * estimates[0].frequency_hz[rows]
+    gain = np.array([unknowns.locals_of[e].gain[o].value for o in chosen])
+    model = linearised(unknowns.models[e])
+    return _Target(
+        model=model,
+        index=[unknowns.names.index(name) for name in model.free],
+        input=list(experiment.plant.inputs).index(active[0]),
+        outputs=list(chosen),
+        s=s,
+        shift=np.exp(-s * delay)[:, None] * gain,
+        log_response=np.log(np.where(used, response, 1.0)),
+        weight=np.where(used, 1.0 / spread, 0.0),
+    )
+
+
+@lru_cache(maxsize=64)
+def _stretch(n: int) -> int:
+    """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
+    length = min(n // 16, LONGEST)
+    fast = [2**a * 3**b for a in range(15) for b in range(9) if 2**a * 3**b <= length]
+    return max(fast, default=16)
+
+
+def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
+    """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
+    candidates = np.flatnonzero(good)
+    places = np.log(f[candidates])
+    grid = np.linspace(places[0], places[-1], POINTS)
+    after = np.clip(np.searchsorted(places, grid), 1, places.size - 1)
+    nearest = np.where(grid - places[after - 1] <= places[after] - grid, after - 1, after)
+    return candidates[np.unique(nearest)]
+
+
+def _misfits(targets: list[_Target], candidates: list[Float[np.ndarray, " p"]]) -> Float[np.ndarray, " k"]:
+    """Return half the squared misfit of each candidate, of all at once."""
+    costs = np.zeros(len(candidates))
+    for target in targets:
+        g = np.array([target.model.matrices(theta[target.index])[0] for theta in candidates])
+        try:
+            r, _, _, _ = _mismatch(target, g)
+        except np.linalg.LinAlgError:  # of one of them
+            return np.array([_misfit(targets, theta)[0] for theta in candidates])
+        costs += 0.5 * np.sum(np.real(r) ** 2 + np.imag(r) ** 2, axis=(1, 2))
+    return np.where(np.isfinite(costs), costs, np.inf)
+
+
+@np.errstate(all="ignore")  # what is not finite is told by the caller
+def _mismatch(
+    target: _Target, g: Float[np.ndarray, "*k rows cols"]
+) -> tuple[
+    Complex[np.ndarray, "*k m ny"],
+    Complex[np.ndarray, "*k m ny"],
+    Complex[np.ndarray, "*k m nx"],
+    Complex[np.ndarray, "*k m nx nx"],
+]:
+    """Return weighted differences of the log responses, the responses, the states' and the resolvents."""
+    nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
+    b, c, d = g[..., :nx, nx + target.input], g[..., rows, :nx], g[..., rows, nx + target.input]
+    back = np.linalg.inv(target.s[:, None, None] * np.eye(nx) - g[..., None, :nx, :nx])
+    x = (back @ b[..., None, :, None])[..., 0]
+    response = (x @ np.swapaxes(c, -1, -2) + d[..., None, :]) * target.shift
+    difference: Any = np.log(response) - target.log_response
+    wrapped = difference.real + 1j * (np.mod(difference.imag + np.pi, 2 * np.pi) - np.pi)
+    return target.weight * wrapped, response, x, back
+
+
+def _misfit(
+    targets: list[_Target], theta: Float[np.ndarray, " p"], derivatives: bool = False
+) -> tuple[float, Any, Any]:
+    """Return half the squared misfit, and its gradient and Gauss-Newton Hessian if asked."""
+    cost, gradient, hessian = 0.0, np.zeros(theta.size), np.zeros((theta.size, theta.size))
+    for target in targets:
+        nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
+        g, dg = target.model.matrices(theta[target.index])
+        try:
+            r, response, x, back = _mismatch(target, g)
+        except np.linalg.LinAlgError:
+            return np.inf, gradient, hessian
+        if not np.all(np.isfinite(r)):
+            return np.inf, gradient, hessian
+        cost += 0.5 * float(np.vdot(r, r).real)
+        if derivatives:
+            c, db, dc = g[rows, :nx], dg[:, :nx, nx + target.input], dg[:, rows, :nx]
+            moved = back @ ((dg[:, :nx, :nx] @ x.T).transpose(2, 1, 0) + db.T)
+            slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
+            j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
+            gradient[target.index] += (j.conj().T @ r.ravel()).real
+            hessian[np.ix_(target.index, target.index)] += (j.conj().T @ j).real
+    return cost, gradient, hessian
+
+
+def _refine(
+    targets: list[_Target], theta: Float[np.ndarray, " p"], low: Any, high: Any, spread: Any
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """Gauss-Newton in the logarithms of the parameters, damped."""
+    damping = 1e-2
+    cost, gradient, hessian = _misfit(targets, theta, derivatives=True)
+    for _ in range(25):
+        scale = np.where(spread, theta, 0.0)
+        h = hessian * np.outer(scale, scale)
+        h[np.diag_indices(theta.size)] += damping * np.diag(h) + 1e-9 * (1.0 + np.max(np.diag(h)))
+        step = np.clip(-np.linalg.solve(h, gradient * scale), -1.5, 1.5)
+        trial = np.clip(np.where(spread, theta * np.exp(step), theta), low, high)
+        trial_cost, trial_gradient, trial_hessian = _misfit(targets, trial, derivatives=True)
+        if trial_cost < cost:
+            small = cost - trial_cost < 1e-3 * cost  # least squares in time goes on from here
+            theta, cost, gradient, hessian = trial, trial_cost, trial_gradient, trial_hessian
+            damping = max(damping / 5, 1e-9)
+            if small:
+                break
+        else:
+            damping *= 8
+            if damping > 1e6:
+                break
+    return cost, theta

@@ -1,0 +1,1 @@
+"""Uncertainty beyond the covariance: profile likelihoods, bootstrap, leverage."""

@@ -1,0 +1,303 @@
+r"""The bootstrap of a fit: how the parameters vary when stretches of the residuals are drawn anew.
+
+The covariance of a fit is a formula; this is an experiment that does not use it. The residuals of each experiment are
+cut into blocks at random places, all outputs at once, the blocks are put in random order, round the end of the log
+(circular blocks; Politis and Romano, in: Exploring the Limits of Bootstrap, 1992), and the fit is made anew with them:
+within a block their colour stays what it is. The length of the blocks follows from the residuals' correlation r
+(Politis and White, Econometric Reviews 23, 2004, corrected by Patton, Politis and White, ibid. 28, 2009),
+
+.. math:: b = \left(\tfrac32 (G/g)^2 N\right)^{1/3}, \qquad G = \sum_k \lambda_k |k|\, |r_k|, \qquad
+          g = \sum_k \lambda_k |r_k|,
+
+under their trapezoidal window :math:`\lambda`. They have r in place of its absolute value, for a mean; a parameter
+weighs the residuals at the frequencies of its sensitivity, where all of their correlation may count. Blocks cut what is
+correlated across their ends, so that the bootstrap's variance is low by about G/(g b).
+
+Two ways of making the fit anew: one Gauss-Newton step from the minimum, :math:`-H^{-1} J^T r^*` (the default: no fits
+are made, and a log of a minute takes a second), or a refit of model output minus :math:`r^*` from there.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.errors import EstimationError
+from seaopt.estimation.problem.correlation import autocorrelation
+from seaopt.estimation.problem.losses import Linear, pull_of
+from seaopt.estimation.problem.normal_equations import inverse
+from seaopt.estimation.problem.residual_statistics import Errors, column_chunks
+from seaopt.estimation.problem.residuals import Residuals
+from seaopt.estimation.result.covariance import Covariance, robust_bread
+from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.solver.least_squares import minimise
+from seaopt.records import record
+from seaopt.units import unit_after
+
+LEAST = 20  # draws, below which a covariance says nothing
+
+
+@record(eq=False, repr=False)
+class Bootstrap:
+    """What `bootstrap` returns; ``print(bootstrap)`` is a table.
+
+    Parameters
+    ----------
+    names, units : tuple of str
+        The free parameters of the plants.
+    estimates : array, shape (p,)
+        The fit's values.
+    draws : array, shape (n, p)
+        Values after each draw.
+    blocks : mapping of experiment to int
+        Length of the blocks, in samples.
+    refit : bool
+        Whether each draw was a fit, or one step.
+    reference : Covariance
+        The fit's own, for comparison.
+
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimates: Float[np.ndarray, " p"]
+    draws: Float[np.ndarray, "n p"]
+    blocks: Mapping[str, int]
+    refit: bool
+    reference: Covariance
+
+    @property
+    def covariance(self) -> Covariance:
+        """Of the draws."""
+        return Covariance(names=self.names, matrix=np.atleast_2d(np.cov(self.draws, rowvar=False)))
+
+    def std(self, name: str) -> float:
+        """Return the standard deviation of one parameter."""
+        return self.covariance.std(name)
+
+    def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
+        """Return the percentile interval of one parameter."""
+        tail = 50.0 * (1.0 - level)
+        low, high = np.percentile(self.draws[:, self.names.index(name)], [tail, 100.0 - tail])
+        return float(low), float(high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content as numbers, lists and text."""
+        return {
+            "names": list(self.names), "draws": len(self.draws), "refit": self.refit, "blocks": dict(self.blocks),
+            "covariance": self.covariance.matrix,
+            "parameters": {
+                name: {"value": value, "unit": unit, "std": self.std(name), "ci95": list(self.interval(name))}
+                for name, unit, value in zip(self.names, self.units, self.estimates.tolist(), strict=True)
+            },
+        }  # fmt: skip
+
+    def __repr__(self) -> str:
+        how = "refits" if self.refit else "steps from the minimum"
+        cut = ", ".join(f"{name} {length}" for name, length in self.blocks.items())
+        lines = [f"Bootstrap: {len(self.draws)} {how}; blocks of residuals, in samples: {cut}"]
+        for name, unit, value in zip(self.names, self.units, self.estimates, strict=True):
+            low, high = self.interval(name)
+            lines.append(
+                f"  {name} = {value:.6g}{unit_after(unit)}: std {self.std(name):.2g} "
+                f"(the fit says {self.reference.std(name):.2g}), 95 % of the draws {low:.6g} to {high:.6g}"
+            )
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False, block: int | None = None) -> Bootstrap:
+    """Return how the parameters vary when blocks of the residuals are drawn anew.
+
+    Parameters
+    ----------
+    fit : Fit
+        As `fit` returned it.
+    draws : int
+        How many; the std of a std from n draws is 1/sqrt(2 n) of it, 5 % for 200.
+    seed : int
+        Of the draws.
+    refit : bool
+        Make a fit a draw, from the minimum, instead of one Gauss-Newton step: slower; it shows what bends.
+    block : int, optional
+        Length of the blocks in samples; from the residuals' correlation if left out.
+
+    Returns
+    -------
+    Bootstrap
+
+    Raises
+    ------
+    EstimationError
+        The fit was read from a file, or cannot tell some parameter; fewer than 20 draws; `refit` of errors of
+        prediction, which cannot be put on top of a simulation.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.bench import PAPER_STAND, Sensors, virtual_log
+    >>> from seaopt.estimation import bootstrap
+    >>> plant, truth = so.plants.high_impedance(), so.plants.thor()
+    >>> log = virtual_log(plant, truth, PAPER_STAND, duration_s=20, rate_hz=400, seed=1,
+    ...                   sensors=Sensors(noise_std={"F1": 2.0, "F2": 2.0}))
+    >>> found = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1", "F2"))], truth.free("J", "b_r"))
+    >>> 0.7 < bootstrap(found).std("J") / found.covariance.std("J") < 1.3
+    True
+
+    """
+    minimum = fit.at_minimum("bootstrap")
+    problem = minimum.problem
+    _check(fit, problem, draws, refit, block)
+    left = minimum.errors()
+    rng = np.random.default_rng(seed)
+    names = problem.unknowns.names[: problem.unknowns.shared]
+    lengths = [_length(problem, left, e, block) for e in range(len(problem.experiments))]
+    found = (_refits if refit else _steps)(minimum, left, lengths, draws, rng)
+    return Bootstrap(
+        names=names, units=tuple(fit.parameters[name].unit for name in names), estimates=minimum.z[: len(names)],
+        draws=found, blocks={e.name: n for e, n in zip(problem.experiments, lengths, strict=True)}, refit=refit,
+        reference=fit.covariance,
+    )  # fmt: skip
+
+
+def _check(fit: Fit, problem: Residuals, draws: int, refit: bool, block: int | None) -> None:
+    if draws < LEAST:
+        raise EstimationError(f"bootstrap: draws = {draws} are too few for a covariance; give {LEAST} or more")
+    if block is not None and block < 1:
+        raise EstimationError(f"bootstrap: block = {block} samples; give 1 or more, or leave it out")
+    if fit.identifiability.rank < fit.identifiability.free:
+        raise EstimationError(f"bootstrap: {fit.message}")
+    if refit and problem.observers is not None:
+        raise EstimationError(
+            "bootstrap: refit=True needs a simulation's residuals, and this fit has errors of prediction: leave it out"
+        )
+
+
+def _length(problem: Residuals, left: list[list[Errors]], e: int, block: int | None) -> int:
+    rows = _rows(left[e])
+    length = block_length(np.concatenate([error.weighted[r] for error, r in zip(left[e], rows, strict=True)]))
+    return min(block or length, max(sum(int(np.sum(r)) for r in rows) // 2, 1))
+
+
+def _rows(row: list[Errors]) -> list[Any]:
+    """Return which samples of each segment counted in some output."""
+    return [np.any(error.weighted != 0.0, axis=1) for error in row]
+
+
+def block_length(residual: Float[np.ndarray, "n ny"]) -> int:
+    """Return the length of blocks that leaves the colour of a residual, of the output that needs the longest."""
+    n = len(residual)
+    quiet, most = max(5, int(np.sqrt(np.log10(max(n, 10))))), min(int(3.0 * np.sqrt(n)), n // 3)
+    longest = 1.0
+    for o in range(residual.shape[1]):
+        r = autocorrelation(residual[:, o], min(int(np.sqrt(n)) * 4, n - 1))
+        small = np.abs(r[1:]) < 2.0 * np.sqrt(np.log10(max(n, 10)) / n)
+        run = np.convolve(small, np.ones(quiet), "valid")
+        still = int(np.argmax(run == quiet)) if np.any(run == quiet) else r.size // 2
+        if not still:
+            continue
+        k = np.arange(1, min(2 * still, r.size - 1) + 1)
+        window = np.clip(2.0 * (1.0 - k / (2.0 * still)), 0.0, 1.0)
+        g = 1.0 + 2.0 * float(np.sum(window * np.abs(r[k])))
+        moment = 2.0 * float(np.sum(window * k * np.abs(r[k])))
+        longest = max(longest, (1.5 * (moment / g) ** 2 * n) ** (1.0 / 3.0))
+    return int(min(np.ceil(longest), max(most, 1)))
+
+
+def _drawn(
+    pool: Float[np.ndarray, "m ny"], starts: Int[np.ndarray, " b"], length: int, rows: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n ny"]:
+    """Return the residuals that a draw puts at `rows`."""
+    return pool[(starts[rows // length] + rows % length) % len(pool)]
+
+
+def _pool(values: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "m ny"]:
+    """Return residuals to draw from: without their mean, and without what is missing, which is made up for in size."""
+    whole = np.concatenate(values)
+    present = np.isfinite(whole) & (whole != 0.0)
+    share = np.maximum(np.mean(present, axis=0), 1e-300)
+    mean = np.sum(np.where(present, whole, 0.0), axis=0) / np.maximum(np.sum(present, axis=0), 1)
+    return np.where(present, whole - mean, 0.0) / np.sqrt(share)
+
+
+def _starts(problem: Residuals, lengths: list[int], pools: list[Any], draws: int, rng: np.random.Generator):  # noqa: ANN202
+    """Return, for each experiment, where each draw's blocks start."""
+    totals = [sum(piece.n for piece in pieces) for pieces in problem.segments]
+    return [
+        rng.integers(0, len(pool), size=(draws, -(-total // length)))
+        for pool, total, length in zip(pools, totals, lengths, strict=True)
+    ]
+
+
+def _steps(
+    minimum: Minimum, left: list[list[Errors]], lengths: list[int], draws: int, rng: np.random.Generator
+) -> Float[np.ndarray, "draws p"]:
+    """Return one Gauss-Newton step a draw."""
+    problem, z = minimum.problem, minimum.z
+    p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-1.0
+    hessian = problem.evaluate(z).hessian
+    if not isinstance(problem.loss, Linear):
+        hessian = robust_bread(problem, z) + np.diag(prior**2)
+    back = inverse(hessian)[0][:, :p]
+    pulls = [[pull_of(problem.loss, error.weighted) for error in row] for row in left]
+    pools = [_pool([r[use] for r, use in zip(row, _rows(e), strict=True)]) for row, e in zip(pulls, left, strict=True)]
+    starts = _starts(problem, lengths, pools, draws, rng)
+    moved = (rng.normal(size=(draws, z.size)) * prior) @ back
+    for e, row in enumerate(left):
+        first = 0
+        for s, error in enumerate(row):
+            for rows, columns, used in column_chunks(problem, e, s, z):
+                influence = _influence(problem, e, s, columns, back) * used[:, :, None]
+                flat = influence.reshape(-1, p)
+                at = first + np.arange(rows.start, rows.start + len(columns))
+                for d in range(draws):
+                    moved[d] += _drawn(pools[e], starts[e][d], lengths[e], at).ravel() @ flat
+            first += len(error.weighted)
+    return z[:p] - moved
+
+
+def _influence(
+    problem: Residuals, e: int, s: int, columns: Float[np.ndarray, "m ny nc"], back: Float[np.ndarray, "n p"]
+) -> Float[np.ndarray, "m ny p"]:
+    """Return how much each residual, in sigma, moves each parameter."""
+    found = np.empty((*columns.shape[:2], back.shape[1]))
+    for o, places in enumerate(problem.columns(e, s)):
+        used = np.flatnonzero(places >= 0)
+        found[:, o] = columns[:, o, 1 + used] @ (back[places[used]] / problem.sigma[e][o])
+    return found
+
+
+def _refits(
+    minimum: Minimum, left: list[list[Errors]], lengths: list[int], draws: int, rng: np.random.Generator
+) -> Float[np.ndarray, "draws p"]:
+    """Return one fit a draw, of the model's outputs with the drawn residuals, from the minimum."""
+    problem, z = minimum.problem, minimum.z
+    unknowns, p = problem.unknowns, problem.unknowns.shared
+    pools = [_pool([error.raw[use] for error, use in zip(row, _rows(row), strict=True)]) for row in left]
+    starts = _starts(problem, lengths, pools, draws, rng)
+    found: list[Any] = []
+    for d in range(draws):
+        segments: list[Any] = []
+        for e, pieces in enumerate(problem.segments):
+            rows = np.concatenate([error.raw for error in left[e]])
+            new = _drawn(pools[e], starts[e][d], lengths[e], np.arange(len(rows)))
+            first, row = 0, []
+            for piece, error in zip(pieces, left[e], strict=True):
+                y = np.column_stack(piece.y) + error.raw - new[first : first + piece.n]
+                row.append(replace(piece, y=tuple(np.ascontiguousarray(column) for column in y.T)))
+                first += piece.n
+            segments.append(tuple(row))
+        shift = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0) * rng.normal(size=z.size)
+        trial = replace(problem, segments=tuple(segments), unknowns=replace(unknowns, start=z + shift))
+        solution = minimise(trial.evaluate, z, unknowns.low, unknowns.high)
+        if not np.isfinite(solution.evaluation.cost):
+            raise EstimationError(f"bootstrap: draw {d} overflows the simulation; use refit = False")
+        found.append(solution.z[:p])
+    return np.array(found)

@@ -1,0 +1,1 @@
+"""The worst case from above: Taylor models, enclosures, branch and bound."""

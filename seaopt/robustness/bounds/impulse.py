@@ -1,0 +1,157 @@
+r"""The sampled plant over boxes: numerator and denominator of its pulse transfer function as Taylor models.
+
+With :math:`F = e^{A T} - I = X \varphi(X)`, :math:`X = A T`, :math:`\varphi(X) = \sum_k X^k / (k + 1)!` and
+:math:`w = z - 1`, the plant is :math:`c\,\mathrm{adj}(wI - F)\,\Gamma / \det(wI - F)`, :math:`\Gamma = T \varphi(X) b`:
+in w, nothing cancels at low frequencies, where z is close to 1. The series is summed where X is small and doubled,
+:math:`\varphi(2X) = \varphi(X)(I + X\varphi(X)/2)`; adjugate and determinant are Leverrier's and Faddeev's. All of it
+is done in the modal basis of each box's centre, where F is diagonal but for what the box changes: the determinant is
+then no difference of large products. A basis does not change a transfer function.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.control import Controller
+from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant, jacobians
+from seaopt.records import record
+from seaopt.robustness.bounds.enclosure import Entry, enclosed, halvings, matrix
+from seaopt.robustness.bounds.equilibrium import at_rest
+from seaopt.robustness.bounds.region import Boxes, Region
+from seaopt.robustness.bounds.taylor import Taylor, basis, constant, kept, stacked
+
+REACH, DEGREE = 0.25, 12  # of the series: 0.25^13 / 14! = 2e-19, which is enclosed too
+WORST_BASIS = 1e5  # condition of a modal basis, beyond which Schur's takes its place
+DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 3 of more
+
+
+@record(eq=False)
+class Pulse:
+    """P(z) = (head + tail / z) / (z^whole denominator), coefficients in ascending powers of w = z - 1.
+
+    Parameters
+    ----------
+    head, tail, denominator : Taylor
+        Shapes (b, n + 1); the denominator is monic.
+    whole : array
+        Whole samples of the plant's own delay, shape (b,).
+
+    """
+
+    head: Taylor
+    tail: Taylor
+    denominator: Taylor
+    whole: Int[np.ndarray, " b"]
+
+
+def pulse(controller: Controller, plant: Plant, nominal: ParameterSet, within: Region, boxes: Boxes) -> Pulse:
+    """Return the sampled plant, from motor force to the measured output, over boxes.
+
+    Raises
+    ------
+    ControlError
+        The plant's equations have an instruction without an enclosure, or cannot rest at a box's centre.
+
+    """
+    degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
+    uncertain = within.enclosed(boxes, degree)
+    count, over = boxes.centre.shape[0], basis(within.size, degree)
+    p: list[Entry] = [
+        uncertain.get(name, within.fixed.get(name, value))  # a range of no width is no uncertainty, but another value
+        for name, value in zip(plant.parameters, plant.parameter_values(nominal), strict=True)
+    ]
+    at: dict[str, Entry] = {n: item for n, item in (within.fixed | uncertain).items() if n not in plant.parameters}
+    delay = at.pop(DELAY, 0.0)
+    x, u = at_rest(plant, p, at, count, over)
+    n, outputs = len(plant.states), len(plant.outputs)
+    found = enclosed(jacobians(plant), [x, u, p])
+    row = list(plant.outputs).index(controller.spec.measured)
+    a, b, c, d = (matrix(item, rows, count, over) for item, rows in zip(found, (n, n, outputs, outputs), strict=True))
+    gain = controller.current_per_force_A_per_N
+    return _sampled(
+        a, b[:, :, :1] * gain, c[:, row : row + 1], d[:, row : row + 1, :1] * gain, controller.sample_time_s, delay
+    )
+
+
+def _sampled(a: Taylor, b: Taylor, c: Taylor, d: Taylor, period: float, delay: Entry) -> Pulse:
+    count, n = a.c.shape[0], a.c.shape[1]
+    over = a.basis
+    left, right = _bases(a.c)
+    a, b, c = a.between(left, right), b.between(left, np.eye(1)), c.between(np.eye(1), right)
+    one = constant(np.broadcast_to(np.eye(n), a.c.shape).copy(), over)
+    x, series = _series(a * period, one)
+    f, gamma = x @ series, series @ b * period
+    late = delay if isinstance(delay, Taylor) else constant(np.full(count, delay), over)
+    least = 1e-9 * period if isinstance(delay, Taylor) else 0.0
+    whole = np.floor(late.c / period + 1e-9).astype(int)
+    rest = late - constant(whole * period, over)
+    split = np.any(rest.size > least)
+    newer = gamma
+    if split:
+        left_over = (period - rest)[:, None, None]
+        newer = (_series(a * left_over, one)[1] @ b) * left_over
+    denominator, (head, tail) = _polynomials(f, c, [newer, gamma - newer] if split else [newer, newer * 0.0])
+    through = denominator * d[:, 0]
+    late_through = (rest.c > least)[:, None]  # the output is read before the command changes
+    head, tail = head + kept(through, ~late_through), tail + kept(through, late_through)
+    return Pulse(head=head, tail=tail, denominator=denominator, whole=whole)
+
+
+def _series(x: Taylor, one: Taylor) -> tuple[Taylor, Taylor]:
+    """Return x and phi(x), of matrices."""
+    norm = np.max(np.sum(np.abs(x.c) + x.reach, axis=2), axis=1)
+    halved = halvings(norm, REACH)
+    small = x * 0.5**halved
+    out = one
+    for k in range(DEGREE, 0, -1):
+        out = one + small @ out * (1.0 / (k + 1))
+    norm = np.where(np.isfinite(norm), norm * 0.5**halved, np.inf)
+    tail = norm ** (DEGREE + 1) / float(np.prod(np.arange(1.0, DEGREE + 3))) / (1.0 - np.minimum(norm, 0.5))
+    out = out.with_rest(out.r + tail[:, None, None])
+    for _ in range(halved):
+        out = out @ (one + small @ out * 0.5)
+        small = small * 2.0
+    return x, out
+
+
+def _polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Taylor, list[Taylor]]:
+    """Return det(wI - f) and c adj(wI - f) drive, coefficients ascending along the last axis."""
+    count, n = f.c.shape[:2]
+    one = np.eye(n)
+    unit = constant(np.ones(count), f.basis)
+    coefficients, sensed = [unit], [c]
+    term: Taylor | None = None  # M_j; the first is the identity
+    for j in range(1, n + 1):
+        product = f if term is None else f @ term
+        trace = _trace(product) * (-1.0 / j)
+        coefficients.append(trace)
+        if j < n:
+            term = product + trace[:, None, None] * one
+            sensed.append(c @ term)
+    numerators = [
+        stacked([*((row @ drive)[:, 0, 0] for row in reversed(sensed)), constant(np.zeros(count), f.basis)])
+        for drive in drives
+    ]
+    return stacked(coefficients[::-1]), numerators
+
+
+def _trace(item: Taylor) -> Taylor:
+    return Taylor(item.basis, *(np.trace(part, axis1=-2, axis2=-1) for part in (item.a, item.r)))
+
+
+def _bases(a: Float[np.ndarray, "b n n"]) -> tuple[Float[np.ndarray, "b n n"], Float[np.ndarray, "b n n"]]:
+    """Return the inverse and the real modal basis of every matrix, or its Schur basis where that is ill conditioned."""
+    from scipy.linalg import matrix_balance, schur
+
+    scale = np.asarray(matrix_balance(a[0], permute=False, separate=True)[1][0]) if a.shape[1] else np.ones(0)
+    balanced = a * scale / scale[:, None]
+    values, vectors = np.linalg.eig(balanced)
+    right = np.where(np.imag(values)[:, None] < 0.0, np.imag(vectors), np.real(vectors)).astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        poor = ~(np.linalg.cond(right) < WORST_BASIS)
+    for k in np.flatnonzero(poor):
+        right[k] = np.asarray(schur(balanced[k], output="real")[1])
+    return np.linalg.inv(right) / scale, scale[:, None] * right

@@ -1,0 +1,173 @@
+r"""The set over which a bound is asked for, as boxes: what of an `Uncertainty` one plant depends on.
+
+The Gaussian part is an ellipsoid, the image :math:`p = \bar p + W y` of a ball; of the parameters that the plant has,
+it is again one, whose axes come from the singular values of their rows of W. Coordinates along it are fractions of its
+half axes, so that it is the unit ball; those of the ranges run from -1 to 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from seaopt.control.loops.sampled_plant import DELAY, conditions, conditions_of
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.robustness.bounds.taylor import Taylor, basis, linear
+from seaopt.robustness.uncertainty.draws import SCREW_MASS, SCREW_MODE, Uncertainty, radius
+
+SMALLEST = 1e-12  # half axis, as a fraction of the largest relative one, that is no uncertainty
+
+
+@record(eq=False)
+class Boxes:
+    """Boxes in coordinates: centres and half widths, shapes (b, k)."""
+
+    centre: Float[np.ndarray, "b k"]
+    radius: Float[np.ndarray, "b k"]
+
+    def rows(self, index: Int[np.ndarray, " r"] | Bool[np.ndarray, " b"] | slice) -> Boxes:
+        """Return some of them."""
+        return Boxes(centre=self.centre[index], radius=self.radius[index])
+
+    def halves(self, axis: Int[np.ndarray, " b"]) -> Boxes:
+        """Return the lower halves, each along an axis of its own, then the upper ones."""
+        step = np.zeros_like(self.radius)
+        rows = np.arange(axis.size)
+        step[rows, axis] = 0.5 * self.radius[rows, axis]
+        radius = np.tile(self.radius - step, (2, 1))
+        return Boxes(centre=np.vstack([self.centre - step, self.centre + step]), radius=radius)
+
+
+@record(eq=False)
+class Region:
+    """The set of one plant.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Parameters and conditions that are uncertain.
+    centre, slopes
+        Their values at the coordinates' origin, shape (n,), and per coordinate, (n, k).
+    low, high
+        Physical bounds of those of the Gaussian part, infinite for the others, shape (n,).
+    ball : int
+        The first so many coordinates lie in a unit ball, the others between -1 and 1.
+    fixed : mapping of name to value
+        Conditions that are not uncertain.
+
+    """
+
+    names: tuple[str, ...]
+    centre: Float[np.ndarray, " n"]
+    slopes: Float[np.ndarray, "n k"]
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    ball: int
+    fixed: dict[str, float]
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self.slopes.shape[1]
+
+    def whole(self, sample_time_s: float) -> Boxes:
+        """Return boxes that cover the set, none with a whole number of samples of delay inside it.
+
+        Where the output has a part that follows the command at once, the sampled plant jumps there, so that each such
+        delay is also a box of its own, of no width.
+        """
+        size = self.size
+        boxes = Boxes(centre=np.zeros((1, size)), radius=np.ones((1, size)))
+        if DELAY not in self.names:
+            return self.cut(boxes)[0]
+        row = self.names.index(DELAY)
+        axis = int(np.flatnonzero(self.slopes[row])[0])
+        middle, half = self.centre[row], self.slopes[row, axis]
+        first, last = (middle - half) / sample_time_s, (middle + half) / sample_time_s
+        inner = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1)
+        edges = np.unique(np.concatenate([[first], inner[(inner > first) & (inner < last)], [last]]))
+        points = np.concatenate([0.5 * (edges[:-1] + edges[1:]), inner]) * sample_time_s
+        widths = np.concatenate([0.5 * np.diff(edges), np.zeros(inner.size)]) * sample_time_s
+        centre, radius = np.zeros((points.size, size)), np.ones((points.size, size))
+        centre[:, axis], radius[:, axis] = (points - middle) / half, widths / half
+        return self.cut(Boxes(centre=centre, radius=radius))[0]
+
+    def cut(self, boxes: Boxes) -> tuple[Boxes, Bool[np.ndarray, " b"]]:
+        """Return the boxes without what lies beyond a physical bound, those that are left, and which these are."""
+        low, high = boxes.centre - boxes.radius, boxes.centre + boxes.radius
+        for sign, bound in ((1.0, self.low), (-1.0, -self.high)):
+            for row in np.flatnonzero(np.isfinite(bound)):
+                slope = sign * self.slopes[row]
+                largest = np.maximum(slope * low, slope * high)  # of what each coordinate adds
+                room = sign * self.centre[row] - bound[row] + np.sum(largest, axis=1, keepdims=True) - largest
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    limit = -room / slope
+                low = np.where(slope > 0.0, np.maximum(low, limit), low)
+                high = np.where(slope < 0.0, np.minimum(high, limit), high)
+        nearest = np.clip(0.0, low, high)[:, : self.ball]
+        kept = np.all(low <= high, axis=1) & (np.sum(nearest**2, axis=1) <= 1.0)
+        return Boxes(centre=0.5 * (low + high)[kept], radius=0.5 * (high - low)[kept]), kept
+
+    def enclosed(self, boxes: Boxes, degree: int) -> dict[str, Taylor]:
+        """Return the uncertain parameters and conditions over the boxes, as models of a degree."""
+        over = basis(self.size, degree)
+        centre, slopes = self.at(boxes.centre), self.slopes[:, None] * boxes.radius
+        return {name: linear(centre[name], slopes[row].T, over) for row, name in enumerate(self.names)}
+
+    def at(self, points: Float[np.ndarray, "b k"]) -> dict[str, Float[np.ndarray, " b"]]:
+        """Return the uncertain parameters and conditions at points."""
+        return dict(zip(self.names, (self.centre + points @ self.slopes.T).T, strict=True))
+
+    def into(self, points: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b k"]:
+        """Return points, those outside the ball or the box moved onto its edge."""
+        inner = points[:, : self.ball]
+        size = np.linalg.norm(inner, axis=1, keepdims=True)
+        return np.hstack([inner / np.maximum(size, 1.0), np.clip(points[:, self.ball :], -1.0, 1.0)])
+
+    def inside(self, points: Float[np.ndarray, "b k"]) -> Bool[np.ndarray, " b"]:
+        """Tell which points are in the set."""
+        values = self.centre + points @ self.slopes.T
+        edge = 1.0 + 1e-12
+        near = np.all(np.abs(points) <= edge, axis=1) & (np.linalg.norm(points[:, : self.ball], axis=1) <= edge)
+        return near & np.all((values >= self.low) & (values <= self.high), axis=1)
+
+
+def region(plant: Plant, unknown: Uncertainty) -> Region:
+    """Return the set over which a plant is uncertain."""
+    extra = conditions((plant,))
+    taken = {SCREW_MASS} if SCREW_MODE in unknown.ranges else set[str]()
+    gaussian = [k for k, name in enumerate(unknown.names) if name in plant.parameters and name not in taken]
+    names = [unknown.names[k] for k in gaussian]
+    rows = unknown.factor()[gaussian] * radius(len(unknown.names))
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    left, axes, _ = np.linalg.svd(rows / np.where(size > 0.0, size, 1.0), full_matrices=False)
+    kept = axes > SMALLEST
+    axes = (left * axes)[:, kept] * size
+    ends = {
+        (SCREW_MASS if name == SCREW_MODE else name): _ends(unknown, name, pair)
+        for name, pair in unknown.ranges.items()
+    }
+    ends = {name: pair for name, pair in ends.items() if name in plant.parameters or name in extra}
+    given = {name: pair[0] for name, pair in ends.items() if pair[0] == pair[1]}
+    wide = {name: pair for name, pair in ends.items() if name not in given}
+    count, ball = len(names), axes.shape[1]
+    slopes = np.zeros((count + len(wide), ball + len(wide)))
+    slopes[:count, :ball] = axes
+    slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
+    middle = [0.5 * (low + high) for low, high in wide.values()]
+    nominal = {name: value for name, value in conditions_of(plant, unknown.nominal).items() if name not in ends}
+    return Region(
+        names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
+        slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
+        high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float), ball=ball,
+        fixed=given | nominal,
+    )  # fmt: skip
+
+
+def _ends(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[float, float]:
+    """Return a range; of the screw's mode, that of the masses which put it there."""
+    if name != SCREW_MODE:
+        return float(pair[0]), float(pair[1])
+    ends = np.interp(np.array(pair), unknown.screw[0], unknown.screw[1])
+    return float(np.min(ends)), float(np.max(ends))

@@ -1,0 +1,1 @@
+"""The certificate: requirements, verdict, and tuning until it passes."""

@@ -1,0 +1,282 @@
+"""Certify: close one controller around every plant, nominal, over draws, and at the worst that can be found.
+
+The draws are independent of whatever was used in tuning, so that the statement on the probability of failure holds:
+with no failure in N draws, it is below epsilon at a confidence of 1 - delta where N >= ln(1/delta)/ln(1/(1 - epsilon)),
+and with failures the bound is Clopper's and Pearson's. Draws are made and measured in blocks; only the worst are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.control import Controller
+from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.errors import ControlError
+from seaopt.estimation import Fit
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
+from seaopt.robustness.certificate.certificate import DESIGN_NAMES, Certificate, MonteCarlo, Requirement
+from seaopt.robustness.certificate.nominal import plant_margins
+from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
+from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import Uncertainty, uncertainty
+from seaopt.robustness.uncertainty.severity import limits, severities
+from seaopt.robustness.uncertainty.worst import ROUNDING, find_worst, witnessed
+
+CONFIDENCE = 1.0 - 1e-6
+BLOCK = 50_000
+MOST_DELAY = 20  # samples
+KEPT = 64  # worst draws kept of each plant
+STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Tally:
+    """The worst draws of a plant so far, as coordinates."""
+
+    points: Float[np.ndarray, "n k"]
+    severity: Float[np.ndarray, " n"]
+
+
+@dataclass(slots=True, kw_only=True)
+class _Failures:
+    """Draws that are unstable on some plant; of the others, over Ms on one; of the others, over Mt on one."""
+
+    unstable: int = 0
+    over_ms: int = 0
+    over_mt: int = 0
+
+    def add(
+        self, unstable: Bool[np.ndarray, " n"], over_ms: Bool[np.ndarray, " n"], over_mt: Bool[np.ndarray, " n"]
+    ) -> None:
+        self.unstable += int(np.count_nonzero(unstable))
+        self.over_ms += int(np.count_nonzero(over_ms & ~unstable))
+        self.over_mt += int(np.count_nonzero(over_mt & ~over_ms & ~unstable))
+
+    @property
+    def count(self) -> int:
+        return self.unstable + self.over_ms + self.over_mt
+
+
+def certify(
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    parameters: Fit | ParameterSet,
+    *,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    others: ParameterSet | None = None,
+    samples: int = 1375,
+    seed: int = 1,
+    confidence: float = CONFIDENCE,
+    max_failure_probability: float | None = None,
+    bounds: Budget | None = None,
+    progress: Progress | None = None,
+) -> Certificate:
+    """Check a controller against plants, at the nominal parameters and over draws.
+
+    Everything is computed from the controller's two transfer functions; every plant is closed from the current that
+    the controller commands, so that its own eta, K_tau and lead change the loop gain.
+
+    Parameters
+    ----------
+    controller : Controller
+        The law.
+    plants : mapping of name to Plant
+        What it must survive. The design plant is certified too, as "design" where it is not among them.
+    parameters : Fit or ParameterSet
+        A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one.
+    ranges : mapping of name to (low, high), optional
+        Drawn uniformly instead: parameters; conditions, which are an angle to linearise at (phi, rad) and delay_s,
+        seconds besides the controller's; and screw_mode_hz, where the screw's mode is, of plants with that part.
+    others : ParameterSet, optional
+        Values of parameters that the fit's plants do not have; the plants' defaults where left out.
+    samples : int
+        Draws; 1375 without a failure bound the failure probability by 1 % at a confidence of 1 - 1e-6.
+    seed : int
+        Of the draws. They come from a stream of the law's own: none is a draw of the tuner's, nor of the certificate
+        whose worst cases the law was tuned with.
+    confidence : float
+        Of the bound (Clopper-Pearson).
+    max_failure_probability : float, optional
+        Required of that bound, so that too few draws are no certificate; left out, it is stated and requires nothing.
+    bounds : Budget, optional
+        Also bound the worst case from above, with this much work on each plant; not at all if left out. What is proven
+        requires nothing; a plant met on the way that is worse than the worst case found takes its place.
+    progress : callable, optional
+        Called with the number of draws done and of all, now and then.
+
+    Returns
+    -------
+    Certificate
+        A draw fails if a plant is unstable there, or breaks the specification's Ms or Mt.
+
+    Raises
+    ------
+    ControlError
+        There is no plant, a plant lacks the measured output, a range is empty, or the fit leaves a parameter open.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> params, swing = so.plants.thor(), so.plants.moving_output()
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    >>> controller = so.tune(so.plants.high_impedance(), params, spec, robust_to={"swing": swing})
+    >>> certificate = so.certify(controller, {"swing": swing}, params, ranges={"I_p": (0.3, 0.5)}, samples=100)
+    >>> certificate.passed, certificate.monte_carlo.failures, list(certificate.plants)
+    (True, 0, ['design', 'swing'])
+
+    """
+    _check(controller, plants, samples, seed, confidence, max_failure_probability)
+    plants, others = _with_design(controller, plants, others or ParameterSet())
+    unknown = uncertainty(parameters, others, ranges or {}, plants)
+    _check_delay(controller, unknown.ranges)
+    nominal = unknown.nominal
+    figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
+    samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
+    rng = np.random.default_rng([seed, STREAM, _digest(controller)])
+    failures, tallies = _drawn(controller, plants, unknown, samples, rng, progress)
+    worst = {
+        name: find_worst(controller, plant, unknown, tallies[name].points, tallies[name].severity)
+        for name, plant in plants.items()
+    }
+    brackets: dict[str, Bracket] = {}
+    if bounds is not None:
+        brackets = {name: bracket(controller, plant, unknown, worst[name], bounds) for name, plant in plants.items()}
+    for name, item in brackets.items():
+        if item.parameters:
+            worst[name] = witnessed(controller, plants[name], nominal, item.parameters)
+    monte_carlo = MonteCarlo(
+        samples=samples, failures=failures.count, seed=seed, confidence=confidence,
+        failure_probability_bound=failure_bound(samples, failures.count, confidence),
+        unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
+    )  # fmt: skip
+    requirements = (
+        *_design_requirements(controller, nominal),
+        *(item for name in plants for item in plant_requirements(controller, name, figures[name])),
+        *draw_requirements(monte_carlo, worst, max_failure_probability),
+    )
+    return Certificate(
+        passed=all(item.met for item in requirements), requirements=requirements, plants=figures,
+        margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
+        monte_carlo=monte_carlo, controller=controller, models=dict(plants), parameters=nominal,
+        varied=unknown.varied(),
+        brackets=brackets,
+    )  # fmt: skip
+
+
+def _check(
+    controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
+    max_failure_probability: float | None,
+) -> None:  # fmt: skip
+    if not isinstance(plants, Mapping):
+        raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
+    if not plants:
+        raise ControlError("certify needs at least one plant; give {name: plant}")
+    for name, value, least, what in (("samples", samples, 1, "number of draws"), ("seed", seed, 0, "seed")):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise ControlError(f"{name} = {value!r} is not a {what}; give a whole number, {least} or more")
+    if not 0.0 < confidence < 1.0:
+        raise ControlError(f"confidence = {confidence:g} is not between 0 and 1")
+    if max_failure_probability is not None and not 0.0 < max_failure_probability <= 1.0:
+        raise ControlError(f"max_failure_probability = {max_failure_probability:g} is no probability; give 0.01, say")
+    if controller.design is None:
+        raise ControlError(
+            "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
+        )
+
+
+def _with_design(
+    controller: Controller, plants: Mapping[str, Plant], others: ParameterSet
+) -> tuple[dict[str, Plant], ParameterSet]:
+    """Return the plants with the design plant among them, and its own values of what nobody else gives."""
+    assert controller.design is not None
+    design, values = controller.design
+    if any(plant is design for plant in plants.values()):
+        return dict(plants), others
+    missing = (values[name] for name in values if name in design.parameters and name not in others)
+    name = next(item for item in DESIGN_NAMES if item not in plants)
+    return {name: design, **plants}, others.with_parameters(*missing)
+
+
+def _check_delay(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse delays of so many samples that a plant with them is no plant to control."""
+    if DELAY not in ranges:
+        return
+    high, period = ranges[DELAY][1], controller.sample_time_s
+    if high > MOST_DELAY * period:
+        raise ControlError(
+            f"range of {DELAY} reaches {high:g} s, {high / period:.0f} samples; delays are in seconds, and up to "
+            f"{MOST_DELAY} samples ({MOST_DELAY * period:g} s) are certified"
+        )
+
+
+def _digest(controller: Controller) -> int:
+    """Return a number of the law's own, so that another law meets other draws at the same seed.
+
+    To six digits: what two machines tune from the same file is the same law.
+    """
+    told = (
+        f"{value:.6g}" for part in (controller.reference, controller.measurement) for value in (*part.num, *part.den)
+    )
+    return int.from_bytes(sha256(" ".join(told).encode()).digest()[:8], "big")
+
+
+def _drawn(
+    controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
+    progress: Progress | None,
+) -> tuple[_Failures, dict[str, _Tally]]:  # fmt: skip
+    """Draw and measure in blocks: the draws that fail on some plant, and the worst of each plant."""
+    tallies = {name: _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0)) for name in plants}
+    ms, mt = (limit * (1.0 + ROUNDING) for limit in limits(controller))
+    failures, steps = _Failures(), samples * len(plants)
+    for start in range(0, samples, BLOCK):
+        points = unknown.draw(min(BLOCK, samples - start), rng)
+        values = unknown.values(points)
+        unstable, over_ms, over_mt = (np.zeros(len(points), dtype=bool) for _ in range(3))
+        for number, (name, plant) in enumerate(plants.items()):
+            before = start * len(plants) + number * len(points)
+            tell = None if progress is None else (lambda done, before=before: progress(before + done, steps))
+            found = batch_figures(controller, plant, unknown.nominal, values, tell)
+            unstable |= found.spectral_radius >= STABLE
+            over_ms |= found.ms > ms
+            over_mt |= found.mt > mt
+            tally, severity = tallies[name], severities(controller, found)
+            points_so_far = np.vstack([tally.points, points])
+            severity_so_far = np.concatenate([tally.severity, severity])
+            worst = np.argsort(severity_so_far)[::-1][:KEPT]
+            tallies[name] = _Tally(points=points_so_far[worst], severity=severity_so_far[worst])
+        failures.add(unstable, over_ms, over_mt)
+    return failures, tallies
+
+
+def failure_bound(samples: int, failures: int, confidence: float) -> float:
+    """Return the upper Clopper-Pearson bound of a failure probability (Biometrika 26, 1934).
+
+    Examples
+    --------
+    >>> round(failure_bound(1375, 0, 1 - 1e-6), 4)
+    0.01
+
+    """
+    if failures >= samples:
+        return 1.0
+    from scipy.special import betaincinv
+
+    return float(betaincinv(failures + 1, samples - failures, confidence))
+
+
+def _design_requirements(controller: Controller, nominal: ParameterSet) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal parameters, computed from the law again."""
+    assert controller.design is not None
+    plant, values = controller.design
+    named = values.with_parameters(*(nominal[name] for name in nominal if name in plant.parameters))
+    return design_requirements(controller, controller.close(plant, named).figures(), named)

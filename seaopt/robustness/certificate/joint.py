@@ -1,0 +1,255 @@
+"""Tune until certified: a cutting-set loop between the tuner and the certificate.
+
+The tuner keeps its limits on a few plants; the certificate looks for the worst of infinitely many. What it finds goes
+back into the few, and so on, until nothing worse is found or the few alone cannot be met together (Mutapcic, Boyd,
+Optimization Methods and Software 24(3), 2009, for the convex case, where this ends at the optimum). If the few cannot
+be met, neither can all: a bandwidth that the tuner calls out of reach is so, as far as the tuner is right.
+
+Every round certifies with draws of its own, on a controller that has seen none of them. The chance that some round's
+certificate is wrong is no more than the sum of the rounds' chances: each is made at 1 - (1 - confidence)/rounds, so
+that the one which passes holds at `confidence`.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from seaopt.control import Controller, ControllerSpec, tune
+from seaopt.errors import ControlError
+from seaopt.estimation import Fit
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.robustness.certificate.certificate import Certificate
+from seaopt.robustness.certificate.certify import CONFIDENCE, certify
+from seaopt.robustness.uncertainty.severity import UNSTABLE
+from seaopt.robustness.uncertainty.worst import Worst
+
+ROUNDS = 6
+SAME = 1e-6  # witnesses that differ by less than this share in every parameter are one
+Pairs = Mapping[str, tuple[Plant, ParameterSet]]
+
+
+@record(eq=False)
+class Round:
+    """One round: what was tuned, on how many plants, and what certifying it found.
+
+    Parameters
+    ----------
+    number : int
+        From 1.
+    plants : int
+        That the tuner kept its limits on, the design plant among them.
+    controller : Controller
+    certificate : Certificate or None
+        None if the controller misses its limits on those plants already.
+    added : tuple of str
+        Witnesses that the next round keeps its limits on too.
+
+    """
+
+    number: int
+    plants: int
+    controller: Controller
+    certificate: Certificate | None
+    added: tuple[str, ...] = ()
+
+
+@record(eq=False)
+class JointTuning:
+    """What `tune_certified` returns.
+
+    Parameters
+    ----------
+    status : str
+        "certified"; "infeasible": the limits cannot be met on the witnesses together; "stuck": the certificate fails
+        at what the tuner has met already, or at something that it does not treat; "rounds": there were too few.
+    controller : Controller
+        Of the last round.
+    certificate : Certificate or None
+        Of that controller; None if it is infeasible.
+    rounds : tuple of Round
+    robust_to : mapping of name to (plant, parameters)
+        Every plant besides the design plant on which the last controller was asked to keep its limits.
+
+    """
+
+    status: Literal["certified", "infeasible", "stuck", "rounds"]
+    controller: Controller
+    certificate: Certificate | None
+    rounds: tuple[Round, ...]
+    robust_to: Pairs
+
+    @property
+    def explanation(self) -> str:
+        """One line: why it is not certified; empty if it is."""
+        if self.status == "certified":
+            return ""
+        if self.certificate is None:
+            return self.controller.explanation
+        broken = next(item for item in self.certificate.requirements if not item.met)
+        found = f"{broken.name} = {broken.value:.4g}, limit {broken.limit:.4g} ({broken.where})"
+        if self.status == "rounds":
+            return f"{len(self.rounds)} rounds were too few: {found}; give more rounds, or a larger reserve"
+        return f"no witness is left that the tuner has not met: {found}"
+
+    @property
+    def summary(self) -> str:
+        """Whether it is certified, and in how many rounds."""
+        count = f"{len(self.rounds)} round{'' if len(self.rounds) == 1 else 's'}"
+        return f"certified in {count}" if self.status == "certified" else f"NOT certified ({self.status}, {count})"
+
+    def __repr__(self) -> str:
+        lines = [f"Joint tuning: {self.summary}", "  round  plants  failures  worst case, of its limit"]
+        lines += [f"  {_row(item)}" for item in self.rounds]
+        return "\n".join([*lines, *([f"  {self.explanation}"] if self.explanation else [])])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def tune_certified(
+    plant: Plant,
+    parameters: Fit | ParameterSet,
+    spec: ControllerSpec,
+    plants: Mapping[str, Plant],
+    *,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    robust_to: Pairs | None = None,
+    draws: Sequence[Mapping[str, float]] = (),
+    others: ParameterSet | None = None,
+    samples: int = 1375,
+    seed: int = 1,
+    confidence: float = CONFIDENCE,
+    rounds: int = ROUNDS,
+    progress: Callable[[Round], None] | None = None,
+) -> JointTuning:
+    """Tune, certify, and tune again with the worst cases found, until the certificate passes.
+
+    Parameters
+    ----------
+    plant : Plant
+        The design plant.
+    parameters : Fit or ParameterSet
+        A fit, or values with the prior_std of those that have one.
+    spec : ControllerSpec
+        Bandwidth and limits.
+    plants : mapping of name to Plant
+        What the controller must survive; each is in the first round at the nominal parameters.
+    ranges, others, samples
+        As in `certify`.
+    robust_to : mapping of name to (Plant, ParameterSet), optional
+        More for the first round, such as the ends of the ranges.
+    draws : sequence of mappings of parameter to value, optional
+        As in `tune`, in every round.
+    seed : int
+        Of the first round; every other has the next one.
+    confidence : float
+        Of the certificate that passes, over all rounds.
+    rounds : int
+        The most that there may be.
+    progress : callable, optional
+        Called with each round when it is done.
+
+    Returns
+    -------
+    JointTuning
+
+    Raises
+    ------
+    ControlError
+        As `tune` and `certify`; or rounds is not 1 or more.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, swing, thor = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    >>> done = tune_certified(stand, thor, spec, {"swing": swing}, ranges={"I_p": (0.15, 0.6)}, samples=100)
+    >>> done.status, done.certificate.passed
+    ('certified', True)
+
+    """
+    if rounds < 1:
+        raise ControlError(f"rounds = {rounds} is not a number of rounds; give 1 or more")
+    values = _values(parameters, others or ParameterSet())
+    held = {name: (item, values) for name, item in plants.items() if item is not plant} | dict(robust_to or {})
+    share = 1.0 - (1.0 - confidence) / rounds
+    done: list[Round] = []
+    for number in range(1, rounds + 1):
+        controller = tune(plant, values, spec, held, draws=draws)
+        certificate = None
+        if controller.feasible:
+            certificate = certify(
+                controller, plants, parameters, ranges=ranges, others=others, samples=samples, seed=seed + number - 1,
+                confidence=share,
+            )  # fmt: skip
+        fresh = _fresh(certificate, [(plant, values), *held.values()], number)
+        done.append(
+            Round(number=number, plants=1 + len(held), controller=controller, certificate=certificate, added=(*fresh,))
+        )
+        if progress is not None:
+            progress(done[-1])
+        status = _status(certificate, fresh, last=number == rounds)
+        if status is not None:
+            return JointTuning(
+                status=status, controller=controller, certificate=certificate, rounds=tuple(done), robust_to=held
+            )
+        held |= fresh
+    raise AssertionError("the last round has a status")
+
+
+def _status(
+    certificate: Certificate | None, fresh: Pairs, *, last: bool
+) -> Literal["certified", "infeasible", "stuck", "rounds"] | None:
+    """Return what a round ends with; None if another follows."""
+    if certificate is None:
+        return "infeasible"
+    if certificate.passed:
+        return "certified"
+    if not fresh:
+        return "stuck"
+    return "rounds" if last else None
+
+
+def _values(parameters: Fit | ParameterSet, others: ParameterSet) -> ParameterSet:
+    known = parameters.parameters if isinstance(parameters, Fit) else parameters
+    return others.with_parameters(*known.values())
+
+
+def _fresh(
+    certificate: Certificate | None, known: Sequence[tuple[Plant, ParameterSet]], number: int
+) -> dict[str, tuple[Plant, ParameterSet]]:
+    """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need."""
+    if certificate is None or certificate.passed:
+        return {}
+    return {
+        f"{name}, round {number}: {_place(worst)}": worst
+        for name, worst in certificate.worst.items()
+        if not any(_same(worst, pair) for pair in known)
+    }
+
+
+def _same(worst: Worst, pair: tuple[Plant, ParameterSet]) -> bool:
+    plant, values = worst
+    return plant is pair[0] and all(
+        name in pair[1] and np.isclose(values[name].value, pair[1][name].value, rtol=SAME, atol=0.0)
+        for name in worst.parameters
+    )
+
+
+def _place(worst: Worst) -> str:
+    return ", ".join(f"{name} = {value:.4g}" for name, value in worst.parameters.items()) or "nominal"
+
+
+def _row(item: Round) -> str:
+    head = f"{item.number:<5}  {item.plants:<6}"
+    if item.certificate is None:
+        return f"{head}  limits not met on these plants"
+    name, worst = max(item.certificate.worst.items(), key=lambda pair: pair[1].severity)
+    size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
+    return f"{head}  {item.certificate.monte_carlo.failures:<8}  {size} on {name} at {_place(worst)}"

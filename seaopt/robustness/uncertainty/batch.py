@@ -1,0 +1,284 @@
+r"""Many plants at once: closed-loop eigenvalues and peaks of S and T for every draw, vectorised.
+
+With the eigenvalues :math:`o_i` of the open loop (plant, delay, controller) and :math:`c_i` of the closed one,
+
+.. math:: S(z) = \frac{1}{1 + d\, d_c} \prod_i \frac{z - o_i}{z - c_i}, \qquad T = 1 - S,
+
+so that no linear system is solved at any frequency and the derivatives along the circle are sums of simple fractions.
+Every draw's grid has points of its own about the poles of its loop. About a peak :math:`1/|S|^2` is close to a
+parabola in the angle: Newton's method on its derivative, kept between the neighbouring grid points, ends at rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from seaopt.control import Controller
+from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.response import LARGEST, law_state_space
+from seaopt.control.loops.sampled_plant import DELAY, Linear, conditions, conditions_of, hold, linearised
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+
+BLOCK = 8192  # draws linearised at once: bounds the memory
+CHUNK = 512  # draws whose curves are evaluated at once: bounds the cache
+BASE = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 60)])
+FAN = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # about a pole, in distances of it from the circle
+MAXIMA = 3  # local maxima refined
+NEWTON_STEPS = 40
+
+NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
+
+Progress = Callable[[int], None]
+Peak = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+
+
+@record(eq=False)
+class BatchFigures:
+    """Spectral radius, Ms and Mt of every draw (infinite where unstable), arrays of shape (n,).
+
+    A draw so far off that the sampled plant is not finite is unstable, with an infinite spectral radius.
+    """
+
+    spectral_radius: Float[np.ndarray, " n"]
+    ms: Float[np.ndarray, " n"]
+    mt: Float[np.ndarray, " n"]
+
+
+def batch_figures(
+    controller: Controller, plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]],
+    progress: Progress | None = None, threads: int = 2, peaks: bool = True,
+) -> BatchFigures:  # fmt: skip
+    """Close `controller` around `plant` at every draw.
+
+    Parameters
+    ----------
+    controller : Controller
+        The law.
+    plant, nominal
+        The plant, and the values of what is not drawn.
+    draws : mapping of name to array, shape (n,)
+        Parameters of the plant and conditions (`seaopt.control.loops.sampled_plant`); the others are left
+        out.
+    progress : callable, optional
+        Called with the number of draws done, now and then.
+    threads : int
+        Blocks of draws worked on at once.
+    peaks : bool
+        Whether Ms and Mt are wanted; if not, they are nan where stable.
+
+    """
+    values, extra = columns(plant, nominal, draws)
+    count = values.shape[1]
+    chain = float(np.max(extra.get(DELAY, np.zeros(1))))
+    parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
+    with ThreadPoolExecutor(threads) as pool:
+        for start in range(0, count, BLOCK):
+            own = slice(start, min(start + BLOCK, count))
+            at = {name: item[own] for name, item in extra.items()}
+            late = at.get(DELAY, np.zeros(own.stop - own.start)) if chain else np.zeros(own.stop - own.start)
+            continuous = linearised(
+                plant, values[:, own], at, controller.spec.measured, controller.current_per_force_A_per_N
+            )
+            pieces = [slice(k, k + CHUNK) for k in range(0, own.stop - own.start, CHUNK)]
+            parts += pool.map(
+                lambda piece, given=continuous, delay=late: _chunk(
+                    controller, tuple(item[piece] for item in given), delay[piece], peaks
+                ),
+                pieces,
+            )
+            if progress is not None:
+                progress(own.stop)
+    radius, ms, mt = (np.concatenate(items) for items in zip(*parts, strict=True))
+    return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
+
+
+def columns(
+    plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]]
+) -> tuple[Float[np.ndarray, "np n"], dict[str, Float[np.ndarray, " n"]]]:
+    """Return a plant's parameters, one column a draw, and its conditions."""
+    count = len(next(iter(draws.values()))) if draws else 1
+    values = np.repeat(np.array(plant.parameter_values(nominal))[:, None], count, axis=1)
+    for row, name in enumerate(plant.parameters):
+        if name in draws:
+            values[row] = draws[name]
+    known = conditions_of(plant, nominal)
+    extra = {
+        name: draws[name] if name in draws else np.full(count, known[name])
+        for name in conditions((plant,))
+        if name in draws or name in known
+    }
+    return values, extra
+
+
+@record(eq=False)
+class Products:
+    """S of every draw as a product over poles, open and closed."""
+
+    opened: Complex[np.ndarray, "n k"]
+    closed: Complex[np.ndarray, "n k"]
+    scale: Float[np.ndarray, " n"]
+
+    def sensitivity(self, z: Complex[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
+        """Return S at points of each row's own."""
+        above, below = np.ones_like(z), np.ones_like(z)
+        for k in range(self.opened.shape[1]):
+            above *= z - self.opened[:, k, None]
+            below *= z - self.closed[:, k, None]
+        return above / below * self.scale[:, None]
+
+    def logarithmic(
+        self, z: Complex[np.ndarray, "n m"]
+    ) -> tuple[Complex[np.ndarray, "n m"], Complex[np.ndarray, "n m"]]:
+        """Return S'/S and its derivative."""
+        first, second = np.zeros_like(z), np.zeros_like(z)
+        for k in range(self.opened.shape[1]):
+            above, below = 1.0 / (z - self.opened[:, k, None]), 1.0 / (z - self.closed[:, k, None])
+            first += above - below
+            second += below**2 - above**2
+        return first, second
+
+    def rows(self, index: Int[np.ndarray, " r"]) -> Products:
+        """Return the loops of some rows."""
+        return Products(opened=self.opened[index], closed=self.closed[index], scale=self.scale[index])
+
+
+def _chunk(
+    controller: Controller, continuous: Linear, delay: Float[np.ndarray, " k"], peaks: bool
+) -> tuple[Float[np.ndarray, " k"], ...]:
+    a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
+    count = d.size
+    whole = np.concatenate([a.reshape(count, -1), b, c, d[:, None]], axis=1)
+    finite = np.max(np.abs(whole), axis=1) < LARGEST  # not so of nan
+    a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (item.ndim - 1)), item, 0.0) for item in (a, b, c, d))
+    products = closed_products(controller, a, b, c, d)
+    radius = np.where(finite, np.max(np.abs(products.closed), axis=1), np.inf)
+    ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
+    stable = np.flatnonzero(radius < STABLE)
+    if stable.size:
+        (ms[stable], _), (mt[stable], _) = find_peaks(products.rows(stable)) if peaks else NO_PEAKS
+    return radius, ms, mt
+
+
+def closed_products(
+    controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n x"],
+    d: Float[np.ndarray, " n"],
+) -> Products:  # fmt: skip
+    """Return the eigenvalues of the open and of the closed loop."""
+    ac, bc, cc, dc = law_state_space(controller.reference, controller.measurement)
+    count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
+    n, m = nx + k, cc.size
+    plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
+    plant[:, :nx, :nx], sense[:, :nx] = a, c
+    through = d
+    if k:
+        plant[:, :nx, n - 1], sense[:, n - 1], drive[:, nx] = b, d, 1.0
+        for i in range(1, k):
+            plant[:, nx + i, nx + i - 1] = 1.0
+        through = np.zeros(count)
+    else:
+        drive = b
+    scale = 1.0 / (1.0 + through * dc[1])
+    closed = np.zeros((count, n + m, n + m))
+    closed[:, :n, :n] = plant - (dc[1] * scale)[:, None, None] * drive[:, :, None] * sense[:, None, :]
+    closed[:, :n, n:] = scale[:, None, None] * drive[:, :, None] * cc
+    closed[:, n:, :n] = -scale[:, None, None] * bc[:, 1, None] * sense[:, None, :]
+    closed[:, n:, n:] = ac - (scale * through)[:, None, None] * np.outer(bc[:, 1], cc)
+    fixed = np.concatenate([np.linalg.eigvals(ac), np.zeros(k)])
+    opened = np.concatenate([np.linalg.eigvals(a), np.broadcast_to(fixed, (count, m + k))], axis=1)
+    return Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
+
+
+def find_peaks(loop: Products) -> tuple[Peak, Peak]:
+    """Return the largest abs(S) and abs(T) of every row, and at which angles they are."""
+    angle, distance = np.abs(np.angle(loop.closed)), np.abs(1.0 - np.abs(loop.closed))
+    own = (angle[:, :, None] + distance[:, :, None] * FAN).reshape(angle.shape[0], -1)
+    base = np.broadcast_to(BASE, (angle.shape[0], BASE.size))
+    theta = np.sort(np.clip(np.concatenate([base, own], axis=1), 0.0, np.pi), axis=1)
+    s = loop.sensitivity(np.exp(1j * theta))
+    return _highest(loop, theta, np.abs(s), False), _highest(loop, theta, np.abs(1.0 - s), True)
+
+
+def _highest(
+    loop: Products, theta: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n m"], complement: bool
+) -> Peak:
+    """Return the largest value of each row and its angle: the highest local maxima of its grid, by Newton's method."""
+    rows = np.arange(theta.shape[0])
+    at = np.argmax(values, axis=1)
+    top, where = values[rows, at], theta[rows, at]
+    inner = values[:, 1:-1]
+    local = np.where((inner >= values[:, :-2]) & (inner >= values[:, 2:]), inner, -np.inf)
+    for _ in range(MAXIMA):
+        at = np.argmax(local, axis=1)
+        worth = np.flatnonzero(local[rows, at] > 0.5 * top)
+        if not worth.size:
+            break
+        # Of a plateau or of doubled points, the neighbours are the same maximum.
+        for near in (at - 1, at, at + 1):
+            local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
+        own, point = loop.rows(worth), at[worth] + 1
+        low, high = _around(theta[worth], point)
+        found, angle = _refined(own, low, theta[worth, point], high, complement)
+        higher = found > top[worth]
+        top[worth[higher]], where[worth[higher]] = found[higher], angle[higher]
+    return top, where
+
+
+def _around(
+    theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the neighbours of a grid point that do not coincide with it."""
+    rows, last = np.arange(point.size), theta.shape[1] - 1
+    here = theta[rows, point]
+    low = np.max(np.where(theta < here[:, None] - 1e-14, theta, 0.0), axis=1)
+    high = np.min(np.where(theta > here[:, None] + 1e-14, theta, np.pi), axis=1)
+    return low, np.where(point < last, high, here)
+
+
+def _refined(
+    loop: Products, low: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"],
+    complement: bool,
+) -> Peak:  # fmt: skip
+    """Return the curve's value at its maximum between `low` and `high`, and the angle."""
+    best, where = np.zeros(x.size), x.copy()
+    live = np.arange(x.size)
+    low, x, high = low.copy(), x.copy(), high.copy()
+    small = 1e-6 * (high - low)
+    for _ in range(NEWTON_STEPS):
+        value, g, slope = _slopes(loop.rows(live), x[live], complement)
+        higher = value > best[live]
+        best[live[higher]], where[live[higher]] = value[higher], x[live[higher]]
+        low[live] = np.where(g > 0.0, x[live], low[live])
+        high[live] = np.where(g > 0.0, high[live], x[live])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = g / (g**2 - slope)  # Newton on the derivative of 1/abs(curve)^2
+        new = x[live] + step
+        inside = (new > low[live]) & (new < high[live])
+        new = np.where(inside, new, 0.5 * (low[live] + high[live]))
+        moving = np.abs(new - x[live]) > small[live]
+        x[live] = new
+        live = live[moving]
+        if not live.size:
+            break
+    return best, where
+
+
+@np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
+def _slopes(
+    loop: Products, x: Float[np.ndarray, " n"], complement: bool
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""
+    z = np.exp(1j * x)[:, None]
+    s, (first, second) = loop.sensitivity(z), loop.logarithmic(z)
+    value, curvature = s, second + first**2
+    if complement:
+        value = 1.0 - s
+        first, curvature = -s * first / value, -s * curvature / value
+    rise = 2.0 * np.real(1j * z * first)[:, 0]
+    bend = -2.0 * np.real(z * first + z**2 * (curvature - first**2))[:, 0]
+    return np.abs(value)[:, 0], np.where(np.isfinite(rise), rise, 1.0), bend

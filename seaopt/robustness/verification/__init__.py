@@ -1,0 +1,1 @@
+"""The exported law on nonlinear plants: scenarios, playback, judgement and environments."""

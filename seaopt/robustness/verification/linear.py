@@ -1,0 +1,101 @@
+r"""What the linear loop says of a scenario's last phase: whether it is stable there, and what force noise makes.
+
+White noise of variance :math:`s_n^2` on the reading and :math:`s_u^2` on the motor force leave
+
+.. math:: \frac{1}{f_N} \int_{f_0}^{f_N} s_n^2 |T|^2 + s_u^2 |P S|^2 \, df
+
+of the force's variance above :math:`f_0`, with :math:`T = LS` and :math:`f_N` half the sample rate. A step :math:`q` of
+a sensor or amplifier counts as white noise of variance :math:`q^2/12`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from seaopt.control.loops.loop import STABLE, Loop
+from seaopt.parameters import ParameterSet
+from seaopt.records import record
+from seaopt.robustness.verification.playback import Stage, loaded
+from seaopt.robustness.verification.scenarios import Scenario
+
+
+@record(eq=False)
+class LinearView:
+    """The linear loop of a scenario's last phase, at rest.
+
+    Parameters
+    ----------
+    loop : Loop
+    noise_N, step_N : float
+        Standard deviations of the white noise that stands for the sensor, and for the rounded current.
+
+    """
+
+    loop: Loop
+    noise_N: float
+    step_N: float
+
+    @property
+    def instability(self) -> str:
+        """The eigenvalue that makes the loop unstable, in words; empty where it is stable."""
+        poles, period = self.loop.eigenvalues(), self.loop.plant.sample_time_s
+        fastest = poles[np.argmax(np.abs(poles))] if poles.size else 0.0
+        radius = abs(fastest)
+        if radius < STABLE:
+            return ""
+        if not math.isfinite(radius):
+            return "unstable: the linear loop has an eigenvalue beyond all numbers"
+        hz = abs(np.angle(fastest)) / (2 * np.pi * period)
+        grows = f", doubling in {math.log(2) * period / math.log(radius):.3g} s" if radius > 1.0 + 1e-12 else ""
+        return f"unstable: the linear loop's spectral radius is {radius:.6g}, at {hz:.4g} Hz{grows}"
+
+    def force_std(self, lowest_hz: float = 0.0) -> float:
+        """Return the standard deviation (N) of the force that noise makes above a frequency; the loop is stable."""
+        f = self.loop.grid()
+        f = np.concatenate([[lowest_hz], f[f > lowest_hz]]) if lowest_hz else f
+        s = self.loop.sensitivity(f)
+        power = self.noise_N**2 * np.abs(1.0 - s) ** 2 + self.step_N**2 * np.abs(self.loop.plant.response(f) * s) ** 2
+        return math.sqrt(float(np.trapezoid(power, f)) / self.loop.plant.nyquist_hz)
+
+
+def linear_view(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> LinearView:
+    """Return the linear loop of a scenario's last phase, with the load and the link as they are then.
+
+    Parameters
+    ----------
+    stage : Stage
+        Controller, plants and devices.
+    scenario : Scenario
+        What is played.
+    drawn : ParameterSet
+        Parameters and conditions of the run.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.robustness.verification.scenarios import default_scenarios
+    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+    >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
+    >>> stage = Stage(controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}))
+    >>> found = linear_view(stage, default_scenarios(controller, stand)[0], thor)
+    >>> found.instability, found.force_std() < 2.0
+    ('', True)
+
+    """
+    controller, last = stage.controller, scenario.phases[-1]
+    plant = stage.partner if last.held and stage.partner is not None else stage.plant
+    params = drawn.with_parameters(*plant.complete(drawn).values())
+    for phase in scenario.phases:
+        params = loaded(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
+    name = controller.spec.measured
+    return LinearView(
+        loop=controller.close(plant, params),
+        noise_N=_spread(stage.sensors.noise_std.get(name, 0.0), stage.sensors.quantisation.get(name, 0.0)),
+        step_N=_spread(0.0, stage.current_step_A / controller.current_per_force_A_per_N),
+    )
+
+
+def _spread(std: float, step: float) -> float:
+    return math.hypot(std, step / math.sqrt(12.0))

@@ -1,0 +1,272 @@
+"""Play a scenario: phase after phase on the sampled loop, several parameter sets at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.bench import Sensors, excite
+from seaopt.control import Controller
+from seaopt.control.laws.realisation import runnable
+from seaopt.control.loops.sampled_plant import conditions_of
+from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop, told
+from seaopt.control.running.equilibrium import Equilibrium, equilibrium
+from seaopt.errors import ControlError
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.impacts import caught, position, released, struck
+from seaopt.plants.linear import point
+from seaopt.records import record
+from seaopt.robustness.verification.scenarios import LINK, Phase, Scenario
+
+Rows = Float[np.ndarray, "runs n"]
+
+
+@record(eq=False)
+class Stage:
+    """What scenarios are played on.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its law runs as exported.
+    plant : Plant
+        With link 2 as it is.
+    partner : Plant or None
+        The same actuator with that link fixed, for phases in which it is held.
+    sensors, current_step_A
+        As in `SampledLoop`.
+
+    """
+
+    controller: Controller
+    plant: Plant
+    partner: Plant | None = None
+    sensors: Sensors = field(default_factory=Sensors)
+    current_step_A: float = 0.0
+
+    def loop(self, held: bool, longest_delay_s: float = 0.0) -> SampledLoop:
+        """Return the loop with the link held or not."""
+        plant = self.partner if held else self.plant
+        if plant is None:
+            raise ControlError(
+                f"a phase holds the link of {self.plant.name}; give partner, the plant with that link fixed"
+            )
+        return SampledLoop(
+            plant=plant,
+            law=runnable(self.controller),
+            measured=self.controller.spec.measured,
+            delay_samples=self.controller.delay_samples,
+            sensors=self.sensors,
+            current_step_A=self.current_step_A,
+            longest_delay_s=longest_delay_s,
+        )
+
+    @property
+    def ideal(self) -> Stage:
+        """The stage with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""
+        return replace(self, sensors=Sensors(saturation=self.sensors.saturation), current_step_A=0.0)
+
+    @property
+    def is_ideal(self) -> bool:
+        """Sensor and amplifier do nothing of their own."""
+        sensors, name = self.sensors, self.controller.spec.measured
+        own = (getattr(sensors, what).get(name, 0.0) for what in ("noise_std", "offset", "quantisation"))
+        return not (self.current_step_A or any(own))
+
+
+@record(eq=False)
+class Contact:
+    """A link that is caught: when (s), the impulse that stops it and the energy (J) it loses, one a run."""
+
+    time_s: float
+    impulse: Float[np.ndarray, " runs"]
+    loss_J: Float[np.ndarray, " runs"]
+
+
+@record(eq=False)
+class Trace:
+    """A scenario as it was played.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds from the start.
+    reference, current : array, shape (runs, n)
+        N and A.
+    outputs : mapping of name to array, shape (runs, n)
+        Of `plant`, and "energy" where it declares it; NaN while the link is held and there is no such output.
+    peaks : mapping of name to array, shape (runs,)
+        Largest magnitudes, between samples too.
+    rest : Equilibrium or None
+        Where runs started; None where the scenario says where.
+    edges : tuple of int
+        First samples of the phases, and one past the last.
+    contacts : tuple of Contact
+    error : float
+        Estimated integration error of the worst sample, relative.
+    substeps : int
+        Integration steps a sample, the most of all phases.
+    wall_s : float
+        Time that the simulation took.
+
+    """
+
+    time: Float[np.ndarray, " n"]
+    reference: Rows
+    current: Rows
+    outputs: Mapping[str, Rows]
+    peaks: Mapping[str, Float[np.ndarray, " runs"]]
+    rest: Equilibrium | None
+    edges: tuple[int, ...]
+    contacts: tuple[Contact, ...]
+    error: float
+    substeps: int
+    wall_s: float
+
+    def __repr__(self) -> str:
+        contacts = f"{len(self.contacts)} contacts; "
+        return told("Trace", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
+
+    @property
+    def last(self) -> slice:
+        """The samples of the last phase."""
+        return slice(self.edges[-2], self.edges[-1])
+
+
+def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Trace:
+    """Play a scenario, once for each set of parameters.
+
+    A run starts at rest: at zero, or where a condition among its parameters (an angle such as phi) puts the plant, with
+    the law and the commands that wait at rest too, and the scenario's forces counted from the one that keeps it there.
+    A scenario with an `initial_state` starts in that, whatever the conditions.
+
+    Parameters
+    ----------
+    stage : Stage
+        Controller, plant and devices.
+    scenario : Scenario
+        What happens.
+    params : sequence of ParameterSet
+        One a run; conditions may be among them: where it rests, and `delay_s`, delay besides the controller's.
+    seed : int
+        Of the sensor noise and of random excitations.
+
+    Raises
+    ------
+    ControlError
+        The scenario cannot be played on this plant, or the plant cannot rest where it is to start.
+    SimulationError
+        The plant cannot be simulated well enough.
+
+    """
+    obstacle = scenario.obstacle(stage.plant, stage.partner)
+    if obstacle is not None:
+        raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
+    if not params:
+        raise ControlError("play got no parameters; give one ParameterSet a run")
+    delays = [[item[DELAY]] if DELAY in item else [] for item in params]
+    longest = max(conditions_of(stage.plant, item).get(DELAY, 0.0) for item in params)
+    values = [stage.plant.complete(item).with_parameters(*d) for item, d in zip(params, delays, strict=True)]
+    rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), params)
+    now, grip = _start(stage, scenario, values, longest) if rest is None else rest.state, None
+    offset = rest.reference[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
+    runs: list[LoopRun] = []
+    contacts: list[Contact] = []
+    begin_s = 0.0
+    for number, phase in enumerate(scenario.phases):
+        values = [loaded(item, phase.scale) for item in values]
+        if phase.held and grip is None:
+            now, grip, contact = _catch(stage, values, now, begin_s)
+            contacts.append(contact)
+        elif grip is not None and not phase.held:
+            now, grip = _let_go(stage, values, grip, now), None
+        if phase.impulse_Ns:
+            blows = [struck(stage.plant, p, x, LINK, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
+            now = LoopState(x=np.stack(blows), z=now.z)
+        loop = stage.loop(phase.held, longest)
+        reference = offset + _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
+        run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
+        now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s
+        runs.append(run)
+    return _joined(stage, runs, rest, tuple(contacts))
+
+
+def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
+    """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
+    plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
+    start = at_rest(loop, len(values), point("state", plant.states, scenario.initial_state))
+    if "q" in plant.states and LINK in plant.outputs:
+        place = list(plant.states).index("q")
+        for row, p in zip(start.x, values, strict=True):
+            row[place] -= position(plant, p, row, LINK)
+    return start
+
+
+def loaded(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
+    """Return the parameters with a load on: their bounds say what is known of them, not what may be carried."""
+    changed: list[Parameter] = []
+    for name, factor in scale.items():
+        value = factor * params[name].value
+        low, high = min(params[name].min, value), max(params[name].max, value)
+        changed.append(replace(params[name], value=value, min=low, max=high))
+    return params.with_parameters(*changed)
+
+
+def _reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    n = max(1, round(phase.duration_s / sample_time_s))
+    if not phase.excitation:
+        return np.full(n, phase.force_N)
+    return phase.force_N + excite(phase.excitation, duration_s=n * sample_time_s, rate_hz=1 / sample_time_s, rng=rng)[1]
+
+
+def _catch(
+    stage: Stage, values: Sequence[ParameterSet], now: LoopState, time_s: float
+) -> tuple[LoopState, list[dict[str, float]], Contact]:
+    """Return the states after the link is caught, where its coordinate stands in each run, and the contact."""
+    plant, held = stage.plant, stage.partner
+    assert held is not None
+    found = [caught(plant, p, row, held) for p, row in zip(values, now.x, strict=True)]
+    (name,) = [n for n, unit in plant.states.items() if n not in held.states and not unit.endswith("/s")]
+    place = list(plant.states).index(name)
+    after = LoopState(x=np.stack([state for state, _, _ in found]), z=now.z)
+    impulse, loss = (np.array([item[k] for item in found]) for k in (1, 2))
+    contact = Contact(time_s=time_s, impulse=impulse, loss_J=loss)
+    return after, [{name: float(row[place])} for row in now.x], contact
+
+
+def _let_go(
+    stage: Stage, values: Sequence[ParameterSet], grip: Sequence[Mapping[str, float]], now: LoopState
+) -> LoopState:
+    held = stage.partner
+    assert held is not None
+    rows = [released(held, row, stage.plant, p, link) for row, p, link in zip(now.x, values, grip, strict=True)]
+    return LoopState(x=np.stack(rows), z=now.z)
+
+
+def _joined(stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]) -> Trace:
+    names = stage.loop(held=False).watched
+    count = runs[0].current.shape[0]
+
+    def column(run: LoopRun, name: str) -> Rows:
+        return run.outputs[name] if name in run.outputs else np.full((count, run.time.size), np.nan)
+
+    return Trace(
+        time=np.concatenate([run.time for run in runs]),
+        reference=np.hstack([run.reference for run in runs]),
+        current=np.hstack([run.current for run in runs]),
+        outputs={name: np.hstack([column(run, name) for run in runs]) for name in names},
+        peaks={
+            name: np.max([run.peaks[name] for run in runs if name in run.peaks], axis=0)
+            for name in names
+        },
+        rest=rest,
+        edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
+        contacts=contacts,
+        error=max(run.error for run in runs),
+        substeps=max(run.substeps for run in runs),
+        wall_s=sum(run.wall_s for run in runs),
+    )  # fmt: skip

@@ -1,0 +1,347 @@
+"""What a controller is put through: phases with a reference, a blow, another payload, a link held or let go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import field
+
+import numpy as np
+
+from seaopt.bench import Chirp, Excitation
+from seaopt.control import Controller
+from seaopt.control.laws.realisation import runnable
+from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.impacts import struck
+from seaopt.records import record
+
+LINK = "x_2"
+PAYLOADS = (("I_p", "m"), ("I_p2", "m2"), ("m_2",), ("J_l",))
+FALL_DEG = 120.0
+LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # blows that are tried
+NOMINAL_FORCE_N = 100.0
+SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
+LONGEST_S = 20.0
+JUDGED_PERIODS = 100.0  # of the bandwidth: after a fifth of settling, eight periods of a tenth of it
+LONGEST_SLOW_S = 200.0
+
+
+@record
+class Phase:
+    """A stretch of a scenario; what happens at its start happens in no time.
+
+    Parameters
+    ----------
+    duration_s : float
+        Seconds.
+    force_N : float
+        Constant part of the reference.
+    excitation : tuple of Chirp, Noise, Multisine
+        Added to it (amplitudes in N).
+    impulse_Ns : float
+        A blow on link 2 (along x_2) at the start.
+    scale : mapping of parameter name to float
+        Factors on the plant's parameters, from here to the end of the scenario; states go on unchanged, so that a
+        payload arrives with the link's speed.
+    held : bool
+        Link 2 is held where it is: the plant's partner without that link takes over.
+
+    """
+
+    duration_s: float
+    force_N: float = 0.0
+    excitation: Excitation = ()
+    impulse_Ns: float = 0.0
+    scale: Mapping[str, float] = field(default_factory=dict[str, float])
+    held: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.duration_s < math.inf:
+            raise ControlError(f"phase: duration_s = {self.duration_s:g} is no time; give a positive number")
+        if self.held and self.impulse_Ns:
+            raise ControlError("phase: a link that is held cannot be struck; strike it in a phase with held = False")
+        for name, factor in self.scale.items():
+            if not factor > 0.0:
+                raise ControlError(f"phase: scale of {name} = {factor:g} is not positive; give a positive factor")
+
+
+@record
+class Scenario:
+    """Phases one after the other, and what must hold. Always: finite, nothing that grows in the last phase.
+
+    Parameters
+    ----------
+    name : str
+    phases : tuple of Phase
+    initial_state : mapping of state name to float
+        Where every run starts, zero where left out; q is then moved so that the spring is relaxed. Without it a run
+        starts at rest where its parameters say (phi), zero if they do not.
+    about_rest : bool
+        Forces are counted from the one that keeps a run where it starts; False: from zero.
+    quiet : bool
+        The last phase ends without an oscillation that sustains itself.
+    final_error : float or None
+        Mean error over the last fifth of the last phase, N, at most.
+    max_force_N, max_angle_rad : float or None
+        Peaks allowed of the measured force and of every angle.
+    passes : mapping of output name to float
+        Values that an output must cross: shows that the scenario did what it says.
+    on : {"any", "held", "free"}
+        Plants that it is for: every one, those without a link that moves (x_1, x_2, an angle), or those with one.
+
+    """
+
+    name: str
+    phases: tuple[Phase, ...]
+    initial_state: Mapping[str, float] = field(default_factory=dict[str, float])
+    about_rest: bool = True
+    quiet: bool = True
+    final_error: float | None = None
+    max_force_N: float | None = None
+    max_angle_rad: float | None = None
+    passes: Mapping[str, float] = field(default_factory=dict[str, float])
+    on: str = "any"
+
+    def __post_init__(self) -> None:
+        if not self.phases:
+            raise ControlError(f'scenario "{self.name}" has no phases; give at least one')
+        if self.on not in ("any", "held", "free"):
+            raise ControlError(f'scenario "{self.name}": on = "{self.on}" is not known; use "any", "held" or "free"')
+
+    @property
+    def size(self) -> str:
+        """How large it is, in short: forces, blows, loads, and where it starts.
+
+        Examples
+        --------
+        >>> Scenario(name="knock", phases=(Phase(duration_s=1.0, force_N=50.0), Phase(duration_s=1.0))).size
+        '50 N'
+
+        """
+        forces = [abs(phase.force_N) for phase in self.phases if phase.force_N]
+        waves = [item.amplitude for phase in self.phases for item in phase.excitation if isinstance(item, Chirp)]
+        blows = [abs(phase.impulse_Ns) for phase in self.phases if phase.impulse_Ns]
+        loads = {n: f for phase in reversed(self.phases) for n, f in phase.scale.items()}
+        parts = [f"{max(found):.4g} {unit}" for found, unit in ((forces + waves, "N"), (blows, "N s")) if found]
+        parts += [f"{factor:.3g} {name}" for name, factor in loads.items()]
+        parts += [f"{name} = {value:.4g}" for name, value in self.initial_state.items()]
+        return ", ".join(parts)
+
+    def obstacle(self, plant: Plant, partner: Plant | None) -> str | None:
+        """Return why the scenario cannot be played on a plant, or None."""
+        free = moves(plant)
+        if (self.on == "held" and free) or (self.on == "free" and not free):
+            return f"it is for plants whose link is {self.on}"
+        if any(phase.held for phase in self.phases) and partner is None:
+            return "there is no plant with the same actuator and its link fixed"
+        for name in (name for phase in self.phases for name in phase.scale):
+            if name not in plant.parameters:
+                return f"the plant has no parameter {name}"
+        if any(phase.impulse_Ns for phase in self.phases) and (LINK not in plant.outputs or plant.energy is None):
+            return f"the plant has no {LINK}, or no energy that tells what a blow does"
+        for name in (*self.initial_state, *self.passes):
+            if name not in plant.states and name not in plant.outputs:
+                return f"the plant has no {name}"
+        return None
+
+
+def moves(plant: Plant) -> bool:
+    """Tell whether a plant has a link that moves: an output x_1, x_2 or an angle."""
+    return any(name in ("x_1", LINK) or unit == "rad" for name, unit in plant.outputs.items())
+
+
+def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]:
+    """Return the scenarios for a plant, sized by the controller's own limits.
+
+    Forces are multiples of two: the step that just reaches the current limit (at its first samples, where the law
+    differentiates), and the force that the limit holds at rest. Without `current_limit_A` nothing saturates: the
+    step is then 100 N, and the scenarios of saturation are left out.
+
+    Parameters
+    ----------
+    controller : Controller
+        It knows its design plant.
+    plant : Plant
+        What it is to be verified on.
+
+    Raises
+    ------
+    ControlError
+        The controller does not know its design plant.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+    >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
+    >>> [item.name for item in default_scenarios(controller, so.plants.high_impedance())]
+    ['small step', 'saturating doublet', 'saturating hold', 'chirp']
+
+    """
+    step, rest = step_limit(controller), controller.force_limit(0.01)
+    band = controller.spec.bandwidth_hz
+    small = 0.5 * step if step is not None else NOMINAL_FORCE_N
+    tail, lasting = _tail(controller, plant), max(0.2, 6.0 / band)
+    found = [_small_step(small, lasting, tail, plant)]
+    if step is not None and rest is not None:
+        found += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
+    found.append(_chirp(controller, small, tail))
+    if LINK in plant.outputs and plant.energy is not None:
+        found.append(_impact(_blow(controller, plant, 2.0 * small), tail))
+    payload = next((names for names in PAYLOADS if all(name in plant.parameters for name in names)), ())
+    if payload and moves(plant):
+        found.append(_payload(payload, small, lasting, tail))
+    found += [_fall(angle, 2.0 * tail) for angle in ("phi", "phi2") if angle in plant.states]
+    found.append(_contact(small, lasting, tail))
+    return tuple(item for item in found if item.obstacle(plant, plant) is None)
+
+
+def left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
+    """Return the names of the default scenarios that need a current limit, where the controller has none."""
+    if controller.spec.current_limit_A is not None:
+        return ()
+    saturating = _doublet(1.0, 1.0, 1.0), _hold(1.0, 1.0, 1.0)
+    return tuple(item.name for item in saturating if item.obstacle(plant, plant) is None)
+
+
+def step_limit(controller: Controller) -> float | None:
+    """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit.
+
+    Raises
+    ------
+    ControlError
+        The controller does not know its design plant.
+
+    """
+    limit = controller.spec.current_limit_A
+    plant, params = _design(controller)
+    if limit is None:
+        return None
+    loop = SampledLoop(
+        plant=plant,
+        law=runnable(controller, current_limit_A=math.inf),
+        measured=controller.spec.measured,
+        delay_samples=controller.delay_samples,
+    )
+    run = run_loop(loop, [params], np.full(_samples(controller, 0.2), NOMINAL_FORCE_N))
+    return NOMINAL_FORCE_N * limit / float(np.max(np.abs(run.current)))
+
+
+def _design(controller: Controller) -> tuple[Plant, ParameterSet]:
+    if controller.design is None:
+        raise ControlError(
+            "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
+        )
+    return controller.design
+
+
+def _samples(controller: Controller, duration_s: float) -> int:
+    return max(2, round(duration_s / controller.sample_time_s))
+
+
+def _blow(controller: Controller, plant: Plant, force: float) -> float:
+    """Return the blow (N s) on link 2 whose peak of the measured force is about `force`; play makes that nonlinear."""
+    params = plant.complete(_design(controller)[1])
+    loop = SampledLoop(
+        plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
+    )
+
+    def peak(blow: float) -> float:
+        state = struck(plant, params, np.zeros(len(plant.states)), LINK, blow)
+        run = run_loop(loop, [params], np.zeros(_samples(controller, 0.1)), start=at_rest(loop, 1, state))
+        return float(run.peaks[controller.spec.measured][0])
+
+    blow, found = LIGHTEST_NS, peak(LIGHTEST_NS)
+    while found < force and blow < HEAVIEST_NS:
+        blow, before = 2.0 * blow, found
+        found = peak(blow)
+        if found >= force:
+            return blow * 2.0 ** (-math.log(found / force) / math.log(found / before))
+    return blow
+
+
+def _tail(controller: Controller, plant: Plant) -> float:
+    """Return how long a last phase lasts: long enough for the loop's slowest swing, and for slow limit cycles."""
+    loop = controller.close(plant, _design(controller)[1])
+    poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
+    swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
+    slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0
+    judged = max(np.clip(SWINGS * slowest, 1.0, LONGEST_S), JUDGED_PERIODS / controller.spec.bandwidth_hz)
+    return float(min(judged, LONGEST_SLOW_S))
+
+
+def _small_step(force: float, lasting: float, tail: float, plant: Plant) -> Scenario:
+    if moves(plant):
+        return Scenario(
+            name="small step",
+            phases=(Phase(duration_s=lasting, force_N=force), Phase(duration_s=tail)),
+        )
+    return Scenario(
+        name="small step",
+        phases=(Phase(duration_s=lasting), Phase(duration_s=tail, force_N=force)),
+        final_error=0.02 * force,
+    )
+
+
+def _doublet(force: float, half: float, tail: float) -> Scenario:
+    phases = (
+        Phase(duration_s=half, force_N=force),
+        Phase(duration_s=half, force_N=-force),
+        Phase(duration_s=tail),
+    )
+    return Scenario(name="saturating doublet", phases=phases)
+
+
+def _hold(rest: float, lasting: float, tail: float) -> Scenario:
+    """Ask for more than the limit holds, then for a quarter: an integrator that has wound up overshoots.
+
+    What the limit holds does not depend on where the plant rests.
+    """
+    phases = (Phase(duration_s=2 * lasting, force_N=1.2 * rest), Phase(duration_s=tail, force_N=0.25 * rest))
+    return Scenario(name="saturating hold", phases=phases, about_rest=False, final_error=0.005 * rest, on="held")
+
+
+def _chirp(controller: Controller, small: float, tail: float) -> Scenario:
+    band = controller.spec.bandwidth_hz
+    limit = controller.force_limit(float(band))
+    sweep = Chirp(amplitude=0.5 * limit if limit is not None else small, f0_hz=band / 5, f1_hz=1.5 * band)
+    return Scenario(name="chirp", phases=(Phase(duration_s=2.0, excitation=(sweep,)), Phase(duration_s=tail)))
+
+
+def _impact(impulse: float, tail: float) -> Scenario:
+    phases = (Phase(duration_s=0.1), Phase(duration_s=tail, impulse_Ns=impulse))
+    return Scenario(name="impact", phases=phases, on="free")
+
+
+def _payload(names: tuple[str, ...], force: float, lasting: float, tail: float) -> Scenario:
+    phases = (
+        Phase(duration_s=lasting, force_N=force),
+        Phase(duration_s=lasting, scale=dict.fromkeys(names, 1.5)),
+        Phase(duration_s=tail, scale=dict.fromkeys(names, 1 / 1.5)),
+    )
+    return Scenario(name="payload", phases=phases, on="free")
+
+
+def _fall(angle: str, lasting: float) -> Scenario:
+    """Let go above the horizontal: the lever arm L_a cos(phi) vanishes at 90 degrees and turns its sign."""
+    return Scenario(
+        name="fall through 90 deg",
+        phases=(Phase(duration_s=lasting),),
+        initial_state={angle: math.radians(FALL_DEG)},
+        passes={angle: math.pi / 2},
+        quiet=False,
+        on="free",
+    )
+
+
+def _contact(force: float, lasting: float, tail: float) -> Scenario:
+    phases = (
+        Phase(duration_s=lasting, force_N=force, held=True),
+        Phase(duration_s=lasting, force_N=force),
+        Phase(duration_s=lasting, force_N=force, held=True),
+        Phase(duration_s=tail),
+    )
+    return Scenario(name="contact", phases=phases, on="free")
