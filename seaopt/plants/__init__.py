@@ -2,10 +2,9 @@
 
 from seaopt.plants.exchange import export_fmu, to_control
 from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
-from seaopt.plants.linear import jacobians, state_space
 from seaopt.plants.modes import Modes, Resonance, modes
 from seaopt.plants.parts import PARTS, wrapped
-from seaopt.plants.plant import Plant
+from seaopt.plants.plant import Plant, jacobians, state_space
 from seaopt.plants.published import thor
 from seaopt.plants.rotary import rotary
 from seaopt.plants.two_link import high_impedance, moving_output, two_link

@@ -32,7 +32,8 @@ from jaxtyping import Float
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import ParameterSet
-from seaopt.plants.plant import Plant
+from seaopt.plants.memo import memo
+from seaopt.plants.plant import Plant, output_function
 
 State = Float[np.ndarray, " n"]
 Held = Float[np.ndarray, " m"]
@@ -199,26 +200,22 @@ def _pairs(plant: Plant) -> tuple[list[int], list[int]]:
     return list(range(0, 2 * count, 2)), list(range(1, 2 * count, 2))
 
 
+@memo
 def _inertia(plant: Plant, output: str) -> Any:
     """Return the CasADi function (x, p) -> (H, d output/dy)."""
-    key = f"inertia {output}"
-    if key not in plant.cache:
-        if output not in plant.outputs:
-            raise PlantError(f'plant {plant.name} has no output "{output}"; {suggestion(output, plant.outputs)}')
-        places, rates = _pairs(plant)
-        position = plant.output[list(plant.outputs).index(output)]
-        if ca.depends_on(position, ca.vertcat(plant.x[rates], plant.u)):
-            raise PlantError(f"output {output} of {plant.name} depends on more than positions; name a position")
-        hessian = ca.hessian(plant.stored_energy(), plant.x)[0]
-        slope = ca.jacobian(position, plant.x[places])
-        results = [ca.densify(hessian[rates, rates]), ca.densify(slope)]
-        plant.cache[key] = ca.Function("inertia", [plant.x, plant.p], results)
-    return plant.cache[key]
+    if output not in plant.outputs:
+        raise PlantError(f'plant {plant.name} has no output "{output}"; {suggestion(output, plant.outputs)}')
+    places, rates = _pairs(plant)
+    position = plant.output[list(plant.outputs).index(output)]
+    if ca.depends_on(position, ca.vertcat(plant.x[rates], plant.u)):
+        raise PlantError(f"output {output} of {plant.name} depends on more than positions; name a position")
+    hessian = ca.hessian(plant.stored_energy(), plant.x)[0]
+    slope = ca.jacobian(position, plant.x[places])
+    results = [ca.densify(hessian[rates, rates]), ca.densify(slope)]
+    return ca.Function("inertia", [plant.x, plant.p], results)
 
 
 def position(plant: Plant, params: ParameterSet, state: State, output: str) -> float:
     """Return an output of a state without inputs."""
-    if "output" not in plant.cache:
-        plant.cache["output"] = ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [plant.output])
-    values = plant.cache["output"](0.0, state, np.zeros(len(plant.inputs)), plant.parameter_values(params))
+    values = output_function(plant)(0.0, state, np.zeros(len(plant.inputs)), plant.parameter_values(params))
     return float(np.array(values).ravel()[list(plant.outputs).index(output)])

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.parameters import ParameterSet
-from seaopt.plants.linear import state_space
-from seaopt.plants.plant import Plant
+from seaopt.plants.plant import Plant, state_space
 from seaopt.records import record
 
 

@@ -15,15 +15,24 @@ from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
+import numpy as np
+from jaxtyping import Float
 
 from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
+Matrices = tuple[
+    Float[np.ndarray, "nx nx"],
+    Float[np.ndarray, "nx nu"],
+    Float[np.ndarray, "ny nx"],
+    Float[np.ndarray, "ny nu"],
+]
 
 
 @record(eq=False)
@@ -92,7 +101,7 @@ class Plant:
     p: Any = field(init=False, repr=False)
     dynamics: Any = field(init=False, repr=False)
     output: Any = field(init=False, repr=False)
-    cache: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
+    memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_names(self)
@@ -194,8 +203,6 @@ class Plant:
         """
         import control  # deferred: it imports matplotlib
 
-        from seaopt.plants.linear import state_space
-
         a, b, c, d = state_space(self, params, x, u)
         return control.ss(
             a,
@@ -219,6 +226,61 @@ class Plant:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+@memo
+def dynamics_function(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p) -> f at t = 0."""
+    dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
+    return ca.Function("dynamics", [plant.x, plant.u, plant.p], [ca.densify(dynamics)])
+
+
+@memo
+def output_function(plant: Plant) -> Any:
+    """Return the CasADi function (t, x, u, p) -> h."""
+    return ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+
+
+@memo
+def jacobians(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p) -> (A, B, C, D) at t = 0."""
+    blocks = [
+        ca.densify(ca.jacobian(expression, variable))
+        for expression in (plant.dynamics, plant.output)
+        for variable in (plant.x, plant.u)
+    ]
+    blocks = [ca.substitute(block, plant.t, 0.0) for block in blocks]
+    return ca.Function("jacobians", [plant.x, plant.u, plant.p], blocks)
+
+
+def state_space(
+    plant: Plant,
+    params: ParameterSet,
+    x: Mapping[str, float] | None = None,
+    u: Mapping[str, float] | None = None,
+) -> Matrices:
+    """Return (A, B, C, D) of a plant at an operating point, as `Plant.linearize` but plain arrays."""
+    at = (fill_vector("state", plant.states, x), fill_vector("input", plant.inputs, u), plant.parameter_values(params))
+    a, b, c, d = (np.array(block) for block in jacobians(plant)(*at))
+    return a, b, c, d
+
+
+def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float] | None) -> Float[np.ndarray, " n"]:
+    """Return the vector of `names` with the given values, zero elsewhere.
+
+    Raises
+    ------
+    PlantError
+        A name is not one of `names`.
+
+    """
+    if values is not None and not isinstance(values, Mapping):
+        raise PlantError(f"{kind}s are given as a {type(values).__name__}; give a mapping of {kind} name to value")
+    known = dict(values or {})
+    for name in known:
+        if name not in names:
+            raise PlantError(f'"{name}" is not a {kind} of this plant; {suggestion(name, names)}')
+    return np.array([float(known.get(name, 0.0)) for name in names])
 
 
 def _in_unit(item: Parameter, unit: str, plant: str) -> Parameter:

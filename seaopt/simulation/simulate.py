@@ -11,7 +11,7 @@ from seaopt.errors import LogError, SimulationError, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.linear import point as vector
+from seaopt.plants.plant import fill_vector
 from seaopt.signals import Signal
 from seaopt.simulation.discretisation import Clock, Hold
 from seaopt.simulation.model import Model, make_model
@@ -110,7 +110,7 @@ def simulate(
     model = make_model(plant, params)
     if len(log.segments) > 1:
         raise LogError(f"{log.source}: has {len(log.segments)} stretches with gaps between; simulate them one by one")
-    x0 = vector("state", plant.states, initial_state)
+    x0 = fill_vector("state", plant.states, initial_state)
     u = input_samples(plant, log)
     clock = Clock(period=log.period, hold=hold, delay_s=delay_s)
     result = _converged(model, Segment(u=u, start_s=float(log.time[0])), x0, clock, rtol)

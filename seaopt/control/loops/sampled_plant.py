@@ -14,7 +14,7 @@ a state of the plant (``phi``)
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -24,6 +24,8 @@ from jaxtyping import Complex, Float, Inexact
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, jacobians
+from seaopt.plants.memo import memo
+from seaopt.plants.plant import dynamics_function
 from seaopt.records import record
 from seaopt.units import factor
 
@@ -224,7 +226,7 @@ def _rest(
     if len(fixed) > 1:
         raise ControlError(f"{', '.join(names[i] for i in fixed)} are both given; a plant rests at one of them")
     for _ in range(NEWTON_STEPS):
-        (rates,) = _mapped(plant, "dynamics", x, u, p)
+        (rates,) = _mapped(plant, dynamics_function, x, u, p)
         a, b, _, _ = _jacobians(plant, x, u, p)
         try:
             step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), rates.T[:, :, None])[..., 0].T
@@ -253,11 +255,11 @@ def linearised_along(
         loose = [i for i in range(len(names)) if i not in fixed]
         for i in fixed:
             dx[i] = dat[names[i]]
-        (drift,) = _mapped(plant, "drift", x, u, p, dp)
+        (drift,) = _mapped(plant, _drift_function, x, u, p, dp)
         moved = drift.T[:, :, None] + a[:, :, fixed] @ dx[fixed].T[:, :, None]
         step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), -moved)[..., 0].T
         dx[loose], du[0] = step[:-1], step[-1]
-    da, db, dc, dd = _blocks(plant, _mapped(plant, "turn", x, u, p, dx, du, dp))
+    da, db, dc, dd = _blocks(plant, _mapped(plant, _turn_function, x, u, p, dx, du, dp))
     return (
         (a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain),
         (da, db[:, :, 0] * gain, dc[:, row], dd[:, row, 0] * gain),
@@ -268,7 +270,7 @@ def _jacobians(
     plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
 ) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return A, B, C and D of k plants."""
-    return _blocks(plant, _mapped(plant, "jacobians", x, u, p))
+    return _blocks(plant, _mapped(plant, jacobians, x, u, p))
 
 
 def _blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:
@@ -280,43 +282,43 @@ def _blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[
     )
 
 
-def _mapped(plant: Plant, what: str, *arguments: Float[np.ndarray, "_ k"]) -> list[Float[np.ndarray, "_ _"]]:
-    """Return a function of `_function` at every column, in blocks that CasADi maps over."""
-    function = jacobians(plant) if what == "jacobians" else _function(plant, what)
+def _mapped(
+    plant: Plant, make: Callable[[Plant], Any], *arguments: Float[np.ndarray, "_ k"]
+) -> list[Float[np.ndarray, "_ _"]]:
+    """Return a plant's CasADi function at every column, in blocks that CasADi maps over."""
     count = arguments[0].shape[1]
     block = 1 if count == 1 else MAPPED
-    key = f"{what} of {block}"
-    if key not in plant.cache:
-        plant.cache[key] = function if block == 1 else function.map(block)
+    function = make(plant) if block == 1 else _block_function(plant, make)
     parts: list[list[Any]] = []
     for start in range(0, count, block):
-        own = [item[:, start : start + block] for item in arguments]
-        width = own[0].shape[1]
-        found = plant.cache[key].call([ca.DM(np.pad(item, ((0, 0), (0, block - width)), "edge")) for item in own])
-        columns = [item.shape[1] // block for item in found]
-        parts.append([np.array(item)[:, : each * width] for item, each in zip(found, columns, strict=True)])
-    return [np.concatenate(items, axis=1) for items in zip(*parts, strict=True)]
+        columns = [values[:, start : start + block] for values in arguments]
+        width = columns[0].shape[1]
+        results = function.call([ca.DM(np.pad(values, ((0, 0), (0, block - width)), "edge")) for values in columns])
+        parts.append([np.array(values)[:, : values.shape[1] // block * width] for values in results])
+    return [np.concatenate(pieces, axis=1) for pieces in zip(*parts, strict=True)]
 
 
-def _function(plant: Plant, what: str) -> Any:
-    """Return a CasADi function, made once a plant.
+@memo
+def _block_function(plant: Plant, make: Callable[[Plant], Any]) -> Any:
+    """Return a plant's CasADi function, mapped over a block of columns."""
+    return make(plant).map(MAPPED)
 
-    dynamics: (x, u, p) to f; drift: f's derivative along dp; turn: that of A, B, C and D along (dx, du, dp).
-    """
-    if what not in plant.cache:
-        given = [plant.x, plant.u, plant.p]
-        x, u, p = (ca.SX.sym("along", item.shape[0]) for item in given)
-        dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
-        if what == "dynamics":
-            found, wanted = given, [dynamics]
-        elif what == "drift":
-            found, wanted = [*given, p], [ca.jtimes(dynamics, plant.p, p)]
-        else:
-            along = ca.vertcat(x, u, p)
-            wanted = [ca.densify(ca.jtimes(item, ca.vertcat(*given), along)) for item in jacobians(plant).call(given)]
-            found = [*given, x, u, p]
-        plant.cache[what] = ca.Function(what, found, wanted)
-    return plant.cache[what]
+
+@memo
+def _drift_function(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p, dp) -> derivative of f along dp."""
+    dp = ca.SX.sym("along", plant.p.shape[0])
+    dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
+    return ca.Function("drift", [plant.x, plant.u, plant.p, dp], [ca.jtimes(dynamics, plant.p, dp)])
+
+
+@memo
+def _turn_function(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p, dx, du, dp) -> derivatives of A, B, C and D along (dx, du, dp)."""
+    at = [plant.x, plant.u, plant.p]
+    along = [ca.SX.sym("along", symbols.shape[0]) for symbols in at]
+    slopes = [ca.densify(ca.jtimes(block, ca.vertcat(*at), ca.vertcat(*along))) for block in jacobians(plant).call(at)]
+    return ca.Function("turn", [*at, *along], slopes)
 
 
 def hold(

@@ -19,6 +19,8 @@ from seaopt.control.loops.sampled_plant import resting
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.memo import memo
 from seaopt.records import record
 
 Runs = Float[np.ndarray, " runs"]
@@ -76,7 +78,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibriu
 
     """
     law, plant = loop.law, loop.plant
-    observe = _observe(loop)
+    observe = _observe(plant)
     names, rows = list(plant.outputs), [resting(plant, item) for item in params]
     found = np.zeros((len(params), 4))
     z = np.zeros((len(params), law.c.size + loop.waiting))
@@ -110,11 +112,9 @@ def _law_at_rest(law: RunnableLaw, force: float, current_A: float) -> tuple[Floa
     return found[:-1], float(found[-1])
 
 
-def _observe(loop: SampledLoop) -> ca.Function:
+@memo
+def _observe(plant: Plant) -> ca.Function:
     """Return the CasADi function (x, u, p) -> outputs, and the energy behind them."""
-    plant, key = loop.plant, "outputs and energy"
-    if key not in plant.cache:
-        energy = plant.stored_energy() if plant.energy is not None else ca.SX(0)
-        both = ca.substitute(ca.densify(ca.vertcat(plant.output, energy)), plant.t, 0.0)
-        plant.cache[key] = ca.Function("observe", [plant.x, plant.u, plant.p], [both])
-    return plant.cache[key]
+    energy = plant.stored_energy() if plant.energy is not None else ca.SX(0)
+    both = ca.substitute(ca.densify(ca.vertcat(plant.output, energy)), plant.t, 0.0)
+    return ca.Function("observe", [plant.x, plant.u, plant.p], [both])

@@ -24,6 +24,8 @@ from seaopt.control.running.sampled_loop import whole_samples
 from seaopt.errors import ControlError, SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.memo import memo
+from seaopt.plants.plant import output_function
 from seaopt.records import record
 
 State = TypeVar("State")
@@ -138,7 +140,7 @@ def close_loop(
     late = _checked(plant, params, measured, delay_samples)
     whole, rest_s = whole_samples(late, sample_time_s)
     newer, n, p = delay_samples + whole, reference.size, ca.DM(plant.parameter_values(params))
-    output, held = _output(plant), _Held(plant=plant, rtol=rtol)
+    output, held = output_function(plant), _Held(plant=plant, rtol=rtol)
     row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
     noise = sensor_std * np.random.default_rng(seed).normal(size=n)
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
@@ -218,25 +220,16 @@ class _Held:
         )
 
 
+@memo
 def _ends(plant: Plant, substeps: int) -> Any:
     """Return the CasADi function (t, x, u, p, T) -> x after T in `substeps` steps and in twice as many."""
-    key = f"held {substeps}"
-    if key not in plant.cache:
-        step = runge_kutta(plant)
-        t, x, u, p, lasting = (ca.MX.sym(name, step.numel_in(i)) for i, name in enumerate("txupT"))
-        ends: list[Any] = []
-        for count in (substeps, 2 * substeps):
-            at, h = x, lasting / count
-            for i in range(count):
-                at = step(t + i * h, at, u, p, h)
-            ends.append(at)
-        whole = ca.Function("held", [t, x, u, p, lasting], ends)
-        plant.cache[key] = whole.expand() if substeps <= EXPANDED else whole
-    return plant.cache[key]
-
-
-def _output(plant: Plant) -> Any:
-    """Return the CasADi function (t, x, u, p) -> y."""
-    if "output" not in plant.cache:
-        plant.cache["output"] = ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [plant.output])
-    return plant.cache["output"]
+    step = runge_kutta(plant)
+    t, x, u, p, lasting = (ca.MX.sym(name, step.numel_in(i)) for i, name in enumerate("txupT"))
+    ends: list[Any] = []
+    for count in (substeps, 2 * substeps):
+        at, h = x, lasting / count
+        for i in range(count):
+            at = step(t + i * h, at, u, p, h)
+        ends.append(at)
+    whole = ca.Function("held", [t, x, u, p, lasting], ends)
+    return whole.expand() if substeps <= EXPANDED else whole

@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.plants import Plant
+from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation.compiled import threads, workers
 from seaopt.simulation.compiler import load_library
@@ -139,21 +140,28 @@ def _advance_function(loop: SampledLoop) -> Any:
     return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
 
 
+@memo
+def _kernels(plant: Plant) -> dict[tuple[object, ...], tuple[Any, Any, Any, dict[tuple[int, int, bool], Any]]]:
+    """Return the functions, library and chains of every structure of loop around a plant, filled by `kernel`."""
+    return {}
+
+
 def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:
     """Return what runs a job: compiled where there is a compiler, CasADi's virtual machine else; once a structure."""
     sensors = loop.sensors
-    key = (
-        f"closed loop {loop.measured} {loop.law.c.size} {loop.waiting} {bool(loop.current_step_A)} "
-        f"{sensors.saturation.get(loop.measured) is None} {bool(sensors.quantisation.get(loop.measured))} "
-        f"{math.isfinite(loop.law.current_limit_A)}"
-    )
-    if key not in loop.plant.cache:
+    structure = (
+        loop.measured, loop.law.c.size, loop.waiting, bool(loop.current_step_A),
+        sensors.saturation.get(loop.measured) is None, bool(sensors.quantisation.get(loop.measured)),
+        math.isfinite(loop.law.current_limit_A),
+    )  # fmt: skip
+    kernels = _kernels(loop.plant)
+    if structure not in kernels:
         sample, advance = _sample_function(loop), _advance_function(loop)
         library = load_library(_source(loop, sample, advance))
         if library is not None:
             library.seaopt_loops.argtypes, library.seaopt_loops.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
-        loop.plant.cache[key] = (sample, advance, library, {})
-    sample, advance, library, chains = loop.plant.cache[key]
+        kernels[structure] = (sample, advance, library, {})
+    sample, advance, library, chains = kernels[structure]
     constants = _constants(loop)
 
     def execute(job: Job, substeps: int) -> Trace:

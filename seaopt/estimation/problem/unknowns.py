@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from seaopt.errors import EstimationError, SeaoptError, suggestion
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants.linear import point
+from seaopt.plants.plant import fill_vector
 from seaopt.records import record
 from seaopt.simulation import Model, depends_on_time, make_model
 from seaopt.units import factor
@@ -252,7 +252,7 @@ def _drifts(builder: _Builder, experiment: Experiment) -> tuple[tuple[Slot, ...]
 def _initial(builder: _Builder, experiment: Experiment, linear: bool, forgotten: bool) -> tuple[tuple[Slot, ...], ...]:
     """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones."""
     plant, given = experiment.plant, experiment.initial_state
-    known = point("state", plant.states, dict(given) if isinstance(given, Mapping) else None)
+    known = fill_vector("state", plant.states, dict(given) if isinstance(given, Mapping) else None)
     starts = {stretch.start for stretch in experiment.stretches}
     found: list[tuple[Slot, ...]] = []
     for number, piece in enumerate(experiment.pieces):

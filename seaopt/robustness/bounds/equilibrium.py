@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import ControlError
 from seaopt.plants import Plant, jacobians
+from seaopt.plants.plant import dynamics_function
 from seaopt.records import record
 from seaopt.robustness.bounds.enclosure import Entry, enclosed, matrix
 from seaopt.robustness.bounds.taylor import Basis, Taylor, basis, constant
@@ -45,13 +45,8 @@ class _Equations:
 
     def rates(self, y: Taylor) -> Taylor:
         """Return what has to be zero, shape (b, n, 1)."""
-        key = "dense dynamics"
-        if key not in self.plant.cache:
-            rates = ca.densify(ca.substitute(self.plant.dynamics, self.plant.t, 0.0))
-            arguments = [self.plant.x, self.plant.u, self.plant.p]
-            self.plant.cache[key] = ca.Function("dynamics", arguments, [rates])
-        found = enclosed(self.plant.cache[key], [*self.at(y), self.p])
-        return matrix(found[0], len(self.x), self.count, self.over)
+        rates = enclosed(dynamics_function(self.plant), [*self.at(y), self.p])
+        return matrix(rates[0], len(self.x), self.count, self.over)
 
     def slopes(self, y: Taylor) -> Taylor:
         """Return its derivatives, shape (b, n, n)."""

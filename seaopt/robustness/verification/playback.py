@@ -18,7 +18,7 @@ from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.impacts import caught, position, released, struck
-from seaopt.plants.linear import point
+from seaopt.plants.plant import fill_vector
 from seaopt.records import record
 from seaopt.robustness.verification.scenarios import LINK, Phase, Scenario
 
@@ -198,7 +198,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
 def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
     """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
     plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
-    start = at_rest(loop, len(values), point("state", plant.states, scenario.initial_state))
+    start = at_rest(loop, len(values), fill_vector("state", plant.states, scenario.initial_state))
     if "q" in plant.states and LINK in plant.outputs:
         place = list(plant.states).index("q")
         for row, p in zip(start.x, values, strict=True):
