@@ -1,6 +1,9 @@
-"""Sampled channels with units."""
+"""Sampled channels with units, and what a table of them as read and a checked log have in common."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -58,3 +61,84 @@ class Signal:
         if self.values.ndim != 1:
             raise LogError(f"channel {self.name} has shape {self.values.shape}; give one value a sample")
         self.values.setflags(write=False)
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """What is read of a log and of a table alike: channels of one clock, their source, and what was done to them."""
+
+    @property
+    def time(self) -> Float[np.ndarray, " n"]:
+        """Seconds."""
+        ...
+
+    @property
+    def signals(self) -> Mapping[str, Signal]:
+        """Channels by name."""
+        ...
+
+    @property
+    def source(self) -> str:
+        """Where the recording came from."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to it, one sentence each."""
+        ...
+
+    def __len__(self) -> int: ...
+
+
+@record(eq=False)
+class Table:
+    """Channels of one clock, as read: time may repeat, run backwards or be missing.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds, as the file has them.
+    signals : mapping of name to Signal
+        Channels of n samples each, in SI where their unit is known.
+    source : str
+        The file, or the files.
+    notes : tuple of str
+        What was done on reading, one sentence each.
+
+    """
+
+    time: Float[np.ndarray, " n"]
+    signals: Mapping[str, Signal]
+    source: str
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return int(self.time.size)
+
+
+def check_distinct(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[str]:
+    """Refuse one column for two channels; say so where they are two quantities, each with a conversion of its own.
+
+    Parameters
+    ----------
+    channels : mapping of channel name to ((file, column), SI unit)
+        A screw's angle (rad) and its nut's place (m) may come of one encoder; two forces do not come of one load cell.
+
+    Raises
+    ------
+    LogError
+        Two channels of one column have the same SI unit.
+
+    """
+    seen: dict[tuple[str, str], dict[str, str]] = {}
+    notes: list[str] = []
+    for name, (place, unit) in channels.items():
+        for other, known in seen.get(place, {}).items():
+            if known == unit:
+                raise LogError(
+                    f'{place[0]}: column "{place[1]}" is given for {other} and for {name}; each channel needs a column '
+                    "of its own: choose another for one of them, or leave it out"
+                )
+            notes.append(f'{other} and {name} are the same column "{place[1]}", in {known or "-"} and in {unit or "-"}')
+        seen.setdefault(place, {})[name] = unit
+    return notes

@@ -1,4 +1,4 @@
-"""Conversion to SI, once, where data comes in (pint), and the unit texts that go out.
+"""Conversion to SI, once, where data comes in (pint), the unit texts that go out, and the units in column headers.
 
 A unit text is what an engineer writes: "N/m", "kg m^2", "mA", "deg", "usec". A space between units multiplies.
 """
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 DIMENSIONLESS = frozenset({"", "-", "1"})
 _SYNONYMS = {"usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC"}
+_HEADER = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 _TOKEN = re.compile(r"[A-Za-zµμΩ°%]+")
 
 
@@ -29,7 +30,7 @@ def _registry() -> pint.UnitRegistry[Any]:
 def _pint_text(unit: str) -> str:
     """Rewrite an engineer's unit text ("kg m^2", "N m s/rad") as one that pint parses."""
     text = unit.strip().replace("·", "*").replace("µ", "u").replace("μ", "u").replace("°", "deg")
-    text = _TOKEN.sub(lambda found: _SYNONYMS.get(found.group(0), found.group(0)), text)
+    text = _TOKEN.sub(lambda token: _SYNONYMS.get(token.group(0), token.group(0)), text)
     return re.sub(r"(?<=[\w)])\s+(?=[A-Za-z(])", "*", text)
 
 
@@ -114,6 +115,15 @@ def si_unit(unit: str) -> str:
     return f"{_registry().Quantity(1.0, parsed).to_base_units().units:~C}".replace("**", "^").replace("*", " ")
 
 
+def is_unit(text: str) -> bool:
+    """Tell whether a text is a known unit."""
+    try:
+        si_unit(text)
+    except UnitError:
+        return False
+    return True
+
+
 def same_dimension(first: str, second: str) -> bool:
     """Tell whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
     return bool(_parse(first).dimensionality == _parse(second).dimensionality)
@@ -129,3 +139,29 @@ def unit_after(unit: str) -> str:
 
     """
     return "" if unit.strip() in DIMENSIONLESS else f" {unit.strip()}"
+
+
+def header_unit(header: str) -> str | None:
+    """Return the unit in a header's brackets, None where there is none.
+
+    Examples
+    --------
+    >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
+    ('N', 'usec', None)
+
+    """
+    match = _HEADER.match(header)
+    return match["unit"].strip() if match else None
+
+
+def bare_name(header: str) -> str:
+    """Return a header without its unit.
+
+    Examples
+    --------
+    >>> bare_name("F1 [N]"), bare_name("cur")
+    ('F1', 'cur')
+
+    """
+    match = _HEADER.match(header)
+    return match["name"].strip() or header if match else header

@@ -34,7 +34,13 @@ def main() -> int:
         from seaopt.errors import SeaoptError
         from seaopt.logs import Column, contents, read_table
 
-        for name in ("json", "layout", "mat", "simulink", "text"):  # otherwise imported later, and not instrumented
+        for name in (
+            "json",
+            "mat",
+            "simulink",
+            "text",
+            "text_layout",
+        ):  # otherwise imported later, and not instrumented
             import_module(f"seaopt.logs.formats.{name}")
     folder = Path(tempfile.mkdtemp(dir=MEMORY if MEMORY.is_dir() else None))
     file = folder / f"log{SUFFIX[given.target]}"

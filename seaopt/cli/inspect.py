@@ -1,4 +1,4 @@
-"""The quality of a log, as the command shows and writes it."""
+"""What `seaopt inspect` does: read a log as it is, print its quality report, write it where asked."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rich.table import Table as Grid
 
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import to_json, write_json
-from seaopt.logs import Column, Counter, Hold, Linear, Quality, quality, read_table
-from seaopt.logs.align import Rule
-from seaopt.logs.quality import CHANNEL_HEAD, channel_row
+from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, read_table
+from seaopt.logs.log.alignment import Rule
+from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
 
-WIDTH = 200  # columns: a narrower terminal wraps the table, and cuts nothing off
+TABLE_WIDTH = 200  # columns: a narrower terminal wraps the table, and cuts nothing off
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
@@ -36,29 +36,30 @@ def inspect_log(
     """
     if folder is not None and folder.exists() and not folder.is_dir():
         raise LogError(f"{folder}: is a file; give a folder for the results with -o")
-    given, known = _pairs("--channel", channels), _pairs("--unit", units)
-    for name in known:
-        if name != "time" and name not in given:
-            raise SeaoptError(f"--unit {name}={known[name]}: name its column too, --channel {name}=COLUMN")
-    if "time" in known and time is None:
-        raise SeaoptError(f"--unit time={known['time']}: name its column too, --time COLUMN")
-    clock = Column(column=time, unit=known.get("time")) if time is not None else None
-    columns = {name: Column(column=column, unit=known.get(name)) for name, column in given.items()}
-    table = read_table(path, time=clock, channels=columns or None, align=_rule(align), counter=_counter(counter))
-    found = quality(table, inputs=list(inputs) or None)
+    headers, unit_of = _parse_pairs("--channel", channels), _parse_pairs("--unit", units)
+    for name in unit_of:
+        if name != "time" and name not in headers:
+            raise SeaoptError(f"--unit {name}={unit_of[name]}: name its column too, --channel {name}=COLUMN")
+    if "time" in unit_of and time is None:
+        raise SeaoptError(f"--unit time={unit_of['time']}: name its column too, --time COLUMN")
+    clock = Column(column=time, unit=unit_of.get("time")) if time is not None else None
+    columns = {name: Column(column=header, unit=unit_of.get(name)) for name, header in headers.items()}
+    rule = _parse_rule(align)
+    table = read_table(path, time=clock, channels=columns or None, align=rule, counter=_parse_counter(counter))
+    quality = assess_quality(table, inputs=list(inputs) or None)
     written: list[Path] = []
     if folder is not None:
         from seaopt.reporting import write_quality_figure
 
-        written = [write_json(folder / "quality.json", found.to_dict())]
-        written += write_quality_figure(table, found, folder / "quality")
+        written = [write_json(folder / "quality.json", quality.to_dict())]
+        written += write_quality_figure(table, quality, folder / "quality")
     if json:
-        sys.stdout.write(to_json(found.to_dict()))
+        sys.stdout.write(to_json(quality.to_dict()))
         return
-    _show(found, written)
+    _print_report(quality, written)
 
 
-def _rule(align: str | None) -> Rule | None:
+def _parse_rule(align: str | None) -> Rule | None:
     if align is None:
         return None
     if align not in RULES:
@@ -66,43 +67,43 @@ def _rule(align: str | None) -> Rule | None:
     return RULES[align]
 
 
-def _counter(given: str | None) -> Counter | None:
-    if given is None:
+def _parse_counter(option: str | None) -> Counter | None:
+    if option is None:
         return None
-    ((column, count),) = _pairs("--counter", [given]).items()
+    ((column, count),) = _parse_pairs("--counter", [option]).items()
     if not count.isdecimal():
-        raise SeaoptError(f'--counter "{given}": "{count}" is not how many samples a count stands for; give 1 or more')
+        raise SeaoptError(f'--counter "{option}": "{count}" is not how many samples a count stands for; give 1 or more')
     return Counter(column=column, samples_per_count=int(count))
 
 
-def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for item in given:
-        name, sign, value = item.partition("=")
-        if not sign or not name.strip() or not value.strip():
-            raise SeaoptError(f'{option} "{item}" is no pair; write {option} NAME=VALUE')
-        if name.strip() in found:
-            raise SeaoptError(f'{option} names "{name.strip()}" twice; keep one')
-        found[name.strip()] = value.strip()
-    return found
+def _parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
+    pairs: dict[str, str] = {}
+    for text in texts:
+        name, sign, value = (part.strip() for part in text.partition("="))
+        if not sign or not name or not value:
+            raise SeaoptError(f'{option} "{text}" is not a valid pair; write {option} NAME=VALUE')
+        if name in pairs:
+            raise SeaoptError(f'{option} names "{name}" twice; keep one')
+        pairs[name] = value
+    return pairs
 
 
-def _show(found: Quality, written: list[Path]) -> None:
+def _print_report(quality: Quality, written: list[Path]) -> None:
     console = Console(soft_wrap=True)
     plain: dict[str, Any] = {"highlight": False, "markup": False}
-    console.print(f"{found.source}: {found.summary}", **plain)
-    for note in found.notes:
+    console.print(f"{quality.source}: {quality.summary}", **plain)
+    for note in quality.notes:
         console.print(note, style="dim", **plain)
     grid = Grid(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
     for number, title in enumerate(CHANNEL_HEAD):
         grid.add_column(title, justify="left" if number < 2 else "right", no_wrap=True)
-    for item in found.channels.values():
-        grid.add_row(*channel_row(item))
-    Console(width=max(console.width, WIDTH)).print(grid)
-    for item in found.findings:
-        console.print(f"{item.severity:<8}", style=STYLES[item.severity], end=" ", **plain)
-        console.print(item.sentence, **plain)
-    if not found.findings:
-        console.print("nothing to remark", **plain)
+    for channel in quality.channels.values():
+        grid.add_row(*format_channel(channel))
+    Console(width=max(console.width, TABLE_WIDTH)).print(grid)
+    for finding in quality.findings:
+        console.print(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ", **plain)
+        console.print(finding.sentence, **plain)
+    if not quality.findings:
+        console.print("No problem found.", **plain)
     if written:
         console.print("wrote " + ", ".join(str(path) for path in written), **plain)

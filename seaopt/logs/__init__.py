@@ -1,17 +1,18 @@
 """Raw files to `Log`, and what is wrong with them."""
 
-from seaopt.logs.align import Hold, Linear, Nearest
-from seaopt.logs.column import Column, header_unit
-from seaopt.logs.concatenate import concatenate
-from seaopt.logs.contents import Contents, contents
-from seaopt.logs.counter import Counter
-from seaopt.logs.findings import Finding
-from seaopt.logs.log import Log
-from seaopt.logs.quality import Quality, quality
-from seaopt.logs.read import read_log, read_table, write_log
-from seaopt.logs.table import Table
+from seaopt.logs.log.alignment import Hold, Linear, Nearest
+from seaopt.logs.log.concatenation import concatenate
+from seaopt.logs.log.log import Log
+from seaopt.logs.quality.findings import Finding
+from seaopt.logs.quality.report import Quality, assess_quality
+from seaopt.logs.reading.column import Column
+from seaopt.logs.reading.counter import Counter
+from seaopt.logs.reading.listing import Contents, contents
+from seaopt.logs.reading.reader import read_log, read_table, write_log
+from seaopt.signals import Table
+from seaopt.units import header_unit
 
 __all__ = [
-    "Column", "Contents", "Counter", "Finding", "Hold", "Linear", "Log", "Nearest", "Quality", "Table", "concatenate",
-    "contents", "header_unit", "quality", "read_log", "read_table", "write_log",
+    "Column", "Contents", "Counter", "Finding", "Hold", "Linear", "Log", "Nearest", "Quality", "Table",
+    "assess_quality", "concatenate", "contents", "header_unit", "read_log", "read_table", "write_log",
 ]  # fmt: skip

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.logs import Log, Quality, Table
-from seaopt.logs.channel import ChannelQuality
-from seaopt.logs.clock import ClockQuality
-from seaopt.logs.faults import Runs
-from seaopt.logs.quality import jitter
+from seaopt.logs.quality.channel import ChannelQuality
+from seaopt.logs.quality.clock import ClockQuality
+from seaopt.logs.quality.faults import RowRanges
+from seaopt.logs.quality.report import describe_jitter
 from seaopt.reporting.figures import envelope, panels
 from seaopt.reporting.report import write_figure
 
@@ -23,35 +23,35 @@ if TYPE_CHECKING:
 
 SIGNAL = "#5b6570"
 GAP, STUCK, CLIPPED, MISSING, WILD, HUM = "#e69f00", "#cc79a7", "#d55e00", "#0072b2", "#009e73", "#d55e00"
-MOST = 200  # marks of a kind in a panel: more are a blur
+MOST_MARKS = 200  # marks of a kind in a panel: more are a blur
 BINS = 600  # of time, each drawn as its least and largest value
-ROW = 1.75  # inches
+PANEL_HEIGHT = 1.75  # inches
 
 
-def quality_figure(data: Log | Table, found: Quality) -> Figure:
+def quality_figure(data: Log | Table, quality: Quality) -> Figure:
     """Draw the steps of time and the excitation on top, then each channel over time and its spectrum.
 
     Parameters
     ----------
     data : Log or Table
         What the report was made of.
-    found : Quality
+    quality : Quality
         The report.
 
     """
-    count = 1 + len(found.channels)
-    figure, axes = panels(count, 2, ROW * count + 0.6)
+    count = 1 + len(quality.channels)
+    figure, axes = panels(count, 2, PANEL_HEIGHT * count + 0.6)
     time = data.time
-    _steps(axes[0, 0], time, found)
-    _excitation(axes[0, 1], found)
-    for (left, right), item in zip(axes[1:], found.channels.values(), strict=True):
-        _in_time(left, time, data.signals[item.name].values, item, found)
-        _in_frequency(right, item, found)
+    _draw_steps(axes[0, 0], time, quality)
+    _draw_excitation(axes[0, 1], quality)
+    for (left, right), channel in zip(axes[1:], quality.channels.values(), strict=True):
+        _draw_in_time(left, time, data.signals[channel.name].values, channel, quality)
+        _draw_in_frequency(right, channel, quality)
     for axis in axes[1:, 0]:
         axis.set_xlim(axes[0, 0].get_xlim())
-    if found.spectra is not None:
+    if quality.spectra is not None:
         for axis in axes[:, 1]:
-            axis.set_xlim(0.8 * found.spectra.frequency_hz[1], 1.1 * found.spectra.frequency_hz[-1])
+            axis.set_xlim(0.8 * quality.spectra.frequency_hz[1], 1.1 * quality.spectra.frequency_hz[-1])
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("frequency [Hz]")
     handles: dict[str, Any] = {}
@@ -65,14 +65,14 @@ def quality_figure(data: Log | Table, found: Quality) -> Figure:
     return figure
 
 
-def write_quality_figure(data: Log | Table, found: Quality, path: Path | str) -> list[Path]:
+def write_quality_figure(data: Log | Table, quality: Quality, path: Path | str) -> list[Path]:
     """Draw a quality report to SVG and PNG.
 
     Parameters
     ----------
     data : Log or Table
         What the report was made of.
-    found : Quality
+    quality : Quality
         The report.
     path : path
         Without suffix; ``.svg`` and ``.png`` are added.
@@ -88,63 +88,67 @@ def write_quality_figure(data: Log | Table, found: Quality, path: Path | str) ->
         The folder cannot be written.
 
     """
-    return write_figure(quality_figure(data, found), path)
+    return write_figure(quality_figure(data, quality), path)
 
 
-def _steps(axis: Axes, time: Float[np.ndarray, " n"], found: Quality) -> None:
+def _draw_steps(axis: Axes, time: Float[np.ndarray, " n"], quality: Quality) -> None:
     """Draw the steps of time against the period, gaps as marks at the top: they would flatten all else."""
-    clock, step = found.clock, np.diff(time)
+    clock, step = quality.clock, np.diff(time)
     step = np.where(np.abs(step) > 3.0 * clock.period, np.nan, step)
-    _band(axis, time[1:], 1e3 * step, clock.gaps - 1)
+    _draw_range(axis, time[1:], 1e3 * step, clock.gaps - 1)
     axis.axhline(1e3 * clock.period, color=MISSING, linewidth=0.8, label="period")
-    _gaps(axis, time, clock)
-    _lines(axis, time, np.concatenate([clock.repeated, clock.backwards]), CLIPPED, "repeated or backwards")
+    _mark_gaps(axis, time, clock)
+    _mark_lines(axis, time, np.concatenate([clock.repeated, clock.backwards]), CLIPPED, "repeated or backwards")
     # A perfect clock is drawn as a line, not as its rounding.
     spread = max(1.2e3 * float(np.nanmax(np.abs(step - clock.period), initial=0.0)), 20.0 * clock.period)
     axis.set_ylim(1e3 * clock.period - spread, 1e3 * clock.period + spread)
     axis.set_ylabel("step [ms]")
-    axis.set_title(f"clock: {jitter(clock)}", fontsize="medium", loc="left")
+    axis.set_title(f"clock: {describe_jitter(clock)}", fontsize="medium", loc="left")
 
 
-def _excitation(axis: Axes, found: Quality) -> None:
-    """Draw how coherent the best output is with each input, band by band, and which bands can be told."""
+def _draw_excitation(axis: Axes, quality: Quality) -> None:
+    """Draw how coherent the best output is with each input, band by band, and the band that identifies a model."""
     axis.set_title("coherence of the best output with the input", fontsize="medium", loc="left")
     axis.set_ylim(0.0, 1.05)
     axis.set_xscale("log")
-    if not found.excitation:
+    if not quality.excitation:
         axis.text(0.5, 0.5, "no input, or too few samples", transform=axis.transAxes, ha="center", va="center")
         return
-    for name, item in found.excitation.items():
-        middle = [float(np.sqrt(band.low_hz * band.high_hz)) for band in item.bands]
-        height = [band.coherence if band.coherence is not None else np.nan for band in item.bands]
+    for name, excitation in quality.excitation.items():
+        middle = [float(np.sqrt(band.low_hz * band.high_hz)) for band in excitation.bands]
+        height = [band.coherence if band.coherence is not None else np.nan for band in excitation.bands]
         axis.plot(middle, height, color=SIGNAL, linewidth=1.2, drawstyle="steps-mid")
-        told = item.told_hz
-        if told is not None:
-            axis.axvspan(*told, color=MISSING, alpha=0.12, linewidth=0.0, label=f"{name}: band that can be told")
+        if excitation.usable_hz is not None:
+            label = f"{name}: band that identifies a model"
+            axis.axvspan(*excitation.usable_hz, color=MISSING, alpha=0.12, linewidth=0.0, label=label)
 
 
-def _in_time(
-    axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], item: ChannelQuality, found: Quality
+def _draw_in_time(
+    axis: Axes,
+    time: Float[np.ndarray, " n"],
+    values: Float[np.ndarray, " n"],
+    channel: ChannelQuality,
+    quality: Quality,
 ) -> None:
-    _band(axis, time, values, found.clock.gaps)
-    _gaps(axis, time, found.clock)
-    _spans(axis, time, item.missing, MISSING, "missing")
-    _spans(axis, time, item.stuck, STUCK, "stuck")
-    for rail in item.rails:
+    _draw_range(axis, time, values, quality.clock.gaps)
+    _mark_gaps(axis, time, quality.clock)
+    _mark_spans(axis, time, channel.missing, MISSING, "missing")
+    _mark_spans(axis, time, channel.stuck, STUCK, "stuck")
+    for rail in channel.rails:
         axis.axhline(rail.value, color=CLIPPED, linewidth=1.0, linestyle="--", label="flat top")
-    rows = item.outliers[:MOST]
+    rows = channel.outliers[:MOST_MARKS]
     if rows.size:
         axis.plot(time[rows], values[rows], "o", color=WILD, markersize=4, fillstyle="none", label="outlier")
-    if item.counter is not None:
-        _lines(axis, time, item.counter.rows, GAP, "lost, by the counter")
-    axis.set_ylabel(f"{item.name} [{item.unit}]" if item.unit else item.name)
+    if channel.counter is not None:
+        _mark_lines(axis, time, channel.counter.rows, GAP, "lost, by the counter")
+    axis.set_ylabel(f"{channel.name} [{channel.unit}]" if channel.unit else channel.name)
 
 
-def _band(
+def _draw_range(
     axis: Axes, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " k"]
 ) -> None:
     """Draw the range of a channel over time, with nothing across a gap."""
-    edges = [0, *(gaps.tolist() if gaps.size <= MOST else []), time.size]
+    edges = [0, *(gaps.tolist() if gaps.size <= MOST_MARKS else []), time.size]
     for first, last in pairwise(edges):
         if last - first < 2:
             continue
@@ -152,33 +156,37 @@ def _band(
         axis.fill_between(at, low, high, color=SIGNAL, linewidth=0.8)
 
 
-def _spans(axis: Axes, time: Float[np.ndarray, " n"], runs: Runs, colour: str, label: str) -> None:
-    for start, stop in zip(time[runs.start[:MOST]].tolist(), time[runs.stop[:MOST] - 1].tolist(), strict=True):
+def _mark_spans(axis: Axes, time: Float[np.ndarray, " n"], runs: RowRanges, colour: str, label: str) -> None:
+    for start, stop in zip(
+        time[runs.start[:MOST_MARKS]].tolist(), time[runs.stop[:MOST_MARKS] - 1].tolist(), strict=True
+    ):
         axis.axvspan(start, stop, color=colour, alpha=0.35, linewidth=1.0, label=label)
 
 
-def _gaps(axis: Axes, time: Float[np.ndarray, " n"], clock: ClockQuality) -> None:
-    _spans(axis, time, Runs(start=clock.gaps - 1, stop=clock.gaps + 1), GAP, "gap")
+def _mark_gaps(axis: Axes, time: Float[np.ndarray, " n"], clock: ClockQuality) -> None:
+    _mark_spans(axis, time, RowRanges(start=clock.gaps - 1, stop=clock.gaps + 1), GAP, "gap")
 
 
-def _lines(axis: Axes, time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], colour: str, label: str) -> None:
-    for at in time[rows[:MOST]].tolist():
+def _mark_lines(
+    axis: Axes, time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], colour: str, label: str
+) -> None:
+    for at in time[rows[:MOST_MARKS]].tolist():
         axis.axvline(at, color=colour, linewidth=1.0, label=label)
 
 
-def _in_frequency(axis: Axes, item: ChannelQuality, found: Quality) -> None:
-    seen = found.spectra
+def _draw_in_frequency(axis: Axes, channel: ChannelQuality, quality: Quality) -> None:
+    spectra = quality.spectra
     axis.set_xscale("log")
     axis.set_yscale("log")
-    unit = item.unit or "1"
+    unit = channel.unit or "1"
     axis.set_ylabel(f"density [{unit}/√Hz]")
-    if seen is None or item.name not in seen.channels:
+    if spectra is None or channel.name not in spectra.channels:
         axis.text(0.5, 0.5, "no spectrum", transform=axis.transAxes, ha="center", va="center")
         return
-    f, n = seen.frequency_hz[1:], 2 * (seen.frequency_hz.size - 1)
-    density = np.sqrt(2.0 * seen.power(item.name)[1:] * seen.period / (0.375 * n))  # Hann's mean square is 3/8
+    f, n = spectra.frequency_hz[1:], 2 * (spectra.frequency_hz.size - 1)
+    density = np.sqrt(2.0 * spectra.power(channel.name)[1:] * spectra.period / (0.375 * n))  # Hann's mean square is 3/8
     top = float(np.max(density))
     axis.plot(f, np.maximum(density, 1e-12 * top), color=SIGNAL, linewidth=0.9)
     axis.set_ylim(max(float(np.min(density)), 1e-6 * top) / 2.0, 3.0 * top)
-    for line in item.hum.lines_hz if item.hum is not None else ():
+    for line in channel.hum.lines_hz if channel.hum is not None else ():
         axis.axvline(line, color=HUM, linewidth=0.8, linestyle=":", label="mains")

@@ -113,7 +113,7 @@ def test_a_counter_opens_the_gap_that_it_shows(inspect, data):
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("bad.csv", {"channels": ["F1"]}, "is no pair"),
+        ("bad.csv", {"channels": ["F1"]}, "NAME=VALUE"),
         ("bad.csv", {"channels": ["F1=F1 [N]", "F1=F2 [N]"]}, "twice"),
         ("bad.csv", {"channels": ["F1=F1 [kN]"]}, 'no column "F1 \\[kN\\]"'),
         ("bad.csv", {"units": ["F1=N"]}, "name its column too"),

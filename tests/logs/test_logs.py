@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import seaopt as so
 from seaopt.errors import LogError, SeaoptError, UnitError
-from seaopt.logs import quality
+from seaopt.logs import assess_quality
 
 CHANNELS = {"I": so.Column(column="cur", unit="mA"), "F1": "F1 [N]"}
 
@@ -154,4 +154,4 @@ def test_one_column_for_an_angle_and_a_length_is_noted(csv):
     log = so.read_log(file, time="t [s]", channels=channels)
     np.testing.assert_allclose(log["q"], 5e-4 * log["theta"])
     assert log.notes == ('theta and q are the same column "enc [rad]", in rad and in m',)
-    assert log.notes[0] in quality(log).notes
+    assert log.notes[0] in assess_quality(log).notes

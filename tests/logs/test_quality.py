@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Multisine, Noise
 from seaopt.errors import LogError
 from seaopt.files import to_json
-from seaopt.logs import Table, quality
+from seaopt.logs import Table, assess_quality
 from seaopt.signals import Signal
 
 GRAVE = ("error", "warning")
@@ -67,7 +67,7 @@ def test_the_clock_s_faults_are_counted(short_log):
     time[1500] = np.nan
     time[3000:] += 0.1  # 40 samples
     time[6000:] += 0.025  # 10 samples
-    found = quality(table(short_log, time))
+    found = assess_quality(table(short_log, time))
     assert found.of("duplicate")[0].count == 1
     assert found.of("duplicate")[0].where_s[0][0] == pytest.approx(time[500])
     assert found.of("backwards")[0].count == 1
@@ -81,7 +81,7 @@ def test_the_clock_s_faults_are_counted(short_log):
 def test_jitter_is_measured(short_log):
     rng = np.random.default_rng(0)
     shaken = short_log.time + 0.0025 * rng.uniform(-0.1, 0.1, len(short_log))
-    found = quality(table(short_log, shaken))
+    found = assess_quality(table(short_log, shaken))
     step = np.diff(shaken)
     assert found.clock.jitter_rms == pytest.approx(np.std(step), rel=1e-3)
     assert found.clock.jitter_max == pytest.approx(np.max(np.abs(step - 0.0025)), rel=1e-2)
@@ -91,7 +91,7 @@ def test_jitter_is_measured(short_log):
 
 @pytest.mark.parametrize("how", [np.round, np.floor])
 def test_rounded_timestamps_are_told_from_jitter(short_log, how):
-    found = quality(table(short_log, how(short_log.time * 1000) / 1000))
+    found = assess_quality(table(short_log, how(short_log.time * 1000) / 1000))
     assert found.clock.rounded_only
     assert found.clock.rounding == pytest.approx(1e-3)
     assert "log.restamp()" in found.of("jitter")[0].sentence
@@ -99,25 +99,25 @@ def test_rounded_timestamps_are_told_from_jitter(short_log, how):
 
 def test_small_jitter_is_no_finding(short_log):
     shaken = short_log.time + 0.0025 * np.random.default_rng(0).uniform(-0.01, 0.01, len(short_log))
-    assert not quality(table(short_log, shaken)).of("jitter")
+    assert not assess_quality(table(short_log, shaken)).of("jitter")
 
 
 def test_missing_samples_are_counted(short_log):
     holed = short_log["F1"].copy()
     holed[100:140] = np.nan
     holed[700] = np.inf
-    finding = quality(table(short_log, F1=holed)).of("missing")[0]
+    finding = assess_quality(table(short_log, F1=holed)).of("missing")[0]
     assert (finding.channel, finding.count) == ("F1", 41)
     assert finding.where_s[0] == (short_log.time[100], short_log.time[139])
 
 
 def test_a_channel_without_numbers_is_an_error(short_log):
-    finding = quality(table(short_log, F1=np.full(len(short_log), np.nan))).of("missing")[0]
+    finding = assess_quality(table(short_log, F1=np.full(len(short_log), np.nan))).of("missing")[0]
     assert finding.severity == "error"
 
 
 def test_a_constant_channel_is_found(short_log):
-    assert quality(table(short_log, F2=np.full(len(short_log), 3.0))).of("constant")[0].channel == "F2"
+    assert assess_quality(table(short_log, F2=np.full(len(short_log), 3.0))).of("constant")[0].channel == "F2"
 
 
 @pytest.mark.parametrize("length", [15, 200])
@@ -127,7 +127,7 @@ def test_a_frozen_sensor_is_stuck(short_log, length, quantum):
     frozen = quantum * np.round(frozen / quantum) if quantum else frozen
     frozen[2000 : 2000 + length] = frozen[2000]
     frozen[-500:] = frozen[-500]
-    finding = quality(table(short_log, F1=frozen)).of("stuck")[0]
+    finding = assess_quality(table(short_log, F1=frozen)).of("stuck")[0]
     assert (finding.channel, finding.count) == ("F1", 500 + length)
     assert finding.where_s[0] == (short_log.time[2000], short_log.time[1999 + length])
 
@@ -137,12 +137,12 @@ def test_rest_and_coarse_encoders_are_not_stuck(short_log):
     for name in values:
         values[name][:1500] = np.random.default_rng(1).normal(0, 1e-3 * np.std(values[name]), 1500)
     values["q"] = 1e-5 * np.round(values["q"] / 1e-5)
-    assert not quality(table(short_log, **values)).of("stuck")
+    assert not assess_quality(table(short_log, **values)).of("stuck")
 
 
 def test_a_held_channel_says_its_own_rate(short_log):
     slow = np.repeat(short_log["F2"][::5], 5)
-    assert quality(table(short_log, F2=slow)).of("held", "F2")[0].count == 5
+    assert assess_quality(table(short_log, F2=slow)).of("held", "F2")[0].count == 5
 
 
 @pytest.mark.parametrize("share", [0.6, 0.75])
@@ -150,7 +150,7 @@ def test_a_held_channel_says_its_own_rate(short_log):
 def test_clipping_is_found_and_measured(short_log, share, sides):
     limit = share * np.max(np.abs(short_log["F1"]))
     clipped = np.clip(short_log["F1"], -limit if sides == "both" else -np.inf, limit)
-    found = quality(table(short_log, F1=clipped))
+    found = assess_quality(table(short_log, F1=clipped))
     assert {rail.side for rail in found.channels["F1"].rails} == ({"low", "high"} if sides == "both" else {"high"})
     assert all(rail.clear for rail in found.channels["F1"].rails)
     assert found.channels["F1"].saturated == np.count_nonzero(np.abs(clipped) == limit)
@@ -162,7 +162,7 @@ def test_clipping_is_found_behind_an_outlier_and_a_converter(short_log):
     limit = 0.7 * np.max(np.abs(short_log["F1"]))
     clipped = 0.25 * np.round(np.clip(short_log["F1"], -limit, limit) / 0.25)
     clipped[1000] = 3 * limit
-    found = quality(table(short_log, F1=clipped)).channels["F1"]
+    found = assess_quality(table(short_log, F1=clipped)).channels["F1"]
     assert [rail.clear for rail in found.rails] == [True, True]
     assert found.outliers.tolist() == [1000]
 
@@ -182,7 +182,7 @@ def test_what_is_no_clipping(kind):
 @pytest.mark.parametrize("step", [0.5, 7.0, 1e-3])
 def test_the_quantisation_step_is_found(short_log, step):
     rounded = step * np.round(short_log["F1"] / step) + 0.3
-    found = quality(table(short_log, F1=rounded))
+    found = assess_quality(table(short_log, F1=rounded))
     assert found.channels["F1"].quantum == pytest.approx(step, rel=1e-6)
     assert found.channels["F2"].quantum == 0.0
 
@@ -190,14 +190,14 @@ def test_the_quantisation_step_is_found(short_log, step):
 def test_outliers_are_found_where_they_are(short_log):
     wild, rows = short_log["F1"].copy(), [800, 1201, 1202, 4000, 7000]
     wild[rows] += np.array([900.0, -1200.0, -1300.0, 1000.0, -900.0])
-    assert quality(table(short_log, F1=wild)).channels["F1"].outliers.tolist() == rows
+    assert assess_quality(table(short_log, F1=wild)).channels["F1"].outliers.tolist() == rows
 
 
 @pytest.mark.parametrize("mains", [50.0, 60.0])
 def test_hum_is_measured(stand_log, mains):
     t = stand_log.time
     hum = 5.0 * np.sin(2 * np.pi * mains * t) + 3.0 * np.sin(2 * np.pi * 3 * mains * t + 1)
-    found = quality(table(stand_log, F1=stand_log["F1"] + hum)).channels
+    found = assess_quality(table(stand_log, F1=stand_log["F1"] + hum)).channels
     assert found["F1"].hum.mains_hz == mains
     assert found["F1"].hum.lines_hz == (mains, 3 * mains)
     assert found["F1"].hum.rms == pytest.approx(np.sqrt((25 + 9) / 2), rel=0.1)
@@ -219,7 +219,7 @@ def test_delays_are_found_to_a_fraction_of_a_sample(delay):
 
 
 def test_a_sign_flip_is_an_error(short_log):
-    found = quality(table(short_log, F2=-short_log["F2"]))
+    found = assess_quality(table(short_log, F2=-short_log["F2"]))
     assert found.of("sign")[0].severity == "error"
     assert "opposite sign" in found.of("sign")[0].sentence
 
@@ -228,13 +228,13 @@ def test_excitation_says_what_it_reaches(stand, thor):
     slow = (Noise(std=2.0, band_hz=8.0),)
     sensors = so.Sensors(noise_std={"F1": 0.5, "F2": 0.5})
     log = so.virtual_log(stand, thor, slow, duration_s=40, rate_hz=400, seed=1, sensors=sensors)
-    told = log.quality.excitation["I"]
-    assert told.told_hz[1] == pytest.approx(8.0, abs=0.45)
-    assert "nothing above 8" in told.sentence
-    assert sum(band.share for band in told.bands) == pytest.approx(1.0)
+    excitation = log.quality.excitation["I"]
+    assert excitation.usable_hz[1] == pytest.approx(8.0, abs=0.45)
+    assert "nothing above 8" in excitation.sentence
+    assert sum(band.share for band in excitation.bands) == pytest.approx(1.0)
     power = np.abs(np.fft.rfft(log["I"])[1:]) ** 2
     f = np.fft.rfftfreq(len(log), 1 / 400)[1:]
-    band = next(band for band in told.bands if band.low_hz < 4.0 < band.high_hz)
+    band = next(band for band in excitation.bands if band.low_hz < 4.0 < band.high_hz)
     share = np.sum(power[(f >= band.low_hz) & (f < band.high_hz)]) / np.sum(power)
     assert band.share == pytest.approx(share, rel=0.25)
 
@@ -250,18 +250,18 @@ def test_a_counter_shows_lost_samples(data):
         rows = np.genfromtxt(data / "formats" / "acqtools" / name, delimiter=",", skip_header=1, max_rows=27)
         return Table(time=1e-6 * rows[:, 0], signals={"msr": Signal(name="msr", values=rows[:, 1].copy())}, source=name)
 
-    lost = quality(read("Wmsr2_loss.csv"))
+    lost = assess_quality(read("Wmsr2_loss.csv"))
     gap = lost.of("gap")[0]
     assert (gap.channel, gap.value, gap.severity) == ("msr", 1.0, "error")
     assert gap.where_s[0][0] == pytest.approx(14 * 40e-6)
-    assert not quality(read("Wex1_noError.csv")).of("gap")
-    assert not quality(read("Wmsr1_ini.csv")).of("gap")
+    assert not assess_quality(read("Wex1_noError.csv")).of("gap")
+    assert not assess_quality(read("Wmsr1_ini.csv")).of("gap")
 
 
 def test_a_swung_pendulum_s_encoder_is_not_stuck(data):
     rows = np.genfromtxt(data / "ak80" / "data_measured.csv", delimiter=",", skip_header=1)
     log = so.Log.from_arrays(time=rows[:, 0], position=rows[:, 1], velocity=rows[:, 2], torque=rows[:, 3])
-    found = quality(log, inputs=["torque"])
+    found = assess_quality(log, inputs=["torque"])
     assert grave(found) == []
     assert found.channels["position"].quantum == pytest.approx(0.0029145, rel=1e-4)
     assert found.clock.rate_hz == pytest.approx(500, rel=1e-3)
@@ -281,7 +281,7 @@ def test_a_two_mass_drive_is_clean_and_its_load_angle_turned_around(data):
 def test_the_report_is_strict_json(short_log):
     broken = short_log["F1"].copy()
     broken[:30] = np.nan
-    found = quality(table(short_log, F1=broken, F2=np.full(len(short_log), np.nan)))
+    found = assess_quality(table(short_log, F1=broken, F2=np.full(len(short_log), np.nan)))
     content = json.loads(to_json(found.to_dict()))
     assert content["schema"] == "seaopt/quality/1"
     assert content["channels"]["F1"]["missing"] == 30
@@ -292,9 +292,9 @@ def test_the_report_is_strict_json(short_log):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda log: quality(log, inputs=["cur"]), "which is no channel"),
-        (lambda log: quality(table(log, np.zeros(len(log)))), "never increases"),
-        (lambda log: quality(so.Log.from_arrays(time=[0.0, 1.0])), "holds no channel"),
+        (lambda log: assess_quality(log, inputs=["cur"]), "which is no channel"),
+        (lambda log: assess_quality(table(log, np.zeros(len(log)))), "never increases"),
+        (lambda log: assess_quality(so.Log.from_arrays(time=[0.0, 1.0])), "holds no channel"),
     ],
 )
 def test_what_cannot_be_judged_is_said(short_log, call, words):
@@ -330,7 +330,7 @@ def test_whatever_the_numbers_a_report_or_a_seaopt_error(seed, pool, steps, n):
         "F2": Signal(name="F2", values=np.repeat(rng.choice(np.array(pool), -(-n // 3)), 3)[:n], unit="N"),
     }
     try:
-        found = quality(Table(time=time, signals=signals, source="any"))
+        found = assess_quality(Table(time=time, signals=signals, source="any"))
     except LogError:
         return
     json.loads(to_json(found.to_dict()))

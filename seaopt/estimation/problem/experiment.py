@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError, suggestion
 from seaopt.logs import Log
-from seaopt.logs.mask import mask_saturated
+from seaopt.logs.log.saturation import mask_saturated
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.records import record

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.column import header_unit
-from seaopt.logs.formats.layout import MAX_LINE, too_long
 from seaopt.logs.formats.source import MAX_PARTS, Field, Source, Window, one_line
+from seaopt.logs.formats.text_layout import MAX_LINE, too_long
+from seaopt.units import header_unit
 
 MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
 DEPTH = 32

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.logs.column import header_unit
 from seaopt.logs.formats.source import Field, Source, Window
+from seaopt.units import header_unit
 
 if TYPE_CHECKING:
     import polars as pl

@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.layout import BLANK, MAX_LINE, Layout, cells, is_number, layout, not_text, too_long
 from seaopt.logs.formats.source import Field, Source, Window, one_line
+from seaopt.logs.formats.text_layout import BLANK, MAX_LINE, Layout, cells, is_number, layout, not_text, too_long
 
 if TYPE_CHECKING:
     import polars as pl

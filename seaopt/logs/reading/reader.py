@@ -12,14 +12,13 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.files import write_text
-from seaopt.logs.align import Rule, check_clock
-from seaopt.logs.column import Column, suspect_wrap
-from seaopt.logs.counter import Counter
 from seaopt.logs.formats import Window, open_source
-from seaopt.logs.log import Log
-from seaopt.logs.select import Channel, Clock, Selection, select
-from seaopt.logs.table import Table
-from seaopt.signals import Origin, Signal
+from seaopt.logs.log.alignment import Rule, check_clock
+from seaopt.logs.log.log import Log
+from seaopt.logs.reading.column import Column, suspect_wrap
+from seaopt.logs.reading.counter import Counter
+from seaopt.logs.reading.selection import Channel, Clock, Selection, select
+from seaopt.signals import Origin, Signal, Table
 from seaopt.units import factor, si_unit
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator, Mapping
 from dataclasses import field, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
+from seaopt.logs.log import decimation, frames, resampling
+from seaopt.logs.log.alignment import Rule
+from seaopt.logs.quality.clock import GAP, JITTER_LIMIT, sample_rate_hz, split_at_gaps
+from seaopt.logs.quality.report import Quality, assess_quality
 from seaopt.records import record
 from seaopt.signals import Signal
 from seaopt.units import factor, si_unit
@@ -20,12 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-    from seaopt.logs.align import Rule
-    from seaopt.logs.quality import Quality
-
-JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
-GAP = 1.5  # periods between two samples that make a gap
-BLOCK = 100_000  # samples that are looked at in one go
+STEPS_PER_BLOCK = 100_000  # steps of time that are checked in one go, so that they stay in the cache
 
 
 @record(eq=False)
@@ -63,8 +61,8 @@ class Log:
         n = self.time.size
         if self.time.ndim != 1 or n < 2:
             raise LogError(f"{self.source}: time has shape {self.time.shape}; a log needs at least 2 samples")
-        if not _rises(self.time):
-            raise LogError(f"{self.source}: {_fault(self.time)}")
+        if not _increases(self.time):
+            raise LogError(f"{self.source}: {_describe_fault(self.time)}")
         for name, signal in self.signals.items():
             if signal.values.size != n:
                 raise LogError(
@@ -72,7 +70,7 @@ class Log:
                     "give arrays of one length"
                 )
         self.time.setflags(write=False)
-        object.__setattr__(self, "period", _period(self.time))
+        object.__setattr__(self, "period", _mean_period(self.time))
 
     @classmethod
     def from_arrays(
@@ -104,13 +102,13 @@ class Log:
             A unit is unknown.
 
         """
-        given = dict(units or {})
-        for name in given:
+        units = dict(units or {})
+        for name in units:
             if name not in channels and name != "time":
                 raise LogError(f'units names "{name}", which is no channel; {suggestion(name, channels)}')
-        signals = {name: _signal(name, values, given.get(name), source) for name, values in channels.items()}
-        clock = _array("time", time, source) * factor(given.get("time", "s"), "s")
-        return cls(time=clock, signals=signals, source=source)
+        signals = {name: _signal(name, values, units.get(name), source) for name, values in channels.items()}
+        seconds = _array("time", time, source) * factor(units.get("time", "s"), "s")
+        return cls(time=seconds, signals=signals, source=source)
 
     def __getitem__(self, name: str) -> Float[np.ndarray, " n"]:
         """Return the samples of a channel."""
@@ -129,7 +127,7 @@ class Log:
     @property
     def rate_hz(self) -> float:
         """Sample rate in Hz: one over the median step of time, to nine digits."""
-        return float(f"{1.0 / self.period:.9g}")
+        return sample_rate_hz(self.period)
 
     @property
     def duration_s(self) -> float:
@@ -149,21 +147,19 @@ class Log:
         Raises
         ------
         LogError
-            Inside a stretch the clock strays by more than 5 % of the period: the log is not uniformly sampled.
+            Inside a stretch a step differs by more than 5 % from the period: the log is not uniformly sampled.
 
         """
-        breaks = np.flatnonzero(np.diff(self.time) > GAP * self.period) + 1
-        edges = [0, *breaks.tolist(), len(self)]
-        pieces = [slice(a, b) for a, b in pairwise(edges) if b - a >= 2]
-        for piece in pieces:
-            worst = float(np.max(np.abs(np.diff(self.time[piece]) - self.period)))
+        stretches = split_at_gaps(self.time, GAP * self.period)
+        for stretch in stretches:
+            worst = float(np.max(np.abs(np.diff(self.time[stretch]) - self.period)))
             if worst > JITTER_LIMIT * self.period:
                 raise LogError(
-                    f"{self.source}: a step of time strays {worst / self.period:.0%} from the period "
-                    f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={self._round_rate:g}), or "
+                    f"{self.source}: a step of time differs by {worst / self.period:.0%} from the period "
+                    f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={1.0 / self.period:.3g}), or "
                     "log.restamp() where only the timestamps are rounded (in a problem file: resample)"
                 )
-        return pieces
+        return stretches
 
     def between(self, start_s: float, stop_s: float) -> Log:
         """Return the samples with start_s <= time - time[0] <= stop_s.
@@ -174,8 +170,8 @@ class Log:
             Fewer than two samples lie there.
 
         """
-        clock = self.time - self.time[0]
-        keep = (clock >= start_s - 1e-9) & (clock <= stop_s + 1e-9)
+        elapsed = self.time - self.time[0]
+        keep = (elapsed >= start_s - 1e-9) & (elapsed <= stop_s + 1e-9)
         if np.count_nonzero(keep) < 2:
             raise LogError(
                 f"{self.source}: slice_s = [{start_s:g}, {stop_s:g}] holds fewer than 2 of its samples; "
@@ -193,38 +189,118 @@ class Log:
 
     @property
     def quality(self) -> Quality:
-        """What is wrong with the data, and what they can tell: see `seaopt.logs.quality`."""
-        from seaopt.logs.quality import quality
-
-        return quality(self)
+        """What is wrong with the data, and what they can tell: see `seaopt.logs.assess_quality`."""
+        return assess_quality(self)
 
     def resample(self, *, rate_hz: float, rule: Rule | None = None, bridge_s: float | None = None) -> Log:
-        """Return the log on a uniform clock: see `seaopt.logs.resample.resample`."""
-        from seaopt.logs.resample import resample
+        """Interpolate the log to a uniform clock.
 
-        return resample(self, rate_hz=rate_hz, rule=rule, bridge_s=bridge_s)
+        Parameters
+        ----------
+        rate_hz : float
+            Of the new clock, which starts at the log's first sample; at least 0.8 of the log's own rate.
+        rule : Linear, Hold or Nearest, optional
+            Linear if left out. A line between samples is a low-pass filter: it takes 0.9 dB at a quarter of the sample
+            rate and 3.9 dB at half.
+        bridge_s : float, optional
+            Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out.
+
+        Returns
+        -------
+        Log
+            With a note of what was done; gaps stay gaps.
+
+        Raises
+        ------
+        LogError
+            The rate is not positive, or so low that interpolation would alias, or no stretch is long enough.
+
+        Examples
+        --------
+        >>> log = Log.from_arrays(time=[0.0, 0.11, 0.2, 0.29, 0.4], F1=[0.0, 1.1, 2.0, 2.9, 4.0])
+        >>> even = log.resample(rate_hz=10)
+        >>> even["F1"].round(9).tolist(), even.notes
+        ([0.0, 1.0, 2.0, 3.0, 4.0], ('resampled from 10 Hz to 10 Hz by Linear(max_gap_s=inf)',))
+
+        """
+        return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, bridge_s=bridge_s))
 
     def restamp(self) -> Log:
-        """Return the log with rounded timestamps made uniform: see `seaopt.logs.resample.restamp`."""
-        from seaopt.logs.resample import restamp
+        """Put a log whose timestamps were rounded on the uniform clock that explains them; samples are not touched.
 
-        return restamp(self)
+        Returns
+        -------
+        Log
+            With a note; each stretch between gaps on a line of its own through its timestamps, at one common period.
+
+        Raises
+        ------
+        LogError
+            Rounding alone does not explain the timestamps: the sampling itself is irregular.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> log = Log.from_arrays(time=np.round(np.arange(400) / 400, 3), F1=np.zeros(400))
+        >>> even = log.restamp()
+        >>> bool(np.max(np.abs(even.time - np.arange(400) / 400)) < 1e-3), len(even.segments)
+        (True, 1)
+
+        """
+        time, note = resampling.restamp(self, self.period)
+        return self.with_values(time, {name: self[name] for name in self.signals}, note)
 
     def decimate(self, factor: int) -> Log:
-        """Return every `factor`-th sample behind an anti-alias filter: see `seaopt.logs.decimate.decimate`."""
-        from seaopt.logs.decimate import decimate
+        """Keep every `factor`-th sample behind an anti-alias filter.
 
-        return decimate(self, factor)
+        Parameters
+        ----------
+        factor : int
+            2 or more; 1 keeps the log. Stretches between gaps are filtered each on its own.
+
+        Returns
+        -------
+        Log
+            With a note that names the pass band and the samples that were cut at the ends: 25 periods of the new clock
+            at each end of each stretch. A short run of missing samples is bridged by a line for the filter, and the
+            output is missing where they carry more than 20 % of its weight. An input that was held is no longer: fit
+            with ``hold="first"``.
+
+        Raises
+        ------
+        LogError
+            The factor is not a whole number, or no stretch is as long as the filter.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> t = np.arange(4000) / 1000
+        >>> slow = Log.from_arrays(time=t, F1=np.sin(2 * np.pi * 10 * t) + np.sin(2 * np.pi * 300 * t)).decimate(5)
+        >>> bool(np.max(np.abs(slow["F1"] - np.sin(2 * np.pi * 10 * slow.time))) < 1e-3), slow.rate_hz
+        (True, 200.0)
+
+        """
+        if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
+            raise LogError(f"{self.source}: factor = {factor!r} is not a whole number; give 2 or more")
+        if factor == 1:
+            return self
+        return self.with_values(*decimation.decimate(self, self.period, self.segments, factor))
 
     def to_arrays(self) -> dict[str, Float[np.ndarray, " n"]]:
         """Return copies of time and channels by name, as `from_arrays` takes them."""
         return {"time": self.time.copy()} | {name: self[name].copy() for name in self.signals}
 
     def to_polars(self) -> pl.DataFrame:
-        """Return a polars frame, units in the column names' brackets: "time [s]", "F1 [N]"."""
-        from seaopt.logs.frames import to_polars
+        """Return a polars frame, units in the column names' brackets: "time [s]", "F1 [N]".
 
-        return to_polars(self)
+        Examples
+        --------
+        >>> log = Log.from_arrays(time=[0.0, 0.1], F1=[1.0, 2.0], units={"F1": "kN"})
+        >>> log.to_polars().columns
+        ['time [s]', 'F1 [N]']
+
+        """
+        return frames.to_polars(self)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a pandas frame with the columns of `to_polars`.
@@ -235,9 +311,7 @@ class Log:
             pandas is not installed.
 
         """
-        from seaopt.logs.frames import to_pandas
-
-        return to_pandas(self)
+        return frames.to_pandas(self)
 
     @classmethod
     def from_frame(
@@ -279,27 +353,21 @@ class Log:
         ([0.0, 0.0025], [0.1, nan], 'A')
 
         """
-        from seaopt.logs.frames import from_frame
-
-        return from_frame(frame, time, channels, units or {}, source)
-
-    @property
-    def _round_rate(self) -> float:
-        """The rate to three digits: what one would resample to."""
-        return float(f"{1.0 / self.period:.3g}")
+        arrays, units, notes = frames.read_frame(frame, time, channels, units or {}, source)
+        return replace(cls.from_arrays(units=units, source=source, **arrays), notes=notes)
 
     def __repr__(self) -> str:
         lines = [f"Log {self.source}: {len(self)} samples, {self.duration_s:.6g} s at {self.rate_hz:.6g} Hz"]
         for name, signal in self.signals.items():
-            good = signal.values[np.isfinite(signal.values)]
-            span = f"{good.min():.4g} to {good.max():.4g}" if good.size else "no finite sample"
-            lost = signal.values.size - good.size
-            lines.append(f"  {name} [{signal.unit or 'SI'}]  {span}" + (f", {lost} missing" if lost else ""))
+            finite = signal.values[np.isfinite(signal.values)]
+            span = f"{finite.min():.4g} to {finite.max():.4g}" if finite.size else "no finite sample"
+            missing = signal.values.size - finite.size
+            lines.append(f"  {name} [{signal.unit or 'SI'}]  {span}" + (f", {missing} missing" if missing else ""))
         lines += [f"  {note}" for note in self.notes]
         count = len(self.gaps)
         if count:
-            shown = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])
-            lines.append(f"  {count} gap{'s' if count > 1 else ''}: {shown}{', ...' if count > 3 else ''}")
+            first = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])
+            lines.append(f"  {count} gap{'s' if count > 1 else ''}: {first}{', ...' if count > 3 else ''}")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -308,17 +376,17 @@ class Log:
 
 def _steps(time: Float[np.ndarray, " n"]) -> Iterator[Float[np.ndarray, " _"]]:
     """Return the steps of time in blocks that stay in the cache, where they are looked at more than once."""
-    for start in range(0, time.size - 1, BLOCK):
-        yield np.diff(time[start : start + BLOCK + 1])
+    for start in range(0, time.size - 1, STEPS_PER_BLOCK):
+        yield np.diff(time[start : start + STEPS_PER_BLOCK + 1])
 
 
-def _rises(time: Float[np.ndarray, " n"]) -> bool:
+def _increases(time: Float[np.ndarray, " n"]) -> bool:
     """Tell whether time is finite and strictly increasing; a time that is not finite has a step that is not."""
     with np.errstate(invalid="ignore", over="ignore"):
         return all(step.min() > 0 and step.max() < np.inf for step in _steps(time))
 
 
-def _fault(time: Float[np.ndarray, " n"]) -> str:
+def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
     """Say where time does not increase, and what to do."""
     if not np.all(np.isfinite(time)):
         row = int(np.flatnonzero(~np.isfinite(time))[0])
@@ -330,13 +398,13 @@ def _fault(time: Float[np.ndarray, " n"]) -> str:
     return f"time {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows"
 
 
-def _period(time: Float[np.ndarray, " n"]) -> float:
+def _mean_period(time: Float[np.ndarray, " n"]) -> float:
     """Return the sample period: the mean step between samples that are not across a gap.
 
     The mean over gap-free steps is insensitive to timestamps rounded to a few digits; the median is not. The median
-    that tells the gaps is over at most `BLOCK` steps; the odd stride meets both of two steps that alternate.
+    that tells the gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that alternate.
     """
-    first = np.arange(0, time.size - 1, (time.size - 2) // BLOCK | 1)
+    first = np.arange(0, time.size - 1, (time.size - 2) // STEPS_PER_BLOCK | 1)
     longest = GAP * float(np.median(time[first + 1] - time[first]))
     total, count = 0.0, 0
     for step in _steps(time):
@@ -352,7 +420,7 @@ def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:
     except (TypeError, ValueError) as error:
         raise LogError(f"{source}: channel {name} is not numeric ({error}); give numbers") from error
     if array.ndim != 1:
-        raise LogError(f"{source}: channel {name} has shape {array.shape}; give one value a sample, shape (n,)")
+        raise LogError(f"{source}: channel {name} has shape {array.shape}; give one value per sample, shape (n,)")
     return array
 
 

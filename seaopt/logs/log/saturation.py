@@ -1,4 +1,4 @@
-"""Saturated samples of a measured output: what the sensor could not follow says nothing of the plant.
+"""Saturated samples of a measured output are masked for a fit: beyond its range the sensor did not follow the plant.
 
 They become missing samples (NaN), which have no weight in a fit, and the log's notes say how many and why.
 """
@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.logs.faults import outliers, quantisation, rails, stillness
-from seaopt.logs.log import Log
+from seaopt.logs.log.log import Log
+from seaopt.logs.quality import faults
 
-TOP = 16  # extreme samples among which equal ones give a rail away
+EXTREME_SAMPLES = 16  # extreme samples among which equal ones give a rail away
 
 
 def mask_saturated(
@@ -50,44 +50,49 @@ def mask_saturated(
         if name in ranges:
             low, high = ranges[name]
             rows = (log[name] <= low) | (log[name] >= high)
-            why = f"at or beyond its declared range of {low:g} to {high:g}"
-            log = _masked(log, name, rows, why, "")
+            reason = f"at or beyond its declared range of {low:g} to {high:g}"
+            log = _mask(log, name, rows, reason, "")
         elif search:
-            rows, why = _flat(log[name])
-            log = _masked(log, name, rows, why, ' (flat tops; mask = "declared" keeps them)')
+            rows, reason = _find_clipped(log[name])
+            log = _mask(log, name, rows, reason, ' (flat tops; mask = "declared" keeps them)')
     return log
 
 
-def _masked(log: Log, name: str, rows: Bool[np.ndarray, " n"], why: str, after: str) -> Log:
+def _mask(log: Log, name: str, rows: Bool[np.ndarray, " n"], reason: str, remedy: str) -> Log:
     count = int(np.count_nonzero(rows))
     if not count:
         return log
     signal = log.signal(name)
     plural = "sample" if count == 1 else "samples"
-    note = f"{name}: {count} {plural} ({100 * count / len(log):.2g} %) {why} {signal.unit}".rstrip() + f" masked{after}"
+    note = (
+        f"{name}: {count} {plural} ({100 * count / len(log):.2g} %) {reason} {signal.unit}".rstrip()
+        + f" masked{remedy}"
+    )
     signals = {**log.signals, name: replace(signal, values=np.where(rows, np.nan, signal.values))}
     return replace(log, signals=signals, notes=(*log.notes, note))
 
 
-def _flat(values: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], str]:
+def _find_clipped(values: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], str]:
     """Return which samples lie at a clear rail, and where the rails are."""
     rows = np.zeros(values.size, dtype=bool)
-    if not _may_be_flat(values):
+    if not _may_be_clipped(values):
         return rows, ""
-    quantum = quantisation(values)
+    quantum = faults.find_quantisation(values)
     tame = values.copy()
-    tame[outliers(values, quantum)] = np.nan
-    found = [rail for rail in rails(tame, quantum, stillness(values)) if rail.clear]
-    for rail in found:
+    tame[faults.find_outliers(values, quantum)] = np.nan
+    rails = [rail for rail in faults.find_rails(tame, quantum, faults.measure_stillness(values)) if rail.clear]
+    for rail in rails:
         for start, stop in zip(rail.runs.start, rail.runs.stop, strict=True):
             rows[start:stop] = True
-    return rows, "clipped at " + " and ".join(f"{rail.value:.5g}" for rail in found)
+    return rows, "clipped at " + " and ".join(f"{rail.value:.5g}" for rail in rails)
 
 
-def _may_be_flat(values: Float[np.ndarray, " n"]) -> bool:
+def _may_be_clipped(values: Float[np.ndarray, " n"]) -> bool:
     """Tell whether some of the largest, or of the least, samples are equal: nearly every log ends here."""
-    good = values[np.isfinite(values)]
-    if good.size <= 2 * TOP:
+    finite = values[np.isfinite(values)]
+    if finite.size <= 2 * EXTREME_SAMPLES:
         return False
-    ordered = np.partition(good, (TOP, good.size - TOP))
-    return any(np.unique(end).size <= TOP - 2 for end in (ordered[:TOP], ordered[-TOP:]))
+    ordered = np.partition(finite, (EXTREME_SAMPLES, finite.size - EXTREME_SAMPLES))
+    return any(
+        np.unique(end).size <= EXTREME_SAMPLES - 2 for end in (ordered[:EXTREME_SAMPLES], ordered[-EXTREME_SAMPLES:])
+    )

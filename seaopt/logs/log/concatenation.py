@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.log import GAP, Log
+from seaopt.logs.log.log import Log
+from seaopt.logs.quality.clock import GAP
 from seaopt.signals import Origin
 
 SAME_RATE = 1e-3  # relative difference of periods that is one clock's
@@ -70,7 +71,7 @@ def concatenate(logs: Sequence[Log], *, gap_s: float | None = None) -> Log:
 def _origin(origins: list[Origin]) -> Origin:
     """Return where an appended channel came from: what differs is listed, in the order of the logs."""
     fields = ("file", "sha256", "column", "conversion")
-    return Origin(**{name: "; ".join(dict.fromkeys(getattr(item, name) for item in origins)) for name in fields})
+    return Origin(**{name: "; ".join(dict.fromkeys(getattr(origin, name) for origin in origins)) for name in fields})
 
 
 def _check_alike(first: Log, log: Log) -> None:

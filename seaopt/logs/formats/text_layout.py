@@ -12,10 +12,9 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from seaopt.errors import LogError, SeaoptError
-from seaopt.logs.column import header_unit
+from seaopt.errors import LogError
 from seaopt.records import record
-from seaopt.units import si_unit
+from seaopt.units import header_unit, is_unit
 
 MAX_LINE = 1 << 20
 HEAD = 2 * MAX_LINE  # bytes in which the data must begin
@@ -249,12 +248,3 @@ def _bare_unit(cell: str) -> str | None:
 def _is_units_row(row: list[str]) -> bool:
     filled = [unit for cell in row if (unit := _bare_unit(cell))]
     return bool(filled) and all(is_unit(unit) for unit in filled)
-
-
-def is_unit(text: str) -> bool:
-    """Tell whether a text is a unit."""
-    try:
-        si_unit(text)
-    except SeaoptError:
-        return False
-    return True

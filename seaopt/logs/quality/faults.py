@@ -1,7 +1,7 @@
 """Faults of one channel, found from its samples alone; rows are counted from 0.
 
-Each detector judges a channel against its own activity: a run of equal samples says nothing of an encoder at rest, and
-much of a load cell whose noise makes every sample differ from the last.
+Each detector judges a channel against its own activity: a run of equal samples is normal for an encoder at rest, and a
+fault of a load cell whose noise makes every sample differ from the last.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.records import record
 
-LOOKED_AT = 50_000  # samples that are enough to see a quantisation step
-BLOCK = 64  # samples over which a channel's stillness is averaged
+LEVEL_SAMPLES = 50_000  # samples that are enough to see a quantisation step
+STILLNESS_BLOCK = 64  # samples over which a channel's stillness is averaged
 FEW_LEVELS = 8  # a channel of so few values is switched, not clipped
 PILE = 6.0  # times more samples at a rail than at each of the levels below it
 OUTLYING = 6.0  # robust standard deviations (Hampel)
 FEW_WINDOWS = 5_000  # that are enough to see what distances are usual
 STICKS_OUT = 0.8  # of its distance: how far an outlier lies beyond the second of its neighbours
-HALF = 5  # samples each side of an outlier that it is compared with
+NEIGHBOURS = 5  # samples each side of an outlier that it is compared with
 HOLDS = 0.4  # share of still samples from which a channel may be one that is held
 REGULAR = 0.8  # share of a counter's, or a held channel's, steps that must be alike
-SCARCE = 16  # samples below which nothing is judged
+FEWEST_SAMPLES = 16  # samples below which nothing is judged
 
 
 @record(eq=False)
-class Runs:
-    """Rows from `start` up to, and not including, `stop`, one pair a run."""
+class RowRanges:
+    """Rows from `start` up to, and not including, `stop`, one pair per run."""
 
     start: Int[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, dtype=int))
     stop: Int[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, dtype=int))
@@ -46,9 +46,9 @@ class Runs:
         """Samples in all runs."""
         return int(np.sum(self.lengths))
 
-    def where(self, chosen: Bool[np.ndarray, " k"]) -> Runs:
+    def where(self, chosen: Bool[np.ndarray, " k"]) -> RowRanges:
         """Return the chosen runs."""
-        return Runs(start=self.start[chosen], stop=self.stop[chosen])
+        return RowRanges(start=self.start[chosen], stop=self.stop[chosen])
 
 
 @record(eq=False)
@@ -60,12 +60,12 @@ class Rail:
 
     side: str
     value: float
-    runs: Runs
+    runs: RowRanges
     clear: bool
 
 
 @record(eq=False)
-class Skips:
+class CounterLosses:
     """A channel that counts: each value held `held` samples, `lost` samples skipped ahead of each of `rows`."""
 
     held: int
@@ -73,47 +73,47 @@ class Skips:
     lost: Int[np.ndarray, " k"]
 
 
-def runs_of(mask: Bool[np.ndarray, " n"]) -> Runs:
+def find_runs(mask: Bool[np.ndarray, " n"]) -> RowRanges:
     """Return the runs of True.
 
     Examples
     --------
-    >>> runs_of(np.array([True, True, False, True])).stop.tolist()
+    >>> find_runs(np.array([True, True, False, True])).stop.tolist()
     [2, 4]
 
     """
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
-    return Runs(start=edges[::2], stop=edges[1::2])
+    return RowRanges(start=edges[::2], stop=edges[1::2])
 
 
-def repeats(values: Float[np.ndarray, " n"]) -> Runs:
+def find_repeats(values: Float[np.ndarray, " n"]) -> RowRanges:
     """Return the runs of two or more equal samples."""
-    found = runs_of(values[1:] == values[:-1])
-    return Runs(start=found.start, stop=found.stop + 1)
+    runs = find_runs(values[1:] == values[:-1])
+    return RowRanges(start=runs.start, stop=runs.stop + 1)
 
 
-def stillness(values: Float[np.ndarray, " n"]) -> float:
+def measure_stillness(values: Float[np.ndarray, " n"]) -> float:
     """Return the share of samples equal to the last, in the median block of 64: what is usual for the channel."""
     same = values[1:] == values[:-1]
-    blocks = same.size // BLOCK
+    blocks = same.size // STILLNESS_BLOCK
     if not blocks:
         return float(np.mean(same))
-    return float(np.median(np.mean(same[: blocks * BLOCK].reshape(blocks, BLOCK), axis=1)))
+    return float(np.median(np.mean(same[: blocks * STILLNESS_BLOCK].reshape(blocks, STILLNESS_BLOCK), axis=1)))
 
 
-def quantisation(values: Float[np.ndarray, " n"]) -> float:
+def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
     """Return the step whose multiples the samples are; 0 where there is none.
 
     Examples
     --------
     >>> x = np.sin(np.arange(1000.0))
-    >>> float(round(quantisation(0.01 * np.round(x / 0.01)), 12)), quantisation(x)
+    >>> float(round(find_quantisation(0.01 * np.round(x / 0.01)), 12)), find_quantisation(x)
     (0.01, 0.0)
 
     """
-    stride = max(1, values.size // LOOKED_AT)
+    stride = max(1, values.size // LEVEL_SAMPLES)
     kinds = np.unique(values[::stride][np.isfinite(values[::stride])])
-    if kinds.size < 3 or values.size < SCARCE:
+    if kinds.size < 3 or values.size < FEWEST_SAMPLES:
         return 0.0
     apart = np.diff(kinds)
     apart = apart[apart > 1e-9 * float(kinds[-1] - kinds[0])]
@@ -127,14 +127,14 @@ def quantisation(values: Float[np.ndarray, " n"]) -> float:
     return 0.0
 
 
-def outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.ndarray, " k"]:
+def find_outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.ndarray, " k"]:
     """Return the rows of samples that stand out from their neighbours (Hampel's test).
 
     A sample stands out that lies beyond six robust standard deviations from the median of the five samples on each
     side: both of those ten, and of what is usual for such distances over the whole channel. One of the ten may be an
     outlier too. Pearson et al., Generalized Hampel filters, EURASIP J. Adv. Signal Process. 2016:87.
     """
-    if values.size < SCARCE:
+    if values.size < FEWEST_SAMPLES:
         return np.zeros(0, dtype=int)
     some = np.arange(0, values.size, max(1, values.size // FEW_WINDOWS))
     usual = _distances(values, some)[1]
@@ -146,37 +146,37 @@ def outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.ndarray,
     near[:-2] |= bent
     near[2:] |= bent
     rows = np.flatnonzero(near)
-    found: list[Int[np.ndarray, " _"]] = []
-    for part in np.array_split(rows, max(1, -(-rows.size // LOOKED_AT))):  # in the memory of a part
+    standing_out: list[Int[np.ndarray, " _"]] = []
+    for part in np.array_split(rows, max(1, -(-rows.size // LEVEL_SAMPLES))):  # in the memory of a part
         kept, off, spread, beyond = _distances(values, part)
-        found.append(kept[(off > np.maximum(OUTLYING * spread, floor)) & (beyond > STICKS_OUT * off)])
-    return np.concatenate(found)
+        standing_out.append(kept[(off > np.maximum(OUTLYING * spread, floor)) & (beyond > STICKS_OUT * off)])
+    return np.concatenate(standing_out)
 
 
 def _distances(
     values: Float[np.ndarray, " n"], rows: Int[np.ndarray, " m"]
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return rows whose window is whole, their distance from its median, its spread, and how far they stick out."""
-    offsets = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)])
-    rows = rows[(rows >= HALF) & (rows < values.size - HALF)]
+    offsets = np.concatenate([np.arange(-NEIGHBOURS, 0), np.arange(1, NEIGHBOURS + 1)])
+    rows = rows[(rows >= NEIGHBOURS) & (rows < values.size - NEIGHBOURS)]
     window = values[rows[:, None] + offsets]
     whole = np.all(np.isfinite(window), axis=1) & np.isfinite(values[rows])
     window, at = np.sort(window[whole], axis=1), values[rows[whole]]
-    middle = 0.5 * (window[:, HALF - 1] + window[:, HALF])
+    middle = 0.5 * (window[:, NEIGHBOURS - 1] + window[:, NEIGHBOURS])
     spread = 1.4826 * np.median(np.abs(window - middle[:, None]), axis=1)
     # A peak of a fast signal is far from the median, but not from the second of its neighbours.
     beyond = np.maximum(at - window[:, -2], window[:, 1] - at)
     return rows[whole], np.abs(at - middle), spread, beyond
 
 
-def rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list[Rail]:
+def find_rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list[Rail]:
     """Return the flat tops and bottoms: equal samples piled up at the largest or the least value."""
-    repeated = held(values) if still >= HOLDS else 1
-    stride = max(1, values.size // LOOKED_AT)
+    repeated = count_repeats(values) if still >= HOLDS else 1
+    stride = max(1, values.size // LEVEL_SAMPLES)
     finite = values[::stride][np.isfinite(values[::stride])]
-    if values.size < SCARCE or np.unique(finite).size <= FEW_LEVELS:
+    if values.size < FEWEST_SAMPLES or np.unique(finite).size <= FEW_LEVELS:
         return []
-    found: list[Rail] = []
+    flat_edges: list[Rail] = []
     low, high = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))
     level = quantum if quantum else 1e-3 * (high - low)
     alike = max(0.01 * quantum, 1e-12 * (high - low))
@@ -185,16 +185,16 @@ def rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list
         near = values >= high - 4.5 * level if side == "high" else values <= low + 4.5 * level
         count = int(np.count_nonzero(at))
         below = (np.count_nonzero(near) - count) / 4.0
-        runs = runs_of(at)
+        runs = find_runs(at)
         # A run at either end may be rest, and single samples the peaks of a periodic signal.
         flat = runs.where((runs.start > 0) & (runs.stop < values.size) & (runs.lengths > repeated))
         if count >= 3 * repeated and count >= PILE * max(below, 0.5) and len(flat):
             clear = len(flat) >= 3 and (still < 0.5 or repeated > 1)
-            found.append(Rail(side=side, value=edge, runs=runs, clear=clear))
-    return found
+            flat_edges.append(Rail(side=side, value=edge, runs=runs, clear=clear))
+    return flat_edges
 
 
-def stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> Runs:
+def find_stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> RowRanges:
     """Return the runs of equal samples that the channel's usual stillness does not explain.
 
     With a share p of still steps, L equal samples in a row have a probability of about n p^(L-1): the limit is where
@@ -202,10 +202,10 @@ def stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> Runs
     by one quantisation step; a run that ends in a larger jump, or with the log and twice as long as any rest, is none.
     """
     n = values.size
-    if n < SCARCE or still > 0.98:
-        return Runs()
+    if n < FEWEST_SAMPLES or still > 0.98:
+        return RowRanges()
     shortest = 1.0 + np.log(1e3 * n) / -np.log(max(still, 0.1))
-    runs = repeats(values)
+    runs = find_repeats(values)
     ends = runs.stop == n
     last = np.minimum(runs.stop, n - 1)
     rests = ~ends & (np.abs(values[last] - values[last - 1]) <= 1.5 * quantum)
@@ -217,12 +217,12 @@ def stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> Runs
     return runs.where(long & ~rests & (~ends | (runs.lengths > 2 * longest)))
 
 
-def held(values: Float[np.ndarray, " n"]) -> int:
+def count_repeats(values: Float[np.ndarray, " n"]) -> int:
     """Return how many samples each value is repeated, regularly; 1 where it is not.
 
     Examples
     --------
-    >>> held(np.repeat(np.sin(np.arange(50.0)), 4))
+    >>> count_repeats(np.repeat(np.sin(np.arange(50.0)), 4))
     4
 
     """
@@ -234,19 +234,19 @@ def held(values: Float[np.ndarray, " n"]) -> int:
     return usual if np.mean(spacing == usual) >= REGULAR else 1
 
 
-def counter(values: Float[np.ndarray, " n"]) -> Skips | None:
+def find_counter_losses(values: Float[np.ndarray, " n"]) -> CounterLosses | None:
     """Return the samples that a counter shows to be missing; None where the channel is no counter.
 
     A counter goes up by one, at regular intervals, and may wrap.
 
     Examples
     --------
-    >>> found = counter(np.delete(np.repeat(np.arange(20.0), 2), 15))
-    >>> found.held, found.rows.tolist(), found.lost.tolist()
+    >>> losses = find_counter_losses(np.delete(np.repeat(np.arange(20.0), 2), 15))
+    >>> losses.held, losses.rows.tolist(), losses.lost.tolist()
     (2, [15], [1])
 
     """
-    if values.size < SCARCE or np.any(values[:BLOCK] != np.round(values[:BLOCK])):
+    if values.size < FEWEST_SAMPLES or np.any(values[:STILLNESS_BLOCK] != np.round(values[:STILLNESS_BLOCK])):
         return None  # NaN is not equal to itself
     if np.any(values != np.round(values)) or np.any(np.isinf(values)):
         return None
@@ -268,4 +268,4 @@ def counter(values: Float[np.ndarray, " n"]) -> Skips | None:
     # A value that was held too briefly lost samples; so did every value that was passed over.
     lost = np.maximum(usual - spacing, 0) + ((turned[1:] - 1.0) * usual).astype(int)
     short = lost > 0
-    return Skips(held=usual, rows=changes[1:][short], lost=lost[short])
+    return CounterLosses(held=usual, rows=changes[1:][short], lost=lost[short])

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
-from seaopt.logs.column import bare_name, header_unit
-from seaopt.logs.log import Log
-from seaopt.logs.select import check_apart
-from seaopt.units import si_unit
+from seaopt.signals import Recording, check_distinct
+from seaopt.units import bare_name, header_unit, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
 
-def headed(log: Log) -> dict[str, Float[np.ndarray, " n"]]:
+def add_headers(log: Recording) -> dict[str, Float[np.ndarray, " n"]]:
     """Return time and channels under headers that carry the unit: "time [s]", "F1 [N]"."""
     columns = {"time [s]": log.time}
     for name, signal in log.signals.items():
@@ -29,22 +26,14 @@ def headed(log: Log) -> dict[str, Float[np.ndarray, " n"]]:
     return columns
 
 
-def to_polars(log: Log) -> pl.DataFrame:
-    """Return a polars frame of a log.
-
-    Examples
-    --------
-    >>> log = Log.from_arrays(time=[0.0, 0.1], F1=[1.0, 2.0], units={"F1": "kN"})
-    >>> to_polars(log).columns
-    ['time [s]', 'F1 [N]']
-
-    """
+def to_polars(log: Recording) -> pl.DataFrame:
+    """Return a polars frame of a log: see `Log.to_polars`."""
     import polars as pl
 
-    return pl.DataFrame(headed(log))
+    return pl.DataFrame(add_headers(log))
 
 
-def to_pandas(log: Log) -> pd.DataFrame:
+def to_pandas(log: Recording) -> pd.DataFrame:
     """Return a pandas frame of a log.
 
     Raises
@@ -57,30 +46,43 @@ def to_pandas(log: Log) -> pd.DataFrame:
         pandas = importlib.import_module("pandas")
     except ImportError as error:
         raise LogError("pandas is not installed; run: pip install pandas, or use to_polars()") from error
-    return pandas.DataFrame({name: values.copy() for name, values in headed(log).items()})
+    return pandas.DataFrame({name: values.copy() for name, values in add_headers(log).items()})
 
 
-def from_frame(frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str) -> Log:
-    """Build a log from a frame: see `Log.from_frame`."""
+def read_frame(
+    frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str
+) -> tuple[dict[str, Float[np.ndarray, " n"]], dict[str, str], tuple[str, ...]]:
+    """Return arrays and units by name, time among them, and notes: what `Log.from_frame` makes a log of.
+
+    Raises
+    ------
+    LogError
+        There is no frame, or a column is missing, not numeric, or given for two channels of one unit.
+
+    """
     columns = [str(name) for name in getattr(frame, "columns", ())]
     if not columns:
         raise LogError(f"{type(frame).__name__} is no frame with columns; give a polars or pandas DataFrame")
-    if channels is None:
-        bare = [bare_name(column) for column in columns]
-        clear = [bare.count(name) == 1 and name != "time" for name in bare]
-        pairs = [(name if alone else full, full) for name, full, alone in zip(bare, columns, clear, strict=True)]
-        channels = {name: column for name, column in pairs if column != time}
+    channels = _all_channels(columns, time) if channels is None else channels
     if "time" in channels:
         raise LogError(f'{source}: a channel is named "time"; rename it, time is the clock')
-    wanted = {"time": time} | dict(channels)
-    for name, column in wanted.items():
+    chosen = {"time": time} | dict(channels)
+    for name, column in chosen.items():
         if column not in columns:
             raise LogError(f'{source}: no column "{column}" for {name}; {suggestion(column, columns)}')
-    brackets = {name: header_unit(column) for name, column in wanted.items()}
-    given = {name: unit for name, unit in brackets.items() if unit is not None} | dict(units)
-    notes = check_apart({name: ((source, column), si_unit(given.get(name, ""))) for name, column in channels.items()})
-    arrays = {name: _column(frame, column, source) for name, column in wanted.items()}
-    return replace(Log.from_arrays(units=given, source=source, **arrays), notes=tuple(notes))
+    units = {name: unit for name, column in chosen.items() if (unit := header_unit(column)) is not None} | dict(units)
+    notes = check_distinct(
+        {name: ((source, column), si_unit(units.get(name, ""))) for name, column in channels.items()}
+    )
+    return {name: _column(frame, column, source) for name, column in chosen.items()}, units, tuple(notes)
+
+
+def _all_channels(columns: list[str], time: str) -> dict[str, str]:
+    """Return every column but time under its name without the brackets, or with them where two would be alike."""
+    bare = [bare_name(column) for column in columns]
+    clear = [bare.count(name) == 1 and name != "time" for name in bare]
+    named = zip(bare, columns, clear, strict=True)
+    return {name if alone else column: column for name, column, alone in named if column != time}
 
 
 def _column(frame: Any, column: str, source: str) -> Float[np.ndarray, " n"]:

@@ -8,15 +8,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
-from seaopt.logs.log import GAP
 from seaopt.records import record
 
-LOOKED_AT = 200_000  # steps that are enough to see the rounding of timestamps
+GAP = 1.5  # periods between two samples that make a gap
+JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
+ROUNDING_STEPS = 200_000  # steps of time that are enough to see the rounding of timestamps
 
 
 @record(eq=False)
 class ClockQuality:
-    """What the timestamps say; rows are counted from 0.
+    """Rate, jitter, gaps and faults of a log's timestamps; rows are counted from 0.
 
     Parameters
     ----------
@@ -51,11 +52,16 @@ class ClockQuality:
     @property
     def rate_hz(self) -> float:
         """Sample rate in Hz."""
-        return float(f"{1.0 / self.period:.9g}")
+        return sample_rate_hz(self.period)
 
 
-def clock_of(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
-    """Return what the timestamps of a log or table say.
+def sample_rate_hz(period: float) -> float:
+    """Return the sample rate of a period in s, to nine digits."""
+    return float(f"{1.0 / period:.9g}")
+
+
+def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
+    """Return rate, jitter, gaps and faults of the timestamps of a log or table.
 
     Raises
     ------
@@ -64,7 +70,7 @@ def clock_of(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
 
     Examples
     --------
-    >>> clock = clock_of(np.array([0.0, 0.1, 0.2, 0.5, 0.6]), "log")
+    >>> clock = assess_clock(np.array([0.0, 0.1, 0.2, 0.5, 0.6]), "log")
     >>> clock.rate_hz, clock.gaps.tolist(), clock.lost.tolist()
     (10.0, [3], [2])
 
@@ -78,15 +84,15 @@ def clock_of(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     period = float(np.mean(onward[onward <= GAP * np.median(onward)]))
     across = step > GAP * period
     inside = step[(step > 0.0) & ~across]
-    strays = inside - period
-    rounding = resolution(stamps)
+    deviations = inside - period
+    rounding = timestamp_resolution(stamps)
     return ClockQuality(
         samples=time.size,
         period=period,
-        jitter_rms=float(np.sqrt(np.mean(strays**2))),
-        jitter_max=float(np.max(np.abs(strays))),
+        jitter_rms=float(np.sqrt(np.mean(deviations**2))),
+        jitter_max=float(np.max(np.abs(deviations))),
         rounding=rounding,
-        rounded_only=rounding > 0.0 and _explained(stamps, step, across, rounding, period),
+        rounded_only=rounding > 0.0 and _rounding_explains(stamps, step, across, rounding, period),
         not_numbers=np.flatnonzero(~np.isfinite(time)),
         backwards=finite[1:][step < 0.0],
         repeated=finite[1:][step == 0.0],
@@ -95,18 +101,24 @@ def clock_of(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     )
 
 
-def resolution(time: Float[np.ndarray, " n"]) -> float:
+def split_at_gaps(time: Float[np.ndarray, " n"], longest_step: float) -> list[slice]:
+    """Return the rows of the stretches without a longer step, of two samples or more each."""
+    breaks = np.flatnonzero(np.diff(time) > longest_step) + 1
+    return [slice(first, last) for first, last in pairwise([0, *breaks.tolist(), time.size]) if last - first >= 2]
+
+
+def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
     """Return the step that timestamps are rounded to; 0 where they are as fine as floats.
 
     Examples
     --------
-    >>> float(round(resolution(np.round(np.arange(400) / 400, 3)), 9))
+    >>> float(round(timestamp_resolution(np.round(np.arange(400) / 400, 3)), 9))
     0.001
-    >>> resolution(np.arange(400) / 400)
+    >>> timestamp_resolution(np.arange(400) / 400)
     0.0
 
     """
-    step = np.diff(time[:LOOKED_AT])
+    step = np.diff(time[:ROUNDING_STEPS])
     noise = 16.0 * np.finfo(float).eps * float(np.max(np.abs(time[: step.size + 1])))
     kinds = np.unique(step)
     apart = np.diff(kinds)
@@ -119,7 +131,7 @@ def resolution(time: Float[np.ndarray, " n"]) -> float:
     return unit if float(np.max(off)) <= max(0.02 * unit, noise) and unit > 4.0 * noise else 0.0
 
 
-def _explained(
+def _rounding_explains(
     stamps: Float[np.ndarray, " n"], step: Float[np.ndarray, " m"], across: Float[np.ndarray, " m"] | np.ndarray,
     rounding: float, period: float,
 ) -> bool:  # fmt: skip
@@ -128,7 +140,7 @@ def _explained(
         return False
     breaks = np.flatnonzero(across) + 1
     for first, last in pairwise([0, *breaks.tolist(), stamps.size]):
-        strays = stamps[first:last] - period * np.arange(last - first)
-        if np.ptp(strays) > 2.0 * rounding + 1e-9 * period:
+        deviations = stamps[first:last] - period * np.arange(last - first)
+        if np.ptp(deviations) > 2.0 * rounding + 1e-9 * period:
             return False
     return True

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.align import Rule
+from seaopt.logs.log.alignment import Rule
 from seaopt.records import record
 from seaopt.units import factor, si_unit
-
-_BRACKETS = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 
 
 @record
@@ -85,32 +82,6 @@ class Column:
         steps += [f"plus {self.offset:g}"] if self.offset else []
         steps += [f"{unit} to {si_unit(unit)}"] if factor(unit, si_unit(unit)) != 1 else []
         return ", ".join(steps)
-
-
-def header_unit(header: str) -> str | None:
-    """Return the unit in a header's brackets, None where there is none.
-
-    Examples
-    --------
-    >>> header_unit("F1 [N]"), header_unit("Time(usec)"), header_unit("cur")
-    ('N', 'usec', None)
-
-    """
-    found = _BRACKETS.match(header)
-    return found["unit"].strip() if found else None
-
-
-def bare_name(header: str) -> str:
-    """Return a header without its unit.
-
-    Examples
-    --------
-    >>> bare_name("F1 [N]"), bare_name("cur")
-    ('F1', 'cur')
-
-    """
-    found = _BRACKETS.match(header)
-    return found["name"].strip() or header if found else header
 
 
 def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:

@@ -1,8 +1,7 @@
 r"""Spectra of a log's channels on the same stretches: mains hum, excitation, coherence and delays.
 
 Hann-windowed stretches that overlap by half (Welch 1967), none across a gap. Long logs are sampled: at most 64
-stretches
-of at most 32,768 samples, spread over the log.
+stretches of at most 32,768 samples, spread over the log.
 """
 
 from __future__ import annotations
@@ -14,18 +13,19 @@ from jaxtyping import Complex, Float
 
 from seaopt.records import record
 
-SHORTEST, LONGEST, FEWEST, MOST = 32, 1 << 15, 4, 64
+SHORTEST, LONGEST = 32, 1 << 15  # samples in a stretch
+FEWEST_STRETCHES, MOST_STRETCHES = 4, 64
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = 5
 BESIDE_HZ = 12.0  # from a line: where the noise floor is read
-LINE = 4.0  # times the noise floor: 6 dB
-FAMILY = 3  # lines beside the mains' in the same channel that make a multisine
-BRIDGED = 0.02  # share of a stretch's samples that may be missing: they are bridged by lines
+LINE_HEIGHT = 4.0  # times the noise floor: 6 dB
+OTHER_LINES = 3  # lines beside the mains' in the same channel that make a multisine
+BRIDGED_SHARE = 0.02  # share of a stretch's samples that may be missing: they are bridged by lines
 
 
 @record(eq=False)
 class Spectra:
-    """Windowed spectra of every channel, one row a stretch, from 0 Hz on.
+    """Windowed spectra of every channel, one row per stretch, from 0 Hz on.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Spectra:
     @property
     def stretches(self) -> int:
         """Number of stretches."""
-        return next((len(item) for item in self.channels.values()), 0)
+        return next((len(rows) for rows in self.channels.values()), 0)
 
     @property
     def averages(self) -> float:
@@ -65,40 +65,42 @@ class Spectra:
         return np.abs(self.cross(first, second)) ** 2 / floor
 
 
-def spectra(channels: Mapping[str, Float[np.ndarray, " n"]], pieces: Sequence[slice], period: float) -> Spectra | None:
+def compute_spectra(
+    channels: Mapping[str, Float[np.ndarray, " n"]], stretches: Sequence[slice], period: float
+) -> Spectra | None:
     """Return the spectra of the channels over the stretches without a gap; None where there is no stretch.
 
     Parameters
     ----------
     channels : mapping of name to array, shape (n,)
         Samples.
-    pieces : sequence of slice
+    stretches : sequence of slice
         Rows without a gap.
     period : float
         Seconds between samples.
 
     """
-    total = sum(piece.stop - piece.start for piece in pieces)
+    total = sum(stretch.stop - stretch.start for stretch in stretches)
     length = 2 * (min(max(total // 16, SHORTEST), LONGEST) // 2)
     starts = np.array(
-        [row for piece in pieces for row in range(piece.start, piece.stop - length + 1, max(length // 2, 1))], dtype=int
+        [row for rows in stretches for row in range(rows.start, rows.stop - length + 1, max(length // 2, 1))], dtype=int
     )
-    if starts.size < FEWEST:
+    if starts.size < FEWEST_STRETCHES:
         return None
-    if starts.size > MOST:
-        starts = starts[np.linspace(0, starts.size - 1, MOST).astype(int)]
+    if starts.size > MOST_STRETCHES:
+        starts = starts[np.linspace(0, starts.size - 1, MOST_STRETCHES).astype(int)]
     cuts = {name: np.stack([values[start : start + length] for start in starts]) for name, values in channels.items()}
-    holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED for name, cut in cuts.items()}
+    holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED_SHARE for name, cut in cuts.items()}
     kept = [name for name in cuts if np.mean(holed[name]) <= 0.5]
     whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(starts.size, dtype=bool)
-    if np.count_nonzero(whole) < FEWEST:
+    if np.count_nonzero(whole) < FEWEST_STRETCHES:
         return None
     window = np.hanning(length)
-    found = {name: _spectrum(cuts[name][whole], window) for name in kept}
-    return Spectra(frequency_hz=np.fft.rfftfreq(length, period), period=period, channels=found)
+    transforms = {name: _transform(cuts[name][whole], window) for name in kept}
+    return Spectra(frequency_hz=np.fft.rfftfreq(length, period), period=period, channels=transforms)
 
 
-def _spectrum(cut: Float[np.ndarray, "d n"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
+def _transform(cut: Float[np.ndarray, "d n"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "d m"]:
     """Return the spectra of stretches without their means; missing samples are bridged."""
     rows = np.arange(window.size)
     for row in np.flatnonzero(~np.all(np.isfinite(cut), axis=1)):
@@ -117,22 +119,22 @@ class Hum:
     rms: float
 
 
-def hum(found: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
+def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
     """Return the mains' lines of a channel, None where there are none or the stretches are too short to tell.
 
     A line stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median stretch: what comes and goes,
     such as a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines
     stand out as well it is a multisine.
     """
-    f = found.frequency_hz
+    f = spectra.frequency_hz
     width = f[1] - f[0]
-    if width > 1.5 or found.stretches < 6:
+    if width > 1.5 or spectra.stretches < 6:
         return None
-    square = np.abs(found.channels[name]) ** 2
+    square = np.abs(spectra.channels[name]) ** 2
     steady = np.median(square, axis=0)
-    others = [found.coherence(other, name) for other in inputs if other in found.channels and other != name]
-    own = 1.0 - np.max(others, axis=0) if others else np.ones(f.size)
-    limit = LINE * (1.0 + 2.0 / np.sqrt(found.averages))
+    coherences = [spectra.coherence(other, name) for other in inputs if other in spectra.channels and other != name]
+    incoherent = 1.0 - np.max(coherences, axis=0) if coherences else np.ones(f.size)
+    limit = LINE_HEIGHT * (1.0 + 2.0 / np.sqrt(spectra.averages))
     for mains in MAINS_HZ:
         lines: list[tuple[float, float, float]] = []
         for k in range(1, HARMONICS + 1):
@@ -141,19 +143,19 @@ def hum(found: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
                 break
             at = np.abs(f - line) <= max(0.5, width)
             floor = _floor(f, steady, line)
-            ratio = float(np.max(steady[at] * own[at])) / max(floor, 1e-300)
-            if k == 1 and (ratio < limit or _lines_beside(f, steady, line, limit) >= FAMILY):
+            ratio = float(np.max(steady[at] * incoherent[at])) / max(floor, 1e-300)
+            if k == 1 and (ratio < limit or _lines_beside(f, steady, line, limit) >= OTHER_LINES):
                 break
             if ratio >= limit:
                 lines.append((line, 10.0 * np.log10(ratio), float(np.sum(np.mean(square[:, at], axis=0) - floor))))
         if lines:
             # Parseval for a Hann window of n samples: a line's power in its bins is a^2/4 times 3 n^2/8.
             n = 2 * (f.size - 1)
-            power = sum(max(item[2], 0.0) for item in lines)
+            power = sum(max(line_power, 0.0) for _, _, line_power in lines)
             return Hum(
                 mains_hz=mains,
-                lines_hz=tuple(item[0] for item in lines),
-                over_floor_db=tuple(round(float(item[1]), 1) for item in lines),
+                lines_hz=tuple(line for line, _, _ in lines),
+                over_floor_db=tuple(round(float(height), 1) for _, height, _ in lines),
                 rms=float(np.sqrt(2.0 * power / (0.375 * n**2))),
             )
     return None

@@ -8,13 +8,13 @@ from dataclasses import field
 from pathlib import Path
 
 from seaopt.errors import LogError, SeaoptError, suggestion
-from seaopt.logs.align import Rule
-from seaopt.logs.column import Column, bare_name
-from seaopt.logs.counter import Counter
 from seaopt.logs.formats import Field, Source
-from seaopt.logs.formats.layout import is_unit
+from seaopt.logs.log.alignment import Rule
+from seaopt.logs.reading.column import Column
+from seaopt.logs.reading.counter import Counter
 from seaopt.records import record
-from seaopt.units import factor, same_dimension, si_unit
+from seaopt.signals import check_distinct
+from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 SHOWN = 20  # names in a message
@@ -95,38 +95,10 @@ def select(
         out[name] = Channel(
             column=column, source=source, field=item, unit=unit, clock=own, rule=rule if own != clock else None
         )
-    notes += check_apart(
+    notes += check_distinct(
         {name: ((str(item.source.path), item.field.name), si_unit(item.unit)) for name, item in out.items()}
     )
     return Selection(clock=clock, channels=out, notes=tuple(notes))
-
-
-def check_apart(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[str]:
-    """Refuse one column for two channels; say so where they are two quantities, each with a conversion of its own.
-
-    Parameters
-    ----------
-    channels : mapping of channel name to ((file, column), SI unit)
-        A screw's angle (rad) and its nut's place (m) may come of one encoder; two forces do not come of one load cell.
-
-    Raises
-    ------
-    LogError
-        Two channels of one column have the same SI unit.
-
-    """
-    seen: dict[tuple[str, str], dict[str, str]] = {}
-    notes: list[str] = []
-    for name, (place, unit) in channels.items():
-        for other, known in seen.get(place, {}).items():
-            if known == unit:
-                raise LogError(
-                    f'{place[0]}: column "{place[1]}" is given for {other} and for {name}; each channel needs a column '
-                    "of its own: choose another for one of them, or leave it out"
-                )
-            notes.append(f'{other} and {name} are the same column "{place[1]}", in {known or "-"} and in {unit or "-"}')
-        seen.setdefault(place, {})[name] = unit
-    return notes
 
 
 def as_column(given: str | Column) -> Column:

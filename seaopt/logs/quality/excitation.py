@@ -1,4 +1,4 @@
-"""What an input excites: third-octave bands, which of them an output answers to, and what that can tell."""
+"""What an input excites: third-octave bands, which of them an output answers to, and what can be identified there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from seaopt.logs.spectra import Spectra
+from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
 
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
@@ -15,8 +15,8 @@ COHERENT = 0.5  # of an output with the input, power-weighted; below it most of 
 
 
 @record
-class Band:
-    """A third of an octave.
+class ThirdOctave:
+    """A band of a third of an octave.
 
     Parameters
     ----------
@@ -32,8 +32,8 @@ class Band:
         Of the output that answers best; None without outputs.
     gain : float or None
         Size of the response of the output that answers best over all bands, in its unit over the input's.
-    told : bool
-        Whether a model can be told from it: within 40 dB of the strongest, and coherence of 0.5 or more.
+    usable : bool
+        Whether a model can be identified from it: within 40 dB of the strongest, and coherence of 0.5 or more.
 
     """
 
@@ -44,24 +44,24 @@ class Band:
     level_db: float
     coherence: float | None
     gain: float | None
-    told: bool
+    usable: bool
 
 
 @record
-class Excitation:
+class InputExcitation:
     """The bands of one input."""
 
     channel: str
-    bands: tuple[Band, ...]
+    bands: tuple[ThirdOctave, ...]
     nyquist_hz: float
 
     @property
-    def told_hz(self) -> tuple[float, float] | None:
-        """The widest stretch of bands that can be told, in octaves; None where there is none."""
+    def usable_hz(self) -> tuple[float, float] | None:
+        """The widest stretch of usable bands, in octaves; None where there is none."""
         best: tuple[float, float] | None = None
         start: float | None = None
         for band in self.bands:
-            if not band.told:
+            if not band.usable:
                 start = None
                 continue
             start = band.low_hz if start is None else start
@@ -71,9 +71,9 @@ class Excitation:
 
     @property
     def rolls_off_above_hz(self) -> float | None:
-        """Where the response is largest of the bands that can be told, if it falls to half above; else None."""
-        told = self.told_hz
-        inside = [band for band in self.bands if band.told and told and told[0] <= band.low_hz < told[1]]
+        """Where the response is largest within the usable bands, if it falls to half above; else None."""
+        usable = self.usable_hz
+        inside = [band for band in self.bands if band.usable and usable and usable[0] <= band.low_hz < usable[1]]
         gains = [band.gain for band in inside if band.gain is not None]
         if len(gains) < 3 or len(gains) < len(inside) or min(gains[int(np.argmax(gains)) :]) > 0.5 * max(gains):
             return None
@@ -82,34 +82,34 @@ class Excitation:
 
     @property
     def sentence(self) -> str:
-        """What the input can and cannot tell."""
-        told = self.told_hz
-        if told is None:
+        """What can and cannot be identified with this input."""
+        usable = self.usable_hz
+        if usable is None:
             return (
-                f"{self.channel} excites nothing that an output answers to: no parameter can be told; check the "
+                f"{self.channel} excites nothing that an output answers to: no parameter can be identified; check the "
                 "channels, and drive harder"
             )
-        low, high = told
+        low, high = usable
         what = "answered to" if self.bands[0].coherence is not None else "excited"
-        said = f"{self.channel} is {what} from {low:.3g} to {high:.3g} Hz"
+        sentence = f"{self.channel} is {what} from {low:.3g} to {high:.3g} Hz"
         if high < 0.8 * self.nyquist_hz:
-            said += f"; nothing above {high:.3g} Hz"
+            sentence += f"; nothing above {high:.3g} Hz"
         top = self.rolls_off_above_hz
         if top is not None:
-            said += f"; the response is largest near {top:.2g} Hz and falls to half above"
+            sentence += f"; the response is largest near {top:.2g} Hz and falls to half above"
         elif self.bands[0].gain is not None:
-            said += "; no response falls to half in there: inertia and stiffness (J and k) cannot be told"
+            sentence += "; no response falls to half in there: inertia and stiffness (J and k) cannot be identified"
         if low > 4.0 * self.bands[0].low_hz:
-            said += f"; nothing below {low:.3g} Hz: static gain and friction (eta, b_r) cannot be told apart there"
-        return said
+            sentence += f"; nothing below {low:.3g} Hz: static gain and friction (eta, b_r) cannot be separated there"
+        return sentence
 
 
-def excitation(found: Spectra, channel: str, outputs: Sequence[str]) -> Excitation | None:
-    """Return what an input excites; None where it is constant.
+def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) -> InputExcitation | None:
+    """Return which bands an input excites, and in which a model can be identified; None where it is constant.
 
     Parameters
     ----------
-    found : Spectra
+    spectra : Spectra
         Of input and outputs.
     channel : str
         The input.
@@ -117,15 +117,15 @@ def excitation(found: Spectra, channel: str, outputs: Sequence[str]) -> Excitati
         Channels that may answer to it.
 
     """
-    f, power = found.frequency_hz[1:], found.power(channel)[1:]
+    f, power = spectra.frequency_hz[1:], spectra.power(channel)[1:]
     total = float(np.sum(power))
     if total <= 0.0:
         return None
-    answering = [name for name in outputs if np.sum(found.power(name)[1:]) > 0.0]
-    coherences = {name: found.coherence(channel, name)[1:] for name in answering}
+    answering = [name for name in outputs if np.sum(spectra.power(name)[1:]) > 0.0]
+    coherences = {name: spectra.coherence(channel, name)[1:] for name in answering}
     # Gains are all of one output, or they could not be compared.
     loudest = max(answering, key=lambda name: float(power @ coherences[name]), default=None)
-    gains = np.abs(found.cross(channel, loudest)[1:]) / np.maximum(power, 1e-300) if loudest is not None else None
+    gains = np.abs(spectra.cross(channel, loudest)[1:]) / np.maximum(power, 1e-300) if loudest is not None else None
     count = int(np.ceil(3.0 * np.log2(f[-1] / f[0]))) + 1
     edges = f[0] * 2.0 ** ((np.arange(count + 1) - 0.5) / 3.0)
     places = np.digitize(f, edges) - 1
@@ -134,19 +134,19 @@ def excitation(found: Spectra, channel: str, outputs: Sequence[str]) -> Excitati
     densities = np.array([np.mean(power[row]) if row.size else 0.0 for row in rows])
     with np.errstate(divide="ignore"):
         levels = 10.0 * np.log10(np.maximum(sums / np.max(sums), densities / np.max(densities)))
-    bands: list[Band] = []
+    bands: list[ThirdOctave] = []
     for k, row in enumerate(rows):
         if not row.size:
             continue
         weight = power[row] / max(float(np.sum(power[row])), 1e-300)
-        coherence = max((float(weight @ item[row]) for item in coherences.values()), default=None)
+        best = max((float(weight @ coherence[row]) for coherence in coherences.values()), default=None)
         bands.append(
-            Band(
+            ThirdOctave(
                 low_hz=float(edges[k]), high_hz=float(min(edges[k + 1], f[-1])),
                 reach_hz=float(np.max(f[row[power[row] >= REACHED * np.max(power[row])]])),
-                share=float(sums[k] / total), level_db=float(max(levels[k], -300.0)), coherence=coherence,
+                share=float(sums[k] / total), level_db=float(max(levels[k], -300.0)), coherence=best,
                 gain=float(weight @ gains[row]) if gains is not None else None,
-                told=bool(levels[k] >= -RANGE_DB and (coherence is None or coherence >= COHERENT)),
+                usable=bool(levels[k] >= -RANGE_DB and (best is None or best >= COHERENT)),
             )
         )  # fmt: skip
-    return Excitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]))
+    return InputExcitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]))

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from seaopt.logs.spectra import Spectra
+from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
 
-FINE = 8  # lags a sample: the correlation is interpolated in frequency, then by a parabola
-NEAR = 3  # samples of lag within which signs are compared
+LAGS_PER_SAMPLE = 8  # the correlation is interpolated in frequency, then by a parabola
+SIGN_LAGS = 3  # samples of lag within which signs are compared
 FLIPPED = 0.3  # correlation beyond which a negative sign is a flip
 
 
 @record
-class Pair:
+class ChannelPair:
     """The cross-correlation of two channels.
 
     Parameters
@@ -39,25 +39,25 @@ class Pair:
     flipped: bool
 
 
-def pair(found: Spectra, first: str, second: str) -> Pair | None:
-    """Return how two channels go together; None where one has no power.
+def correlate_channels(spectra: Spectra, first: str, second: str) -> ChannelPair | None:
+    """Return lag and sign of the cross-correlation of two channels; None where one has no power.
 
     Examples
     --------
-    >>> from seaopt.logs.spectra import spectra
+    >>> from seaopt.logs.quality.spectra import compute_spectra
     >>> x = np.random.default_rng(1).normal(size=4000)
-    >>> both = spectra({"a": x[5:], "b": -x[:-5]}, [slice(0, 3995)], 0.01)
-    >>> agreed = pair(both, "a", "b")
-    >>> round(agreed.lag_s, 3), agreed.correlation < -0.9
+    >>> both = compute_spectra({"a": x[5:], "b": -x[:-5]}, [slice(0, 3995)], 0.01)
+    >>> pair = correlate_channels(both, "a", "b")
+    >>> round(pair.lag_s, 3), pair.correlation < -0.9
     (0.05, True)
 
     """
-    own = [float(np.fft.irfft(found.power(name))[0]) for name in (first, second)]
-    if min(own) <= 0.0:
+    powers = [float(np.fft.irfft(spectra.power(name))[0]) for name in (first, second)]
+    if min(powers) <= 0.0:
         return None
-    cross = found.cross(first, second)
-    fine = 2 * (cross.size - 1) * FINE
-    rho = FINE * np.fft.irfft(cross, fine) / np.sqrt(own[0] * own[1])
+    cross = spectra.cross(first, second)
+    fine = 2 * (cross.size - 1) * LAGS_PER_SAMPLE
+    rho = LAGS_PER_SAMPLE * np.fft.irfft(cross, fine) / np.sqrt(powers[0] * powers[1])
     reach = rho.size // 4
     lags = np.arange(-reach, reach + 1)
     near = rho[lags]  # negative lags are at the end
@@ -67,11 +67,11 @@ def pair(found: Spectra, first: str, second: str) -> Pair | None:
         below, top, above = np.sign(near[best]) * near[best - 1 : best + 2]
         bend = float(below - 2.0 * top + above)
         shift = 0.5 * float(below - above) / bend if bend < 0.0 else 0.0
-    close = near[np.abs(lags) <= NEAR * FINE]
-    return Pair(
+    close = near[np.abs(lags) <= SIGN_LAGS * LAGS_PER_SAMPLE]
+    return ChannelPair(
         first=first,
         second=second,
-        lag_s=float(lags[best] + shift) / FINE * found.period,
+        lag_s=float(lags[best] + shift) / LAGS_PER_SAMPLE * spectra.period,
         correlation=float(near[best]),
         leads=bool(lags[best] < 0 and np.max(np.abs(near[lags >= 0])) < 0.9 * abs(near[best])),
         flipped=bool(-np.min(close) > max(FLIPPED, 1.5 * np.max(close))),

@@ -1,0 +1,1 @@
+"""A log: channels on one clock, and what can be done to it: cut, resample, decimate, append, mask."""

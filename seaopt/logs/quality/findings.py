@@ -1,0 +1,266 @@
+"""Findings: each fault of a log with its number, its place and a sentence that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from seaopt.logs.quality.channel import ChannelQuality
+from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality
+from seaopt.logs.quality.excitation import InputExcitation
+from seaopt.logs.quality.faults import CounterLosses, RowRanges
+from seaopt.logs.quality.lags import ChannelPair
+from seaopt.records import record
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+MAX_PLACES = 20  # that a finding lists
+COARSE_LEVELS, FINE_LEVELS = 32, 4096  # in a channel's range: a warning below the one, no finding above the other
+LEAST_CORRELATION = 0.3  # correlation above which a lag is one
+
+
+@record
+class Finding:
+    """One thing that a log's user should know.
+
+    Parameters
+    ----------
+    kind : str
+        For programs: "gap", "clipping", ...
+    severity : "error", "warning" or "note"
+        A fit refuses the log or is wrong; look at it; for information.
+    channel : str
+        "" for the clock; "F1, F2" for a pair.
+    count : int
+        How many samples, runs or lines.
+    value : float
+        The number that goes with it, in `unit`.
+    unit : str
+    where_s : tuple of (float, float)
+        First places, from and to, in s of the log's time.
+    sentence : str
+        What it is and what to do.
+
+    """
+
+    kind: str
+    severity: Severity
+    sentence: str
+    channel: str = ""
+    count: int = 0
+    value: float = 0.0
+    unit: str = ""
+    where_s: tuple[tuple[float, float], ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as plain data."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
+    """Yield what is wrong with the clock."""
+    for kind, rows, what in (
+        ("time_missing", clock.not_numbers, "no number as time; remove these rows"),
+        ("backwards", clock.backwards, "a time before that of the row ahead; sort the rows, or cut the log there"),
+        ("duplicate", clock.repeated, "the time of the row ahead; keep one row of each"),
+    ):
+        if rows.size:
+            text = f"{_count(rows.size, 'row')} of {clock.samples} with {what}"
+            yield Finding(kind=kind, severity="error", count=int(rows.size), where_s=_places(time, rows), sentence=text)
+    share = clock.jitter_max / clock.period
+    if share > JITTER_LIMIT:
+        yield _jitter_finding(clock, share)
+    if clock.gaps.size:
+        total, longest = int(np.sum(clock.lost)), int(np.max(clock.lost))
+        yield Finding(
+            kind="gap", severity="warning", count=int(clock.gaps.size), value=float(total), unit="samples",
+            where_s=tuple((float(time[row - 1]), float(time[row])) for row in clock.gaps[:MAX_PLACES]),
+            sentence=f"{_count(clock.gaps.size, 'gap')}, {_count(total, 'sample')} lost, {longest} in the longest; a "
+            "fit starts anew after each (gaps = \"split\")",
+        )  # fmt: skip
+
+
+def _jitter_finding(clock: ClockQuality, share: float) -> Finding:
+    what = f"steps of time differ by up to {share:.0%} from the period of {clock.period:.4g} s"
+    if clock.rounded_only:
+        text = (
+            f"{what}, which the rounding of the timestamps to {clock.rounding:.3g} s explains; call log.restamp() "
+            '(resample = "restamp" in a problem file)'
+        )
+    else:
+        rate = float(f"{clock.rate_hz:.3g}")
+        text = f"{what} (rms {clock.jitter_rms / clock.period:.1%}); call log.resample(rate_hz={rate:g}) to fit it"
+    return Finding(kind="jitter", severity="error", value=100.0 * share, unit="% of the period", sentence=text)
+
+
+def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
+    """Yield what is wrong with one channel."""
+    name = channel.name
+    if len(channel.missing):
+        yield _missing_finding(channel, time)
+    if channel.missing.samples == time.size:
+        return
+    if channel.constant:
+        text = f"{name} is {_format(channel.low, channel.unit)} throughout; check its wiring, or leave it out"
+        yield Finding(
+            kind="constant", severity="warning", channel=name, value=channel.low, unit=channel.unit, sentence=text
+        )
+        return
+    if len(channel.stuck):
+        longest = int(np.max(channel.stuck.lengths))
+        text = (
+            f"{name} stands still {_count(len(channel.stuck), 'time')}, up to {longest} samples, where it otherwise "
+            "changes: a sensor or a message that stopped; cut the log there, or set those samples to NaN"
+        )
+        yield _runs_finding("stuck", "warning", channel, channel.stuck, time, text)
+    yield from _check_rails(channel, time)
+    yield from _check_levels(channel)
+    if channel.outliers.size:
+        text = f"{_count(channel.outliers.size, 'outlier')} in {name}; fit with loss=so.Huber(), or set them to NaN"
+        yield Finding(
+            kind="outlier", severity="warning", channel=name, count=int(channel.outliers.size), sentence=text,
+            where_s=_places(time, channel.outliers),
+        )  # fmt: skip
+    if channel.counter is not None and channel.counter.rows.size:
+        yield _counter_finding(name, channel.counter, time)
+    if channel.hum is not None:
+        yield _hum_finding(channel)
+
+
+def _missing_finding(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Finding:
+    name, count = channel.name, channel.missing.samples
+    if count == time.size:
+        text = f"{name} has no number in any sample; leave it out"
+        return _runs_finding("missing", "error", channel, channel.missing, time, text)
+    text = (
+        f"{name} lacks {_count(count, 'sample')} of {time.size}; in an output they have no weight, in an input cut the "
+        "log there (log.between)"
+    )
+    return _runs_finding("missing", "warning", channel, channel.missing, time, text)
+
+
+def _counter_finding(name: str, losses: CounterLosses, time: Float[np.ndarray, " n"]) -> Finding:
+    total = int(np.sum(losses.lost))
+    held = f", samples_per_count={losses.held}" if losses.held > 1 else ""
+    text = (
+        f"{name} counts, and skips at {_count(losses.rows.size, 'place')}: {_count(total, 'sample')} lost that the "
+        f'clock does not show; read the log with counter=Counter(column="{name}"{held}), which opens the gaps'
+    )
+    return Finding(
+        kind="gap", severity="error", channel=name, count=int(losses.rows.size), value=float(total), unit="samples",
+        where_s=_places(time, losses.rows), sentence=text,
+    )  # fmt: skip
+
+
+def _check_rails(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
+    name = channel.name
+    for rail in channel.rails:
+        edge = "largest" if rail.side == "high" else "least"
+        count = f"{_count(rail.runs.samples, 'sample')} ({rail.runs.samples / time.size:.2%})"
+        text = f"{name} is flat at its {edge} value, {_format(rail.value, channel.unit)}, for {count}"
+        text += (
+            ": it is clipped; a fit masks these samples of an output"
+            if rail.clear
+            else f": clipped, or at rest there; if clipped, declare its range, saturation = {{ {name} = [low, high] }}"
+        )
+        severity: Severity = "warning" if rail.clear else "note"
+        yield _runs_finding("clipping", severity, channel, rail.runs, time, text, value=rail.value)
+
+
+def _check_levels(channel: ChannelQuality) -> Iterator[Finding]:
+    if channel.held > 1:
+        text = (
+            f"{channel.name} repeats each value {channel.held} times: its own rate is lower than the log's; "
+            'decimate, or use hold = "zero" for an input'
+        )
+        yield Finding(kind="held", severity="note", channel=channel.name, count=channel.held, sentence=text)
+    levels = (channel.high - channel.low) / channel.quantum if channel.quantum else np.inf
+    if channel.counter is None and levels < FINE_LEVELS:
+        text = f"{channel.name} moves in steps of {_format(channel.quantum, channel.unit)}, {levels:.0f} over its range"
+        text += "; use a finer range, or expect coloured residuals" if levels < COARSE_LEVELS else ""
+        yield Finding(
+            kind="quantisation", severity="warning" if levels < COARSE_LEVELS else "note", channel=channel.name,
+            value=channel.quantum, unit=channel.unit, sentence=text,
+        )  # fmt: skip
+
+
+def _hum_finding(channel: ChannelQuality) -> Finding:
+    assert channel.hum is not None
+    lines = ", ".join(f"{line:g} Hz" for line in channel.hum.lines_hz)
+    text = (
+        f"{channel.name} hums with the mains at {lines}: {_format(channel.hum.rms, channel.unit)} rms, "
+        f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it (band_hz)"
+    )
+    return Finding(
+        kind="hum", severity="warning", channel=channel.name, count=len(channel.hum.lines_hz), value=channel.hum.rms,
+        unit=channel.unit, sentence=text,
+    )  # fmt: skip
+
+
+def find_pair_faults(pair: ChannelPair, period: float, driven: bool) -> Iterator[Finding]:
+    """Yield what is wrong between two channels; `driven`: the first is an input of the second."""
+    name = f"{pair.first}, {pair.second}"
+    if {pair.first.casefold(), pair.second.casefold()} == {"f1", "f2"} and pair.flipped:
+        text = (
+            f"{pair.second} has the opposite sign of {pair.first}; on the stand both are positive together: turn one "
+            "around"
+        )
+        yield Finding(kind="sign", severity="error", channel=name, value=pair.correlation, sentence=text)
+    samples = pair.lag_s / period
+    if abs(pair.correlation) < LEAST_CORRELATION or abs(samples) < 0.25:
+        return
+    late, early = (pair.second, pair.first) if samples > 0 else (pair.first, pair.second)
+    text = f"{late} follows {early} by {1e3 * abs(pair.lag_s):.3g} ms ({abs(samples):.2f} samples), correlation "
+    text += f"{pair.correlation:.2f}" + (" (with the opposite sign)" if pair.correlation < 0.0 and not driven else "")
+    severity: Severity = "note"
+    if driven and pair.leads and samples < -1.5:
+        severity = "warning"
+        text += "; an input cannot come after what it causes: align the channels"
+    elif driven and samples > 0:
+        text += "; that is the plant's own lag and any delay: let a fit tell them apart (delay_s free)"
+    yield Finding(kind="delay", severity=severity, channel=name, value=pair.lag_s, unit="s", sentence=text)
+
+
+def describe_excitation(excitation: InputExcitation) -> Finding:
+    """Return what can and cannot be identified with an input."""
+    usable = excitation.usable_hz
+    return Finding(
+        kind="excitation", severity="note" if usable else "warning", channel=excitation.channel,
+        value=usable[1] if usable else 0.0, unit="Hz", sentence=excitation.sentence,
+    )  # fmt: skip
+
+
+def sort_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Return the findings, the most severe first."""
+    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+def count_findings(findings: Sequence[Finding]) -> Mapping[str, int]:
+    """Return how many findings there are of each severity."""
+    return {level: sum(finding.severity == level for finding in findings) for level in SEVERITIES}
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
+def _format(value: float, unit: str) -> str:
+    return f"{value:.4g} {unit}".rstrip()
+
+
+def _places(time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(time[row]), float(time[row])) for row in rows[:MAX_PLACES])
+
+
+def _runs_finding(
+    kind: str, severity: Severity, channel: ChannelQuality, runs: RowRanges, time: Float[np.ndarray, " n"], text: str,
+    value: float = 0.0,
+) -> Finding:  # fmt: skip
+    pairs = zip(runs.start[:MAX_PLACES], runs.stop[:MAX_PLACES], strict=True)
+    return Finding(
+        kind=kind, severity=severity, channel=channel.name, count=runs.samples, value=value, unit=channel.unit,
+        where_s=tuple((float(time[a]), float(time[b - 1])) for a, b in pairs), sentence=text,
+    )  # fmt: skip

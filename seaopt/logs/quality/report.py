@@ -1,0 +1,313 @@
+"""The quality report of a log: every fault in the data made visible before it becomes a wrong parameter.
+
+It reads a `Log`, or a `Table` as a file holds it, whose time may repeat or run backwards. Nothing is changed.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+
+from seaopt.errors import LogError, suggestion
+from seaopt.logs.quality.channel import ChannelQuality, assess_channel, keep_runs_while_others_move
+from seaopt.logs.quality.clock import ClockQuality, assess_clock
+from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
+from seaopt.logs.quality.findings import (
+    Finding,
+    count_findings,
+    describe_excitation,
+    find_channel_faults,
+    find_clock_faults,
+    find_pair_faults,
+    sort_findings,
+)
+from seaopt.logs.quality.lags import ChannelPair, correlate_channels
+from seaopt.logs.quality.spectra import Spectra, compute_spectra, find_hum
+from seaopt.records import record
+from seaopt.signals import Recording
+
+QUALITY_SCHEMA = "seaopt/quality/1"
+INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u"})  # names of inputs, in any case
+INPUT_UNITS = frozenset({"A", "V"})
+
+
+@record(eq=False)
+class Quality:
+    """What is wrong with a log's data, and what they can tell; ``print(quality)`` is a report.
+
+    Parameters
+    ----------
+    source : str
+    duration_s : float
+        From the first sample to the last.
+    clock : ClockQuality
+    channels : mapping of name to ChannelQuality
+    inputs : tuple of str
+        Channels that were taken as inputs.
+    pairs : tuple of ChannelPair
+        Each input with each other channel, and the others with one another where they share a unit.
+    excitation : mapping of input to InputExcitation
+    spectra : Spectra or None
+        From which hum, pairs and excitation come; None where no stretch is long enough.
+    findings : tuple of Finding
+        The most severe first.
+    notes : tuple of str
+        What was done to the log before.
+
+    """
+
+    source: str
+    duration_s: float
+    clock: ClockQuality
+    channels: Mapping[str, ChannelQuality]
+    inputs: tuple[str, ...]
+    pairs: tuple[ChannelPair, ...]
+    excitation: Mapping[str, InputExcitation]
+    spectra: Spectra | None
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is neither an error nor a warning."""
+        return all(finding.severity == "note" for finding in self.findings)
+
+    @property
+    def summary(self) -> str:
+        """Samples, length and rate in one line."""
+        clock = self.clock
+        return f"{clock.samples} samples, {self.duration_s:.6g} s at {clock.rate_hz:.6g} Hz, {describe_jitter(clock)}"
+
+    def of(self, kind: str, channel: str | None = None) -> tuple[Finding, ...]:
+        """Return the findings of a kind, of one channel if given."""
+        return tuple(
+            finding for finding in self.findings if finding.kind == kind and channel in (None, finding.channel)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of quality.json (schema seaopt/quality/1)."""
+        clock = self.clock
+        return {
+            "schema": QUALITY_SCHEMA,
+            "source": self.source,
+            "samples": clock.samples,
+            "duration_s": self.duration_s,
+            "rate_hz": clock.rate_hz,
+            "jitter": {
+                "rms_s": clock.jitter_rms, "max_s": clock.jitter_max,
+                "max_percent": 100.0 * clock.jitter_max / clock.period, "rounding_s": clock.rounding,
+                "rounding_explains_it": clock.rounded_only,
+            },
+            "gaps": {
+                "count": int(clock.gaps.size), "samples_lost": int(np.sum(clock.lost)),
+                "longest_samples": int(np.max(clock.lost, initial=0)),
+            },
+            "duplicates": int(clock.repeated.size),
+            "backwards": int(clock.backwards.size),
+            "time_missing": int(clock.not_numbers.size),
+            "channels": {name: _channel_dict(channel) for name, channel in self.channels.items()},
+            "inputs": list(self.inputs),
+            "pairs": [_fields(pair) for pair in self.pairs],
+            "excitation": {name: _excitation_dict(excitation) for name, excitation in self.excitation.items()},
+            "findings": [finding.to_dict() for finding in self.findings],
+            "counts": dict(count_findings(self.findings)),
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+    def __repr__(self) -> str:
+        lines = [f"Quality of {self.source}: {self.summary}"]
+        lines += [f"  {note}" for note in self.notes]
+        lines += [
+            f"  {row}"
+            for row in _align([CHANNEL_HEAD, *(format_channel(channel) for channel in self.channels.values())])
+        ]
+        lines += [f"  {finding.severity}: {finding.sentence}" for finding in self.findings]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in CHANNEL_HEAD)
+        rows = [format_channel(channel) for channel in self.channels.values()]
+        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        findings = "".join(
+            f"<li><b>{finding.severity}</b>: {html.escape(finding.sentence)}</li>" for finding in self.findings
+        )
+        return (
+            f"<p>{html.escape(self.source)}: {html.escape(self.summary)}</p>"
+            f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table><ul>{findings}</ul>"
+        )
+
+
+@np.errstate(over="ignore", invalid="ignore")  # numbers near the largest float have no std, and are reported as such
+def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Quality:
+    """Look for every fault in a log.
+
+    Parameters
+    ----------
+    data : Log or Table
+        `log.quality` is this with its defaults.
+    inputs : sequence of str, optional
+        Channels that drive the others. Left out: those named I, Fe1, Fe2 or u, or else those in A or V.
+
+    Raises
+    ------
+    LogError
+        An input is no channel, there is no channel, or time never increases.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> t = np.arange(4000) / 400
+    >>> rng = np.random.default_rng(0)
+    >>> log = so.Log.from_arrays(time=t, I=rng.normal(size=4000), F1=np.clip(rng.normal(size=4000), -1, 1))
+    >>> [(item.kind, item.channel) for item in log.quality.findings if item.severity == "warning"][:2]
+    [('clipping', 'F1'), ('clipping', 'F1')]
+
+    """
+    if not data.signals:
+        raise LogError(f"{data.source}: holds no channel; name the columns to look at")
+    for name in inputs or ():
+        if name not in data.signals:
+            raise LogError(
+                f'{data.source}: inputs names "{name}", which is no channel; {suggestion(name, data.signals)}'
+            )
+    clock = assess_clock(data.time, data.source)
+    channels = {name: assess_channel(signal) for name, signal in data.signals.items()}
+    channels = {name: _judge_stuck_runs(channel, channels, data) for name, channel in channels.items()}
+    varying = {name: data.signals[name].values for name, channel in channels.items() if _varies(channel)}
+    inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
+    spectra = compute_spectra(varying, _stretches(clock, len(data)), clock.period)
+    if spectra is not None:
+        hums = {name: find_hum(spectra, name, inputs) for name in spectra.channels}
+        channels = {name: replace(channel, hum=hums.get(name)) for name, channel in channels.items()}
+    pairs = _correlate_pairs(spectra, inputs, channels)
+    excitation = _assess_inputs(spectra, inputs)
+    findings = [*find_clock_faults(clock, data.time)]
+    findings += [finding for channel in channels.values() for finding in find_channel_faults(channel, data.time)]
+    findings += [finding for pair in pairs for finding in find_pair_faults(pair, clock.period, pair.first in inputs)]
+    findings += [describe_excitation(bands) for bands in excitation.values()]
+    findings += _list_unjudged(inputs, spectra, data)
+    finite = data.time[np.isfinite(data.time)]
+    return Quality(
+        source=data.source, duration_s=float(np.ptp(finite)), clock=clock, channels=channels, inputs=inputs,
+        pairs=pairs, excitation=excitation, spectra=spectra, findings=sort_findings(findings), notes=data.notes,
+    )  # fmt: skip
+
+
+def _varies(channel: ChannelQuality) -> bool:
+    return channel.std > 0.0 and channel.counter is None
+
+
+def _judge_stuck_runs(
+    channel: ChannelQuality, channels: Mapping[str, ChannelQuality], data: Recording
+) -> ChannelQuality:
+    """Keep the runs of a channel as stuck during which another one moves."""
+    if not len(channel.stuck):
+        return channel
+    others = [
+        (data.signals[name].values, other.std)
+        for name, other in channels.items()
+        if name != channel.name and _varies(other)
+    ]
+    return replace(channel, stuck=keep_runs_while_others_move(channel.stuck, others))
+
+
+def _stretches(clock: ClockQuality, n: int) -> list[slice]:
+    """Return the rows without a gap or a step backwards."""
+    breaks = np.unique(np.concatenate([clock.gaps, clock.backwards, clock.not_numbers]))
+    return [slice(first, last) for first, last in pairwise([0, *breaks.tolist(), n]) if last > first]
+
+
+def _likely_inputs(channels: Mapping[str, ChannelQuality]) -> tuple[str, ...]:
+    active = [name for name, channel in channels.items() if _varies(channel)]
+    named = tuple(name for name in active if name.casefold() in INPUT_NAMES)
+    return named or tuple(name for name in active if channels[name].unit in INPUT_UNITS)
+
+
+def _correlate_pairs(
+    spectra: Spectra | None, inputs: Sequence[str], channels: Mapping[str, ChannelQuality]
+) -> tuple[ChannelPair, ...]:
+    """Correlate inputs with outputs, and outputs of one unit, F1 and F2 among them, with each other."""
+    if spectra is None:
+        return ()
+    outputs = [name for name in spectra.channels if name not in inputs]
+    wanted = [(first, second) for first in inputs if first in spectra.channels for second in outputs]
+    wanted += [(a, b) for a, b in combinations(outputs, 2) if channels[a].unit and channels[a].unit == channels[b].unit]
+    forces = {name.casefold(): name for name in outputs}
+    if "f1" in forces and "f2" in forces and not any(set(two) == {forces["f1"], forces["f2"]} for two in wanted):
+        wanted.append((forces["f1"], forces["f2"]))
+    pairs = [correlate_channels(spectra, first, second) for first, second in wanted]
+    return tuple(pair for pair in pairs if pair is not None)
+
+
+def _assess_inputs(spectra: Spectra | None, inputs: Sequence[str]) -> dict[str, InputExcitation]:
+    if spectra is None:
+        return {}
+    outputs = [name for name in spectra.channels if name not in inputs]
+    bands = {name: assess_excitation(spectra, name, outputs) for name in inputs if name in spectra.channels}
+    return {name: excitation for name, excitation in bands.items() if excitation is not None}
+
+
+def _list_unjudged(inputs: Sequence[str], spectra: Spectra | None, data: Recording) -> list[Finding]:
+    """Return what could not be looked at, and why."""
+    if spectra is None:
+        text = f"{len(data)} samples are too few for spectra: hum, delays, signs and excitation were not looked at"
+    elif not inputs:
+        text = "no channel is known to be an input: excitation and delays were not looked at; name it (inputs)"
+    else:
+        return []
+    return [Finding(kind="unjudged", severity="note", sentence=text)]
+
+
+CHANNEL_HEAD = ("channel", "unit", "low", "high", "std", "missing", "step", "stuck", "saturated", "outliers", "hum")
+
+
+def format_channel(channel: ChannelQuality) -> tuple[str, ...]:
+    """Return a channel's figures for people, in the order of CHANNEL_HEAD."""
+    return (
+        channel.name, channel.unit or "-", f"{channel.low:.4g}", f"{channel.high:.4g}", f"{channel.std:.4g}",
+        str(channel.missing.samples), f"{channel.quantum:.3g}" if channel.quantum else "-", str(channel.stuck.samples),
+        str(channel.saturated), str(channel.outliers.size), f"{channel.hum.rms:.3g}" if channel.hum else "-",
+    )  # fmt: skip
+
+
+def describe_jitter(clock: ClockQuality) -> str:
+    """Return the clock's jitter for people."""
+    if clock.jitter_max <= 1e-6 * clock.period:
+        return "no jitter"
+    text = f"jitter {clock.jitter_rms / clock.period:.2%} rms, {clock.jitter_max / clock.period:.2%} at most"
+    return text + (f" (timestamps rounded to {clock.rounding:.3g} s)" if clock.rounded_only else "")
+
+
+def _align(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _fields(data: Any) -> dict[str, Any]:
+    return {name: getattr(data, name) for name in data.__dataclass_fields__}
+
+
+def _excitation_dict(excitation: InputExcitation) -> dict[str, Any]:
+    bands = [_fields(band) for band in excitation.bands]
+    for band in bands:
+        band["told"] = band.pop("usable")  # the name in schema 1
+    return {"told_hz": excitation.usable_hz, "sentence": excitation.sentence, "bands": bands}
+
+
+def _channel_dict(channel: ChannelQuality) -> dict[str, Any]:
+    return {
+        "unit": channel.unit, "low": channel.low, "high": channel.high, "mean": channel.mean, "std": channel.std,
+        "missing": channel.missing.samples, "constant": channel.constant, "quantisation": channel.quantum,
+        "held": channel.held, "stuck": channel.stuck.samples, "saturated": channel.saturated,
+        "rails": [
+            {"side": rail.side, "value": rail.value, "samples": rail.runs.samples, "clear": rail.clear}
+            for rail in channel.rails
+        ],
+        "outliers": int(channel.outliers.size),
+        "hum": _fields(channel.hum) if channel.hum else None,
+    }  # fmt: skip
