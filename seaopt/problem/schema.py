@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, model_validator
 
+from seaopt.control.laws.limits import BY_NAME
+
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
@@ -216,6 +218,11 @@ class NotchTable(_Strict):
     depth: Number | None = None
 
 
+def _limit(name: str) -> Any:
+    """Return the field of a limit, with default and description of its row."""
+    return Field(default=BY_NAME[name].default, description=BY_NAME[name].description)
+
+
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
@@ -224,17 +231,17 @@ class ControllerTable(_Strict):
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
     derivative: Literal["error", "measurement"] = "error"
-    bandwidth_hz: Number
+    bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
     sample_rate_hz: Number = 1000.0
     delay_samples: Whole = 1
-    max_sensitivity: Number | None = None
-    max_complementary: Number | None = None
-    min_disk_margin: Number | None = None
-    max_reference_peak: Number | None = None
-    max_noise_gain: Number | None = None
-    min_sensitivity_bandwidth_hz: Number | None = None
-    passive_band_hz: tuple[Number, Number] | None = None
+    max_sensitivity: Number | None = _limit("max_sensitivity")
+    max_complementary: Number | None = _limit("max_complementary")
+    min_disk_margin: Number | None = _limit("min_disk_margin")
+    max_reference_peak: Number | None = _limit("max_reference_peak")
+    max_noise_gain: Number | None = _limit("max_noise_gain")
+    min_sensitivity_bandwidth_hz: Number | None = _limit("min_sensitivity_bandwidth_hz")
+    passive_band_hz: tuple[Number, Number] | None = _limit("passive_band_hz")
     objective: Literal["disturbance", "noise"] = "disturbance"
     robust_to: list[Name] = []
     draws: Annotated[Whole, Field(ge=0, le=200)] = 0

@@ -42,6 +42,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.crossings import crossings, with_minima
 from seaopt.control.loops.loop import GROWING, Loop
@@ -180,7 +181,7 @@ def passivity(
     law = controller.measurement
     impedance, angle = _curves(port, law, ts, controller.delay_samples)
     f = with_minima(angle, with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
-    stable = held_stable(port, controller)
+    stable = held_stable(port, law, ts, controller.delay_samples)
     bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
     least = int(np.argmin(np.real(z)))
@@ -197,15 +198,16 @@ def passivity(
     )
 
 
-def least_cosine(
+def measure_port(
     port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
-) -> tuple[float, float]:
-    """Return the least Re Z/abs(Z) in a band, refined to rounding, and the frequency in Hz where it is."""
+) -> PortFigures:
+    """Return the least Re Z/abs(Z) in a band, refined to rounding, where it is, and whether the held loop is stable."""
     _, angle = _curves(port, law, sample_time_s, delay_samples)
     f = with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
-    found = angle(f)
-    least = int(np.argmin(found))
-    return float(found[least]), float(f[least])
+    cosine = angle(f)
+    least = int(np.argmin(cosine))
+    stable = held_stable(port, law, sample_time_s, delay_samples)
+    return PortFigures(least_cosine=float(cosine[least]), at_hz=float(f[least]), held_stable=stable)
 
 
 def passivity_rows(
@@ -247,16 +249,16 @@ def passivity_rows(
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 
-def held_stable(port: Port, controller: Controller) -> bool:
+def held_stable(port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
     a, b, c, d = port.link_held()
     late = np.array([port.delay_s])
-    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), controller.sample_time_s, late)
+    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), sample_time_s, late)
     plant = DigitalPlant(
-        a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=controller.sample_time_s,
-        delay_samples=controller.delay_samples, static_gain=np.nan,
+        a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=sample_time_s, delay_samples=delay_samples,
+        static_gain=np.nan,
     )  # fmt: skip
-    poles = Loop(plant=plant, reference=controller.measurement, measurement=controller.measurement).eigenvalues()
+    poles = Loop(plant=plant, reference=law, measurement=law).eigenvalues()
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 
 

@@ -1,4 +1,4 @@
-"""What is asked of a controller."""
+"""The specification of a controller, for the tuner and the certificate: a bandwidth, the limits, and what runs it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ import math
 from dataclasses import asdict, fields
 from typing import Any, Literal
 
+from seaopt.control.laws.limits import BY_NAME, FIELDS, Limit
 from seaopt.control.laws.structures import STRUCTURES, Derivative, Notch, Structure
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
 
-LIMITS = ("max_sensitivity", "max_complementary", "max_reference_peak", "max_noise_gain")
-OPTIONAL = ("min_disk_margin", "min_sensitivity_bandwidth_hz", "current_limit_A", "step_N")
+LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
+OPTIONAL = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz", "current_limit_A", "step_N")
 MAX_DELAY_SAMPLES = 1000
 LOWEST_HZ = 1e-3  # limits are kept from here
 
 
 @record
 class ControllerSpec:
-    """A bandwidth and the limits to keep; a limit left out (None) is not imposed.
+    """A bandwidth and the limits to keep, those of `laws.limits`; a limit left out (None) is not imposed.
 
     Parameters
     ----------
@@ -77,11 +78,11 @@ class ControllerSpec:
     derivative: Derivative = "error"
     sample_rate_hz: float = 1000.0
     delay_samples: int = 1
-    max_sensitivity: float | None = None
-    max_complementary: float | None = None
-    min_disk_margin: float | None = None
-    max_reference_peak: float | None = None
-    max_noise_gain: float | None = None
+    max_sensitivity: float | None = BY_NAME["max_sensitivity"].default
+    max_complementary: float | None = BY_NAME["max_complementary"].default
+    min_disk_margin: float | None = BY_NAME["min_disk_margin"].default
+    max_reference_peak: float | None = BY_NAME["max_reference_peak"].default
+    max_noise_gain: float | None = BY_NAME["max_noise_gain"].default
     min_sensitivity_bandwidth_hz: float | None = None
     passive_band_hz: tuple[float, float] | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
@@ -121,28 +122,27 @@ class ControllerSpec:
             raise ControlError(
                 f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give 0, 1, ..."
             )
-        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *LIMITS, *OPTIONAL):
+        for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *OPTIONAL):
             value = getattr(self, name)
-            if value is None and name in (*LIMITS, *OPTIONAL):
+            if value is None and name in OPTIONAL:
                 continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
                 raise ControlError(f"{name} = {value!r} is not a number; give one")
 
     def _check_limits(self) -> None:
-        for name in LIMITS:
-            value = getattr(self, name)
-            least = 0.0 if name in ("max_noise_gain", "max_complementary") else 1.0
-            if value is not None and not value > least:
-                raise ControlError(f"{name} = {value:g} can be met by no loop; give more than {least:g}")
+        for limit in LEVELS:
+            value = getattr(self, limit.name)
+            if value is not None and not limit.in_range(value):
+                upper = "" if limit.below is None else f" and less than {limit.below:g}"
+                raise ControlError(
+                    f"{limit.name} = {value:g} can be met by no loop; give more than {limit.above:g}{upper}"
+                )
         wanted = self.min_sensitivity_bandwidth_hz
         if wanted is not None and not 0.0 <= wanted < self.bandwidth_hz:
             raise ControlError(
                 f"min_sensitivity_bandwidth_hz = {wanted:g} is not between 0 and bandwidth_hz = "
                 f"{self.bandwidth_hz:g}; lower it"
             )
-        disk = self.min_disk_margin
-        if disk is not None and not 0.0 < disk < 2.0:
-            raise ControlError(f"min_disk_margin = {disk:g} can be met by no loop; give more than 0 and less than 2")
         self._check_notch()
         self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
@@ -155,9 +155,9 @@ class ControllerSpec:
     def _check_band(self) -> None:
         if self.passive_band_hz is None:
             return
-        given: Any = self.passive_band_hz
-        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(f, (int, float)) for f in given):
-            raise ControlError(f"passive_band_hz = {given!r} is not a band; give (low, high)")
+        band: Any = self.passive_band_hz
+        if not isinstance(band, tuple) or len(band) != 2 or not all(isinstance(f, (int, float)) for f in band):
+            raise ControlError(f"passive_band_hz = {band!r} is not a band; give (low, high)")
         low, high = self.passive_band_hz
         if not LOWEST_HZ <= low < high < 0.5 * self.sample_rate_hz:
             raise ControlError(
@@ -182,13 +182,19 @@ class ControllerSpec:
         """Seconds between samples."""
         return 1.0 / self.sample_rate_hz
 
+    def allowed(self, limit: Limit) -> float | None:
+        """Return what a limit allows; None where it is not imposed."""
+        value = getattr(self, limit.name) if limit.has_field else limit.allowed
+        if value is None:
+            return None if limit.bandwidth_divisor is None else self.bandwidth_hz / limit.bandwidth_divisor
+        return value if limit.allowed is None else limit.allowed
+
     @property
     def sensitivity_bandwidth_limit_hz(self) -> float:
         """The least sensitivity bandwidth: as given, or bandwidth_hz/5."""
-        given = self.min_sensitivity_bandwidth_hz
-        return self.bandwidth_hz / 5.0 if given is None else given
+        return float(self.allowed(BY_NAME["min_sensitivity_bandwidth_hz"]) or 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
-        own = {field.name: getattr(self, field.name) for field in fields(self)}
-        return own | {"notch": None if self.notch is None else asdict(self.notch)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return values | {"notch": None if self.notch is None else asdict(self.notch)}

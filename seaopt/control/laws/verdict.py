@@ -1,97 +1,97 @@
-"""Whether measured figures keep a specification, and how near they come to its limits."""
+"""Whether measured loops keep the limits of a specification, for the tuner and for the certificate alike."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
+from seaopt.control.laws.limits import LIMITS, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.loops.loop import Loop
+from seaopt.records import record
 
-BANDWIDTH_TOLERANCE = 0.005
-ROUNDING = 1e-6
-PASSIVE = -1e-9  # Re Z/abs(Z) that is still called zero
-
-Port = tuple[float, float] | None  # the least Re Z/abs(Z) in the passive band, and where in Hz, if one is asked for
+NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
 
 
-class Use(NamedTuple):
-    """One limit: its name, with the plant where it holds for all, the figure, what is allowed, and their ratio."""
+@record(eq=False)
+class Verdict:
+    """One limit against one loop's figure; `plant` is the loop's name."""
 
-    label: str
+    limit: Limit
+    plant: str
     value: float
     allowed: float
-    ratio: float
+    met: bool
+
+    @property
+    def label(self) -> str:
+        """The limit's name, with the plant where it holds for all."""
+        return f"{self.limit.name} ({self.plant})" if self.limit.scope == "every plant" else self.limit.name
 
 
-def uses(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures]) -> list[Use]:
-    """Return each peak limit that is imposed; the first figures are the design plant's."""
-    out: list[Use] = []
-
-    def at_most(label: str, value: float, allowed: float | None) -> None:
-        if allowed is not None:
-            out.append(Use(label, value, allowed, value / allowed))
-
-    for name, item in zip(names, figures, strict=True):
-        at_most(f"max_sensitivity ({name})", item.ms, spec.max_sensitivity)
-        at_most(f"max_complementary ({name})", item.mt, spec.max_complementary)
-        if spec.min_disk_margin is not None:
-            ratio = spec.min_disk_margin / max(item.disk_margin, 1e-12)
-            out.append(Use(f"min_disk_margin ({name})", item.disk_margin, spec.min_disk_margin, ratio))
-    at_most("max_reference_peak", figures[0].reference_peak, spec.max_reference_peak)
-    at_most("max_noise_gain", figures[0].noise_gain, spec.max_noise_gain)
-    return out
+def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope) -> list[Verdict]:
+    """Judge a loop by every limit of a scope that the specification imposes."""
+    verdicts: list[Verdict] = []
+    for limit in LIMITS:
+        allowed = spec.allowed(limit)
+        if limit.scope != scope or allowed is None:
+            continue
+        value = limit.figure(loop)
+        met = limit.keeps(value, allowed) and (limit.condition is None or limit.condition(loop))
+        verdicts.append(Verdict(limit=limit, plant=loop.name, value=value, allowed=allowed, met=met))
+    return verdicts
 
 
-def broken(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], port: Port = None) -> list[str]:
-    """Return the limits that the figures break, with the plant that breaks them."""
-    design = figures[0]
-    out = [f"stability ({name})" for name, item in zip(names, figures, strict=True) if not item.stable]
-    out += [use.label for use in uses(spec, names, figures) if use.ratio > 1 + ROUNDING]
-    reached = design.bandwidth_hz
-    if reached is None or abs(reached / spec.bandwidth_hz - 1) > BANDWIDTH_TOLERANCE:
-        out.append("bandwidth_hz")
-    if design.sensitivity_bandwidth_hz < spec.sensitivity_bandwidth_limit_hz * (1 - 1e-3):
-        out.append("min_sensitivity_bandwidth_hz")
-    if port is not None and port[0] < PASSIVE:
-        out.append("passive_band_hz")
-    return out
+def judge_all(spec: ControllerSpec, loops: Sequence[MeasuredLoop]) -> list[Verdict]:
+    """Judge every plant's loop, and the design plant's, which is the first, by its own limits too."""
+    verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant")]
+    return verdicts + judge(spec, loops[0], "design plant")
 
 
-def active(spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], port: Port = None) -> list[str]:
+def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
+    """Return the limits that are broken, with the plant that breaks them."""
+    return [verdict.label for verdict in verdicts if not verdict.met]
+
+
+def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
     """Return the limits that are met with no more than the reserve and a hundredth to spare."""
-    near = 1.0 - spec.reserve - 0.01
-    out = [use.label for use in uses(spec, names, figures) if use.ratio > near]
-    if figures[0].sensitivity_bandwidth_hz < 1.01 * spec.sensitivity_bandwidth_limit_hz:
-        out.append("min_sensitivity_bandwidth_hz")
-    if port is not None and port[0] < spec.reserve + 0.01:
-        out.append("passive_band_hz")
-    return out
+    near = {"figure": 1.0 - NEARLY_USED - spec.reserve, "curve": 1.0 - NEARLY_USED, "none": np.inf}
+    return [
+        verdict.label
+        for verdict in verdicts
+        if verdict.limit.usage(verdict.value, verdict.allowed) > near[verdict.limit.reserve]
+    ]
 
 
-def explained(
-    spec: ControllerSpec, names: tuple[str, ...], figures: list[LoopFigures], loop: Loop, port: Port = None
-) -> tuple[str, ...]:
-    """Return what blocks, each limit with the figure that the best compromise reaches; `loop` is the design plant's."""
-    known = {use.label: f"{use.label} {use.value:.4g} of {use.allowed:g}" for use in uses(spec, names, figures)}
-    design = figures[0]
-    known["bandwidth_hz"] = (
-        "bandwidth_hz, of which there is none" if design.bandwidth_hz is None
-        else f"bandwidth_hz {design.bandwidth_hz:.4g} of {spec.bandwidth_hz:g}"
-    )  # fmt: skip
-    known["min_sensitivity_bandwidth_hz"] = _sensitivity_told(spec.sensitivity_bandwidth_limit_hz, loop)
-    if port is not None and spec.passive_band_hz is not None:
+def explain_broken(spec: ControllerSpec, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
+    """Return each limit that is broken with the figure that was reached; `loop` is the design plant's."""
+    return [_explain(spec, verdict, design, loop) for verdict in verdicts if not verdict.met]
+
+
+def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:
+    limit, port = verdict.limit, design.port
+    if not limit.has_field:
+        return verdict.label
+    if limit.curve is not None and limit.curve.symbol:
+        return f"{limit.name}, {_reached(spec, verdict, loop)}"
+    if limit.name == "passive_band_hz" and port is not None and spec.passive_band_hz is not None:
         low, high = spec.passive_band_hz
-        known["passive_band_hz"] = (
-            f"passive_band_hz = [{low:g}, {high:g}], Re Z/|Z| {port[0]:.3g} of 0 at {port[1]:.4g} Hz"
-        )
-    return tuple(known.get(label, label) for label in broken(spec, names, figures, port))
+        held = "" if port.held_stable else "; the loop grows with its link held"
+        return f"{limit.name} = [{low:g}, {high:g}], Re Z/|Z| {port.least_cosine:.3g} of 0 at {port.at_hz:.4g} Hz{held}"
+    if limit.sense == "equal to" and not np.isfinite(verdict.value):
+        return f"{verdict.label}, of which there is none"
+    return f"{verdict.label} {verdict.value:.4g} of {verdict.allowed:g}"
 
 
-def _sensitivity_told(limit_hz: float, loop: Loop) -> str:
-    """Return by how much abs(S) exceeds -3 dB: where it first does says little when it lies along it."""
-    f = loop.grid()
-    reached = float(np.max(np.abs(loop.sensitivity(np.append(f[f < limit_hz], limit_hz)))))
-    return f"min_sensitivity_bandwidth_hz, |S| reaches {reached:.4f} below {limit_hz:g} Hz, {HALF_POWER:.4f} allowed"
+def _reached(spec: ControllerSpec, verdict: Verdict, loop: Loop) -> str:
+    """Return how far a curve is off its level: where it first crosses says little when it lies along the level."""
+    curve = verdict.limit.curve
+    assert curve is not None and curve.until_hz is not None
+    until, grid = curve.until_hz(verdict.allowed, spec.bandwidth_hz), loop.grid()
+    f = np.append(grid[grid < until], until)
+    p, ts = loop.plant.response(f), loop.plant.sample_time_s
+    c_y, c_r = loop.measurement.response(f, ts), loop.reference.response(f, ts)
+    values = np.abs(curve.numerator(p, c_y, c_r, p * c_y)) / np.abs(1.0 + p * c_y)
+    extreme = f"falls to {np.min(values):.4f}" if curve.floor else f"reaches {np.max(values):.4f}"
+    return f"{curve.symbol} {extreme} below {until:g} Hz, {curve.level(verdict.allowed):.4f} allowed"

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.tuning.optimisation_problem import Grid, Point, Task, prominent
+from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, prominent
 from seaopt.records import record
 
 STEPS = 8
@@ -66,7 +66,7 @@ class _Affine:
     by_r: Complex[np.ndarray, "3 m"]
 
 
-def improved(task: Task, grid: Grid, start: Point, steps: int = STEPS) -> tuple[float, Point]:
+def improved(task: Task, grid: Grid, start: LawNumbers, steps: int = STEPS) -> tuple[float, LawNumbers]:
     """Return the merit and the numbers after successive quadratic programs in the gains, filters as they are.
 
     Parameters
@@ -112,7 +112,7 @@ def _floor(task: Task, grid: Grid) -> Float[np.ndarray, " 3"]:
     return 0.1 * inverse * np.array([1.0, 0.1 * w_b, 1.0 / w_b])
 
 
-def _merit(task: Task, grid: Grid, x: Point) -> float:
+def _merit(task: Task, grid: Grid, x: LawNumbers) -> float:
     """Return the logarithm of the objective and the price of the worst usage."""
     usage = task.usage(grid, x)
     worst = max(float(np.max(curve)) for curve in usage.values())
@@ -120,11 +120,11 @@ def _merit(task: Task, grid: Grid, x: Point) -> float:
     return float(np.log(task.objective(grid, x))) + PRICE * max(0.0, worst - 1.0)
 
 
-def _integral(task: Task, x: Point) -> float:
+def _integral(task: Task, x: LawNumbers) -> float:
     return task.least_rate * (1 + x[0]) - x[1]
 
 
-def _affine(task: Task, grid: Grid, x: Point) -> _Affine:
+def _affine(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     series, integral, rate, _ = task.terms(grid, x)
     c_r, c_y = task.law(grid, x)
     by_y = series * np.array([np.ones_like(grid.q), integral, rate])
@@ -140,9 +140,9 @@ def _along(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "3 n"]) -> 
     return np.real(np.conj(value) / size * by).T
 
 
-def _rows(task: Task, grid: Grid, x: Point, law: _Affine) -> _Rows:
+def _rows(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _Rows:
     """Return the linearised limits at the frequencies and plants where they matter."""
-    rows, limits, m = _Rows(), task.limits(), grid.f.size
+    rows, m = _Rows(), grid.f.size
     usage = task.usage(grid, x)
 
     def chosen(name: str) -> tuple[Any, Any, Any, Any]:
@@ -152,36 +152,26 @@ def _rows(task: Task, grid: Grid, x: Point, law: _Affine) -> _Rows:
         p, column = grid.p.ravel()[index], index % m
         return usage[name].ravel()[index], p, column, 1.0 + p * law.c_y[column]
 
-    for name in ("ms", "slow"):
+    for name, curve in CURVES.items():
         used, p, column, one = chosen(name)
-        slope = _along(one, p * law.by_y[:, column]) / np.abs(one)[:, None]
-        rows.add(2.0 - 1.0 / used, -slope / used[:, None])
-    kinds: dict[str, tuple[float, Any]] = {
-        "mt": (limits.mt, lambda p, k: (p * law.c_y[k], p * law.by_y[:, k])),
-        "disk": (limits.disk, lambda p, k: (1.0 - p * law.c_y[k], -p * law.by_y[:, k])),
-        "peak": (limits.peak, lambda p, k: (p * law.c_r[k], p * law.by_r[:, k])),
-        "noise": (limits.noise, lambda p, k: (law.c_y[k], law.by_y[:, k])),
-    }
-    for name, (limit, of) in kinds.items():
-        used, p, column, one = chosen(name)
-        value, by = of(p, column)
-        near = _along(one, p * law.by_y[:, column])
-        size = limit * np.abs(one)[:, None]
-        rows.add(used, (_along(value, by) - limit * used[:, None] * near) / size)
-    used, p, column, one = chosen("low")
-    through, by = p * law.c_r[column], p * law.by_r[:, column]
-    near = _along(one, p * law.by_y[:, column]) / np.abs(one)[:, None]
-    rows.add(used, used[:, None] * (near - _along(through, by) / np.abs(through)[:, None]))
+        c_y, c_r, by_y, by_r = law.c_y[column], law.c_r[column], law.by_y[:, column], law.by_r[:, column]
+        near = _along(one, p * by_y) / np.abs(one)[:, None]
+        if curve.of == "1":  # the limit is on abs(1 + L) itself
+            rows.add(2.0 - 1.0 / used, -near / used[:, None])
+            continue
+        value, change = curve.numerator(p, c_y, c_r, p * c_y), curve.change(p, by_y, by_r, p * by_y)
+        relative = _along(value, change) / np.abs(value)[:, None]
+        rows.add(used, used[:, None] * ((near - relative) if curve.floor else (relative - near)))
     if task.port is not None:
-        used, _, column, _ = chosen("passive")
+        used, _, column, _ = chosen(PASSIVE)
         turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
-        rows.add(used, -np.real(turned * law.by_y[:, column]).T / (limits.passive * size[:, None]))
+        rows.add(used, -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * size[:, None]))
     _bandwidth_rows(task, grid, x, law, rows)
     rows.add(np.array([1.0 + _integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
     return rows
 
 
-def _bandwidth_rows(task: Task, grid: Grid, x: Point, law: _Affine, rows: _Rows) -> None:
+def _bandwidth_rows(task: Task, grid: Grid, x: LawNumbers, law: _Affine, rows: _Rows) -> None:
     at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
     p, one = grid.p[0, at], np.array([1.0 + grid.p[0, at] * law.c_y[at]])
     through = np.array([p * law.c_r[at]])
@@ -191,7 +181,7 @@ def _bandwidth_rows(task: Task, grid: Grid, x: Point, law: _Affine, rows: _Rows)
 
 
 def _objective(
-    task: Task, grid: Grid, x: Point, law: _Affine
+    task: Task, grid: Grid, x: LawNumbers, law: _Affine
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
     if task.spec.objective == "noise":
@@ -213,7 +203,7 @@ def _objective(
     return curvature / size, values / size, slopes / size
 
 
-def _step(task: Task, grid: Grid, x: Point, reach: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"] | None:
+def _step(task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"] | None:
     """Return the change of the gains that the quadratic program takes; None if it has no answer."""
     law = _affine(task, grid, x)
     rows = _rows(task, grid, x, law)

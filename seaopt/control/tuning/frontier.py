@@ -8,10 +8,10 @@ from dataclasses import fields, replace
 from typing import Any
 
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.loop import LoopFigures
-from seaopt.control.tuning.optimisation_problem import Point, Task
-from seaopt.control.tuning.tuner import controller_of, disturbance, make_task, solved
+from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
+from seaopt.control.tuning.tuner import disturbance, make_controller, make_task, solve
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -132,23 +132,23 @@ def sweep(
     task = make_task(plant, params, specs[0], robust_to or {}, draws)
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
-    warm: tuple[Point, ...] = ()
+    warm: tuple[LawNumbers, ...] = ()
     for one in specs:
         present = replace(task, spec=one)
-        x, figures = solved(present, warm)
-        controller = controller_of(present, x, figures, (plant, params))
-        rows.append(_row(present, x, figures, controller))
+        x, loops = solve(present, warm)
+        controller = make_controller(present, x, loops, (plant, params))
+        rows.append(_row(present, x, loops, controller))
         controllers.append(controller)
         warm = (x,)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
 
 
-def _row(task: Task, x: Point, figures: list[LoopFigures], controller: Controller) -> FrontierRow:
-    design, f_b = figures[0], task.spec.bandwidth_hz
-    worst = max(range(len(figures)), key=lambda i: figures[i].ms)
+def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Controller) -> FrontierRow:
+    design, f_b = loops[0].figures, task.spec.bandwidth_hz
+    worst = max(loops, key=lambda loop: loop.figures.ms)
     return FrontierRow(
-        bandwidth_hz=f_b, feasible=controller.feasible, noise_gain=design.noise_gain, ms=figures[worst].ms,
-        ms_plant=task.names[worst], disturbance=max(disturbance(task.loop(x, i), f_b) for i in range(len(figures))),
+        bandwidth_hz=f_b, feasible=controller.feasible, noise_gain=design.noise_gain, ms=worst.figures.ms,
+        ms_plant=worst.name, disturbance=max(disturbance(task.loop(x, i), f_b) for i in range(len(loops))),
         sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz, phase_margin_deg=design.phase_margin_deg,
         disk_margin=design.disk_margin, force_limit_N=controller.force_limit(f_b),
         blocked_by=controller.blocked_by,

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.laws.structures import terms
-from seaopt.control.tuning.optimisation_problem import EVERYWHERE, NAMES, ON_DESIGN, Grid, Point, Task, prominent
+from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, prominent
 
 POINTS = 24  # of each kind of limit
 SPREAD = 10  # of them, at even distances
@@ -78,7 +78,7 @@ class _Complex:
         return self.re * self.re + self.im * self.im
 
 
-def polished(task: Task, grid: Grid, start: Point, rounds: int = 5) -> Point:
+def polished(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNumbers:
     """Return the numbers at a local optimum, or the start if no better ones are found.
 
     Parameters
@@ -109,7 +109,7 @@ def polished(task: Task, grid: Grid, start: Point, rounds: int = 5) -> Point:
     return x
 
 
-def _add_missed(task: Task, grid: Grid, x: Point, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
+def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
     """Add the points where more of a limit is used than at any chosen one, in place of the last; tell if there are."""
     missed = False
     for name, curve in task.usage(grid, x).items():
@@ -121,7 +121,7 @@ def _add_missed(task: Task, grid: Grid, x: Point, chosen: dict[str, Int[np.ndarr
     return missed
 
 
-def _choose(task: Task, grid: Grid, x: Point) -> dict[str, Int[np.ndarray, " n"]]:
+def _choose(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.ndarray, " n"]]:
     """Return, for each limit, flat indices of POINTS points: those that matter most, and some at even distances."""
     chosen: dict[str, Int[np.ndarray, " n"]] = {}
     for name, curve in task.usage(grid, x).items():
@@ -138,12 +138,12 @@ def _program(
     quadrature: int, observer: bool, notch: bool, feedback_only: bool, noise: bool, passive: bool
 ) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
-    kinds = (*EVERYWHERE, *ON_DESIGN, *(["passive"] * passive))
+    kinds = (*CURVES, *([PASSIVE] * passive))
     n = POINTS * len(kinds)
     total = n + quadrature * WORST * (not noise)
     shapes = {
         "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
-        "inv_im": total, "weight": quadrature, "ln_limit": n, "at": 8, "ts": 1, "kff": 1, "scale": 8, "rate": 1,
+        "inv_im": total, "weight": quadrature, "ln_level": n, "at": 8, "ts": 1, "kff": 1, "scale": 8, "rate": 1,
         "unit": 2 * POINTS * passive,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
@@ -164,31 +164,27 @@ def _program(
 
     names = [name for name in shapes if name.endswith(("_re", "_im"))]
     p, c_y, c_r = law({name: data[name][:n] for name in names})
-    open_loop, through = p * c_y, p * c_r
+    open_loop = p * c_y
     distance = (open_loop + 1.0).square() + NEGLIGIBLE
     slices = {kind: slice(POINTS * i, POINTS * (i + 1)) for i, kind in enumerate(kinds)}
-    above: dict[str, Any] = {
-        "ms": 1.0, "mt": open_loop.square(), "disk": (1.0 - open_loop).square(), "peak": through.square(),
-        "noise": c_y.square(), "slow": 1.0, "low": 1.0,
-    }  # fmt: skip
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
-        if kind == "passive":  # P is the port's loop here
+        if kind == PASSIVE:  # P is the port's loop here
             u, one = _Complex(data["unit"][:POINTS], data["unit"][POINTS:]), open_loop + 1.0
             cosine = (u.re * one.re[where] + u.im * one.im[where]) / ca.sqrt(distance[where])
-            usage[kind] = (1 - cosine) / ca.exp(data["ln_limit"][where]) - 1
+            usage[kind] = (1 - cosine) / ca.exp(data["ln_level"][where]) - 1
             continue
-        top = above[kind] if isinstance(above[kind], float) else above[kind][where]
-        size = 0.5 * ca.log((top + NEGLIGIBLE) / distance[where])
-        if kind == "low":
-            size = 0.5 * ca.log(distance[where] / (2 * through.square()[where] + NEGLIGIBLE))
-        usage[kind] = size - data["ln_limit"][where]
+        curve = CURVES[kind]
+        value = curve.numerator(p, c_y, c_r, open_loop)
+        top = value.square()[where] if isinstance(value, _Complex) else value
+        size = 0.5 * ca.log((top + NEGLIGIBLE) / distance[where]) - data["ln_level"][where]
+        usage[kind] = -size if curve.floor else size
     point = {name: data["at"][i] for i, name in enumerate(names)}
     p, c_y, c_r = law(point)
     bandwidth = 0.5 * ca.log(2 * (p * c_r).square() / (p * c_y + 1.0).square())
     if noise:
-        where = slices["noise"]
-        worst = [usage["noise"] + data["ln_limit"][where] - t]
+        where = slices["max_noise_gain"]
+        worst = [usage["max_noise_gain"] + data["ln_level"][where] - t]
     else:
         p, c_y, _ = law({name: data[name][n:] for name in names})
         size = 1 / ca.sqrt((p * c_y + 1.0).square() + NEGLIGIBLE)
@@ -208,18 +204,17 @@ def _program(
     return ca.nlpsol("polish", "ipopt", nlp, options), list(data)
 
 
-def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarray, " n"]]) -> Point | None:
+def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    limits = task.limits()._asdict() | {"low": 1.0}
-    limits["slow"] = 1.0 / limits["slow"]
-    m, kinds, passive = grid.f.size, (*EVERYWHERE, *ON_DESIGN), task.port is not None
+    levels = task.levels() | {PASSIVE: 1.0 - spec.reserve}
+    m, kinds, passive = grid.f.size, (*CURVES,), task.port is not None
     flat = np.concatenate([chosen[kind] for kind in kinds])
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
     if passive:
-        own, kinds = chosen["passive"], (*kinds, "passive")
-        columns, p = np.concatenate([columns, own]), np.concatenate([p, grid.port[own]])
-        unit = np.where(grid.unit[own] == 0.0, 1.0, grid.unit[own])  # outside the band nothing is asked
+        at_port, kinds = chosen[PASSIVE], (*kinds, PASSIVE)
+        columns, p = np.concatenate([columns, at_port]), np.concatenate([p, grid.port[at_port]])
+        unit = np.where(grid.unit[at_port] == 0.0, 1.0, grid.unit[at_port])  # outside the band nothing is asked
     weights = np.zeros(0)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
@@ -235,7 +230,7 @@ def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarra
     parts = [part for z in every for part in (np.real(z), np.imag(z))]
     one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
     data = [
-        *parts, weights, np.repeat(np.log([limits[kind] for kind in kinds]), POINTS),
+        *parts, weights, np.repeat(np.log([levels[kind] for kind in kinds]), POINTS),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
         [task.least_rate], np.real(unit), np.imag(unit),
     ]  # fmt: skip
@@ -258,11 +253,11 @@ def _solve(task: Task, grid: Grid, start: Point, chosen: dict[str, Int[np.ndarra
         lbx=[*(np.maximum(low, start / REACH) / scale), -np.inf, 0.0],
         ubx=[*(np.minimum(high, REACH * np.maximum(start, 0.3 * scale)) / scale), np.inf, np.inf],
     )  # fmt: skip
-    x = np.array(found["x"]).ravel()[: len(NAMES)] * scale
+    x = np.array(found["x"]).ravel()[: start.size] * scale
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 
 
-def _integrals(task: Task, grid: Grid, x: Point) -> Float[np.ndarray, " n"]:
+def _integrals(task: Task, grid: Grid, x: LawNumbers) -> Float[np.ndarray, " n"]:
     """Return the integral of abs(S) of every plant."""
     _, c_y = task.law(grid, x)
     return (1.0 / np.abs(1.0 + grid.p * c_y)) @ task.weights(grid.f)

@@ -1,6 +1,8 @@
 r"""What is to be tuned: plants, frequencies and limits as arrays, and a law as a vector of eight numbers.
 
-Every limit is one curve over frequency, its *usage*, which must not exceed 1:
+Every limit is one curve over frequency, its *usage*, which must not exceed 1 (`seaopt.control.laws.limits`):
+:math:`|X| / (m\,|1 + L|)`, or its inverse where abs(X) is to be above. As m is what the specification allows less the
+reserve, these are for the rows of today
 
 .. math::
     \frac{1}{M_s |1 + L|}, \quad \frac{|L|}{M_t |1 + L|}, \quad \frac{\alpha\,|1 - L|}{2\,|1 + L|}
@@ -17,12 +19,12 @@ taken off.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.passivity import least_cosine
+from seaopt.control.laws.limits import BY_NAME, LIMITS, MeasuredLoop, Scope
+from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import Gains, Nominal, Notch, Observer, Terms, terms
 from seaopt.control.loops.loop import Loop
@@ -42,23 +44,13 @@ NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
 HIGHEST_NOTCH = 0.45  # of the sample rate
-NAMES = ("k_p", "k_i", "k_d", "T_f", "T_q", "notch_w", "notch_width", "notch_depth")
-EVERYWHERE = ("ms", "mt", "disk")  # limits of every plant
-ON_DESIGN = ("peak", "noise", "slow", "low")
+CURVES = {limit.name: limit.curve for limit in LIMITS if limit.curve is not None}
+SCOPES: dict[Scope, tuple[str, ...]] = {
+    scope: tuple(name for name in CURVES if BY_NAME[name].scope == scope) for scope in ("every plant", "design plant")
+}
+PASSIVE = "passive_band_hz"
 
-Point = Float[np.ndarray, " 8"]
-
-
-class Limits(NamedTuple):
-    """Peak limits with the reserve taken off; NO_LIMIT where none is imposed."""
-
-    ms: float
-    mt: float
-    disk: float  # 2 over the disk margin
-    peak: float
-    noise: float
-    slow: float  # abs(1 + L) at least
-    passive: float  # 1 - Re Z/abs(Z)
+LawNumbers = Float[np.ndarray, " 8"]  # k_p, k_i, k_d, T_f, T_q, notch_w, notch_width, notch_depth
 
 
 @record(eq=False)
@@ -110,24 +102,27 @@ class Task:
         """The least k_i/(1 + k_p), rad/s: an integral does something, and a disturbance observer integrates itself."""
         return INTEGRAL_RAD_S if self.spec.structure == "pid" else 0.0
 
-    def tidy(self, x: Point) -> Point:
+    def tidy(self, x: LawNumbers) -> LawNumbers:
         """Return numbers within their bounds; beside an observer an integral that does nothing becomes none."""
         x = np.clip(x, *self.bounds())
         if self.nominal is not None and x[1] < NO_RATE * (1 + x[0]):
             x[1] = 0.0
         return x
 
-    def limits(self) -> Limits:
-        """Return the limits to keep while tuning."""
-        keep, s = 1.0 - self.spec.reserve, self.spec
-        given = (
-            s.max_sensitivity, s.max_complementary, None if s.min_disk_margin is None else 2.0 / s.min_disk_margin,
-            s.max_reference_peak, s.max_noise_gain,
-        )  # fmt: skip
-        peaks = (NO_LIMIT if value is None else max(value * keep, 1e-6) for value in given)
-        return Limits(*peaks, slow=np.sqrt(2.0) / keep, passive=keep)
+    def levels(self) -> dict[str, float]:
+        """Return each curve's level, with the reserve taken off; one that is never reached where none is imposed."""
+        levels: dict[str, float] = {}
+        for name, curve in CURVES.items():
+            limit, allowed = BY_NAME[name], self.spec.allowed(BY_NAME[name])
+            keep = 1.0 if limit.reserve == "none" else 1.0 - self.spec.reserve
+            if allowed is None:
+                levels[name] = 1.0 / NO_LIMIT if curve.floor else NO_LIMIT
+            else:
+                level = curve.level(allowed)
+                levels[name] = level / keep if curve.floor else max(level * keep, 1e-6)
+        return levels
 
-    def bounds(self) -> tuple[Point, Point]:
+    def bounds(self) -> tuple[LawNumbers, LawNumbers]:
         """Return the least and largest values of the eight numbers; equal where a number is fixed or absent."""
         spec, ts = self.spec, self.spec.sample_time_s
         notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
@@ -146,7 +141,7 @@ class Task:
         low, high = (np.array(ends, dtype=float) for ends in zip(*ranges, strict=True))
         return low, high
 
-    def gains(self, x: Point) -> Gains:
+    def gains(self, x: LawNumbers) -> Gains:
         """Return a vector's numbers by name."""
         ts, notch = self.spec.sample_time_s, None
         if self.spec.notch is not None:
@@ -157,12 +152,12 @@ class Task:
             observer=None if self.nominal is None else Observer(nominal=self.nominal, T_q=float(x[4])),
         )  # fmt: skip
 
-    def loop(self, x: Point, plant: int = 0) -> Loop:
+    def loop(self, x: LawNumbers, plant: int = 0) -> Loop:
         """Return the loop around one plant."""
         reference, measurement = self.gains(x).transfer_functions(self.spec.structure, self.spec.sample_time_s)
         return Loop(plant=self.plants[plant], reference=reference, measurement=measurement)
 
-    def stable(self, x: Point) -> bool:
+    def stable(self, x: LawNumbers) -> bool:
         """Tell whether every plant's loop is stable, by its eigenvalues."""
         return all(np.max(np.abs(self.loop(x, i).eigenvalues())) < 1.0 for i in range(len(self.plants)))
 
@@ -184,13 +179,13 @@ class Task:
             )  # fmt: skip
         return Grid(f=f, q=q, p=p, kept=kept, inverse=inverse, port=port, unit=unit)
 
-    def terms(self, grid: Grid, x: Point) -> Terms:
+    def terms(self, grid: Grid, x: LawNumbers) -> Terms:
         """Return the law's terms on a grid."""
         observer = None if self.nominal is None else (x[4], grid.kept, grid.inverse)
         notch = None if self.spec.notch is None else (x[5], x[6], x[7])
         return terms(grid.q, self.spec.sample_time_s, x[3], observer, notch)
 
-    def law(self, grid: Grid, x: Point) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
+    def law(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
         """Return C_r and C_y on a grid."""
         series, integral, rate, observer = self.terms(grid, x)
         both = x[0] + x[1] * integral
@@ -198,58 +193,64 @@ class Task:
         on_reference = x[2] * rate if self.spec.derivative == "error" else 0.0
         return series * (both + on_reference + self.k_ff), c_y
 
-    def usage(self, grid: Grid, x: Point, *, design: bool = True) -> dict[str, Float[np.ndarray, "k m"]]:
+    def usage(self, grid: Grid, x: LawNumbers, *, design: bool = True) -> dict[str, Float[np.ndarray, "k m"]]:
         """Return how much of each limit is used, by its name, arrays of one row a plant.
 
         The limits of the design plant, which is then the grid's first, are left out on request.
         """
         c_r, c_y = self.law(grid, x)
-        out = self.everywhere(grid.p, c_y)
+        out = self.curves("every plant", grid.f, grid.p, c_y, c_r)
         if design:
-            out |= {name: value[None] for name, value in self.on_design(grid, c_y, c_r).items()}
+            out |= {name: value[None] for name, value in self.design_usage(grid, c_y, c_r).items()}
         return out
 
-    def everywhere(self, p: Complex[np.ndarray, "*k m"], c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
-        """Return the usage of the limits that every plant must keep."""
-        limits, open_loop = self.limits(), p * c_y
+    def curves(
+        self,
+        scope: Scope,
+        f: Float[np.ndarray, " m"],
+        p: Complex[np.ndarray, "*k m"],
+        c_y: Complex[np.ndarray, "*n m"],
+        c_r: Complex[np.ndarray, "*n m"],
+    ) -> dict[str, np.ndarray]:
+        """Return the usage of the limits that every plant, or the design plant, must keep."""
+        levels, open_loop = self.levels(), p * c_y
         distance = np.abs(1.0 + open_loop)
-        return {
-            "ms": 1.0 / (limits.ms * distance), "mt": np.abs(open_loop) / (limits.mt * distance),
-            "disk": np.abs(1.0 - open_loop) / (limits.disk * distance),
-        }  # fmt: skip
+        out: dict[str, np.ndarray] = {}
+        for name in SCOPES[scope]:
+            curve = CURVES[name]
+            size, allowed = np.abs(curve.numerator(p, c_y, c_r, open_loop)), levels[name] * distance
+            usage = allowed / np.maximum(size, 1e-12) if curve.floor else size / allowed
+            out[name] = usage if curve.until_hz is None else np.where(f <= self.until_hz(name), usage, 0.0)
+        return out
 
-    def on_design(
+    def until_hz(self, name: str) -> float:
+        """Return up to where a curve is looked at, a little beyond what is asked: that is one of the frequencies."""
+        curve, allowed = CURVES[name], self.spec.allowed(BY_NAME[name])
+        if curve.until_hz is None or allowed is None:
+            return np.inf
+        return curve.until_hz(allowed, self.spec.bandwidth_hz) * (1 + 1e-9)
+
+    def design_usage(
         self, grid: Grid, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
     ) -> dict[str, np.ndarray]:
         """Return the usage of the limits of the design plant, the grid's first."""
-        f, p, limits = grid.f, grid.p[0], self.limits()
-        distance, through = np.abs(1.0 + p * c_y), np.abs(p * c_r)
-        out = {
-            "peak": through / (limits.peak * distance), "noise": np.abs(c_y) / (limits.noise * distance),
-            "slow": np.where(self.slow(f), limits.slow / distance, 0.0),
-            "low": np.where(self.low(f), distance / np.maximum(np.sqrt(2.0) * through, 1e-12), 0.0),
-        }  # fmt: skip
+        out = self.curves("design plant", grid.f, grid.p[0], c_y, c_r)
         if self.port is not None:
             held = 1.0 + grid.port * c_y
             cosine = np.real(grid.unit * np.conj(held)) / np.maximum(np.abs(held), 1e-300)
-            out["passive"] = np.where(grid.unit != 0.0, (1.0 - cosine) / limits.passive, 0.0)
+            out[PASSIVE] = np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)
         return out
 
-    def least_cosine(self, x: Point) -> tuple[float, float] | None:
-        """Return the least Re Z/abs(Z) in the passive band and where it is; None where none is asked for."""
-        spec, band = self.spec, self.spec.passive_band_hz
-        if self.port is None or band is None:
-            return None
-        _, law = self.gains(x).transfer_functions(spec.structure, spec.sample_time_s)
-        return least_cosine(self.port, law, spec.sample_time_s, spec.delay_samples, band)
-
-    def slow(self, f: Float[np.ndarray, " m"]) -> np.ndarray:
-        """Tell where abs(S) must be below -3 dB."""
-        return f <= self.spec.sensitivity_bandwidth_limit_hz * (1 + 1e-9)
-
-    def low(self, f: Float[np.ndarray, " m"]) -> np.ndarray:
-        """Tell where abs(F/F_ref) must be above -3 dB."""
-        return f < 0.97 * self.spec.bandwidth_hz
+    def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
+        """Return the loop of every plant as limits are judged on it, the design plant's first."""
+        port, spec, band = None, self.spec, self.spec.passive_band_hz
+        if self.port is not None and band is not None:
+            _, law = self.gains(x).transfer_functions(spec.structure, spec.sample_time_s)
+            port = measure_port(self.port, law, spec.sample_time_s, spec.delay_samples, band)
+        return [
+            MeasuredLoop(name=name, figures=self.loop(x, i).figures(), port=None if i else port)
+            for i, name in enumerate(self.names)
+        ]
 
     def weights(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
@@ -259,13 +260,13 @@ class Task:
         out[first + 1 : last] += step
         return out
 
-    def miss(self, grid: Grid, x: Point) -> float:
+    def miss(self, grid: Grid, x: LawNumbers) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
         at = grid.at(np.array([int(np.argmin(np.abs(grid.f - self.spec.bandwidth_hz)))]))
         c_r, c_y = self.law(at, x)
         return float(np.log(np.abs(np.sqrt(2.0) * at.p[0] * c_r / (1 + at.p[0] * c_y)))[0])
 
-    def rank(self, grid: Grid, x: Point) -> tuple[float, float]:
+    def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
         """Return what to sort laws by: the worst usage if a limit is broken, then the objective.
 
         A bandwidth that is missed counts ten times a limit that is.
@@ -274,7 +275,7 @@ class Task:
         worst = max(worst, 1.0 + 10.0 * abs(self.miss(grid, x)))
         return (worst if worst > NEARLY_KEPT else 0.0), self.objective(grid, x)
 
-    def objective(self, grid: Grid, x: Point) -> float:
+    def objective(self, grid: Grid, x: LawNumbers) -> float:
         """Return the objective on a grid."""
         _, c_y = self.law(grid, x)
         distance = np.abs(1.0 + grid.p * c_y)
@@ -309,7 +310,11 @@ def frequencies(task: Task) -> Float[np.ndarray, " m"]:
     extra = np.sort(np.concatenate([np.zeros(0), *near]))
     extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
     slow, base = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW), np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
-    ends = [spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz, *(spec.passive_band_hz or ())]
+    ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]
+    for name, curve in CURVES.items():
+        allowed = spec.allowed(BY_NAME[name])
+        if curve.until_hz is not None and allowed is not None and BY_NAME[name].reserve == "curve":
+            ends.append(curve.until_hz(allowed, spec.bandwidth_hz))
     grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
     return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
 

@@ -26,7 +26,7 @@ from seaopt.control.tuning.optimisation_problem import (
     LOWEST_NOTCH,
     OBJECTIVE_HZ,
     Grid,
-    Point,
+    LawNumbers,
     Task,
     light_modes,
 )
@@ -38,7 +38,7 @@ IN_BAND = 20  # frequencies of the passive band
 TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: less is an encirclement
 
 
-def starts(task: Task, grid: Grid, count: int) -> list[Point]:
+def starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
     """Return up to `count` distinct stable starts, best first; `at_rest` if the scan has none.
 
     Parameters
@@ -55,7 +55,7 @@ def starts(task: Task, grid: Grid, count: int) -> list[Point]:
     found = [_ranked(task, coarse, shape) for shape in _shapes(task)]
     merit = np.concatenate([item[0] for item in found])
     points = np.concatenate([item[1] for item in found])
-    distinct: list[Point] = []
+    distinct: list[LawNumbers] = []
     tried = 0
     for k in np.argsort(merit):
         if len(distinct) == count or tried == 40 * count or not np.isfinite(merit[k]):
@@ -69,13 +69,13 @@ def starts(task: Task, grid: Grid, count: int) -> list[Point]:
     return distinct or [at_rest(task)]
 
 
-def at_rest(task: Task) -> Point:
+def at_rest(task: Task) -> LawNumbers:
     """Return the law with next to no feedback, stable because the plants are."""
     ts = task.spec.sample_time_s
     return task.tidy(np.array([0.0, task.least_rate, 0.0, ts, 10.0, 0.3, 0.5, 1.0]))
 
 
-def _alike(task: Task, x: Point, other: Point) -> bool:
+def _alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
     """Tell whether two starts lead to the same place: valleys differ by notch, observer or integral."""
     apart = np.abs(np.log((x + 1e-4) / (other + 1e-4)))
     if task.spec.notch is not None:
@@ -177,8 +177,8 @@ def _merit(task: Task, grid: Grid, c_y: Complex[np.ndarray, "n m"], c_r: Complex
     weights, worst = task.weights(grid.f), np.zeros(c_y.shape[0])
     value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
     for row, p in enumerate(grid.p):
-        usage = task.everywhere(p, c_y)
-        usage |= task.on_design(grid, c_y, c_r) if row == 0 else {}
+        usage = task.curves("every plant", grid.f, p, c_y, c_r)
+        usage |= task.design_usage(grid, c_y, c_r) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = 1.0 + p * c_y

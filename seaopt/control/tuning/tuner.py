@@ -24,17 +24,17 @@ import numpy as np
 from jaxtyping import Complex
 
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.spec_checks import check_current, check_delay
 from seaopt.control.laws.structures import Nominal
-from seaopt.control.laws.verdict import BANDWIDTH_TOLERANCE as BANDWIDTH_TOLERANCE
-from seaopt.control.laws.verdict import active, broken, explained
-from seaopt.control.loops.loop import GROWING, Loop, LoopFigures
+from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken
+from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import sample
 from seaopt.control.tuning.convex_concave import improved
 from seaopt.control.tuning.interior_point import polished
-from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, Point, Task, frequencies
+from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, frequencies
 from seaopt.control.tuning.starts import starts
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
@@ -117,14 +117,14 @@ def tune(
     values = plant.complete(params)
     friction = values["f_c"].value if "f_c" in values else 0.0
     check_current(spec, task.k_ff, current_per_force(plant, params), friction)
-    x, figures = solved(task)
+    x, loops = solve(task)
     largest = None
-    if broken(spec, task.names, figures, task.least_cosine(x)):
+    if list_broken(judge_all(spec, loops)):
         largest, near = largest_bandwidth(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near is not None:
-            x, figures = solved(task, (x, near))
-    return controller_of(task, x, figures, (plant, params), largest)
+            x, loops = solve(task, (x, near))
+    return make_controller(task, x, loops, (plant, params), largest)
 
 
 def make_task(
@@ -187,8 +187,8 @@ def _drawn(
     return out
 
 
-def solved(task: Task, warm: Sequence[Point] = ()) -> tuple[Point, list[LoopFigures]]:
-    """Return the best numbers found, and the figures of every plant with them.
+def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> tuple[LawNumbers, list[MeasuredLoop]]:
+    """Return the best numbers found, and every plant's loop with them.
 
     Parameters
     ----------
@@ -206,24 +206,24 @@ def solved(task: Task, warm: Sequence[Point] = ()) -> tuple[Point, list[LoopFigu
             break
         grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
         x = polished(task, grid, x)
-    return x, [task.loop(x, i).figures() for i in range(len(task.plants))]
+    return x, task.measure(x)
 
 
-def best(task: Task, grid: Grid, warm: Sequence[Point] = ()) -> Point:
+def best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = ()) -> LawNumbers:
     """Return the best numbers on a grid."""
     more = task.nominal is not None or task.spec.notch is not None
     given = [task.tidy(x) for x in warm]
     first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + 2 * more - bool(given))
     ranked = sorted((improved(task, grid, x) for x in first), key=lambda item: item[0])
     polish = len(ranked) if task.spec.notch is not None else POLISHED + more
-    chosen: list[Point] = []
+    chosen: list[LawNumbers] = []
     for _, x in ranked:
         if len(chosen) < polish and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
     return min((polished(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
 
 
-def _missed(task: Task, x: Point, grid: Grid) -> np.ndarray:
+def _missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
     """Return frequencies between the grid's at which more of a limit is used than anywhere on it."""
     allowed = {name: max(1.0, float(np.max(curve))) for name, curve in task.usage(grid, x).items()}
     out: list[float] = []
@@ -237,7 +237,7 @@ def _missed(task: Task, x: Point, grid: Grid) -> np.ndarray:
     return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
 
 
-def largest_bandwidth(task: Task, x: Point) -> tuple[float, Point | None]:
+def largest_bandwidth(task: Task, x: LawNumbers) -> tuple[float, LawNumbers | None]:
     """Return the largest bandwidth in range that keeps the limits, and its numbers; 0 and None if there is none.
 
     Found by bisection from the bandwidth asked, which does not keep them, towards the lowest; if that does not either,
@@ -246,7 +246,7 @@ def largest_bandwidth(task: Task, x: Point) -> tuple[float, Point | None]:
     """
     spec, asked = task.spec, task.spec.bandwidth_hz
     low = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
-    near: list[Point] = []
+    near: list[LawNumbers] = []
 
     def possible(bandwidth_hz: float) -> bool:
         found = _possible(
@@ -266,7 +266,7 @@ def largest_bandwidth(task: Task, x: Point) -> tuple[float, Point | None]:
     return float(lower), near[-1]
 
 
-def _possible(task: Task, x: Point, *, near: bool) -> Point | None:
+def _possible(task: Task, x: LawNumbers, *, near: bool) -> LawNumbers | None:
     """Return numbers that keep all limits on the frequencies looked at, if found: from x first, then from anywhere.
 
     Near a bandwidth that is possible what x misses clearly is not looked for anywhere else.
@@ -282,13 +282,17 @@ def _possible(task: Task, x: Point, *, near: bool) -> Point | None:
     return found if task.rank(grid, found)[0] == 0.0 else None
 
 
-def controller_of(
-    task: Task, x: Point, figures: list[LoopFigures], design: tuple[Plant, ParameterSet], largest: float | None = None
+def make_controller(
+    task: Task,
+    x: LawNumbers,
+    loops: Sequence[MeasuredLoop],
+    design: tuple[Plant, ParameterSet],
+    largest: float | None = None,
 ) -> Controller:
     """Return the controller of tuned numbers."""
     spec, gains = task.spec, task.gains(x)
-    port = task.least_cosine(x)
-    blocked = broken(spec, task.names, figures, port)
+    verdicts = judge_all(spec, loops)
+    broken = list_broken(verdicts)
     reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
     return Controller(
         structure=spec.structure,
@@ -299,13 +303,13 @@ def controller_of(
         measurement=measurement,
         current_per_force_A_per_N=current_per_force(*design),
         spec=spec,
-        achieved=figures[0],
-        feasible=not blocked,
-        active_constraints=tuple(blocked or active(spec, task.names, figures, port)),
+        achieved=loops[0].figures,
+        feasible=not broken,
+        active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[1:],
         design=design,
         observer=gains.observer,
-        blocked_by=explained(spec, task.names, figures, task.loop(x), port),
+        blocked_by=tuple(explain_broken(spec, verdicts, loops[0], task.loop(x))),
         largest_bandwidth_hz=largest,
     )
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
+from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import resting_on
 from seaopt.markup import figure, items, paragraph, table
@@ -45,10 +46,8 @@ class Requirement:
 
     @property
     def sense(self) -> str:
-        """What the value must be to the limit: the bandwidth is placed, a `min_` and passivity are floors."""
-        if self.name == "bandwidth_hz":
-            return "="
-        return "≥" if self.name.startswith("min_") or self.name == "passive_band_hz" else "≤"
+        """What the value must be to the limit, as a sign; of draws and worst cases it is at most that."""
+        return BY_REQUIREMENT[self.name].symbol if self.name in BY_REQUIREMENT else "≤"
 
 
 @record

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.laws.passivity import held_stable, least_cosine
-from seaopt.control.laws.verdict import BANDWIDTH_TOLERANCE, PASSIVE
+from seaopt.control.laws.limits import MeasuredLoop, PortFigures
+from seaopt.control.laws.passivity import measure_port
+from seaopt.control.laws.verdict import Verdict, judge
 from seaopt.control.loops.port import port_of
 from seaopt.parameters import ParameterSet
 from seaopt.robustness.certificate.certificate import MonteCarlo, Requirement
@@ -20,65 +21,39 @@ REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandw
 
 def design_requirements(controller: Controller, achieved: LoopFigures, values: ParameterSet) -> list[Requirement]:
     """Return what is required of the design plant at the nominal parameters `values`; `achieved` is its loop there."""
-    spec = controller.spec
-    reached = achieved.bandwidth_hz if achieved.bandwidth_hz is not None else np.inf
-    rows = [
-        Requirement(
-            name="bandwidth_hz", limit=spec.bandwidth_hz, value=reached, where="design",
-            met=bool(abs(reached / spec.bandwidth_hz - 1.0) <= BANDWIDTH_TOLERANCE),
-        ),
-        Requirement(
-            name="min_sensitivity_bandwidth_hz", limit=spec.sensitivity_bandwidth_limit_hz,
-            value=achieved.sensitivity_bandwidth_hz, where="design",
-            met=achieved.sensitivity_bandwidth_hz >= spec.sensitivity_bandwidth_limit_hz * (1 - 1e-3),
-        ),
-    ]  # fmt: skip
-    peaks = (("max_reference_peak", achieved.reference_peak), ("max_noise_gain", achieved.noise_gain))
-    rows += [item for name, value in peaks for item in _upper(name, getattr(spec, name), value, "design")]
-    return rows + _passive(controller, values)
-
-
-def _passive(controller: Controller, values: ParameterSet) -> list[Requirement]:
-    """Return that Re Z >= 0 of the design plant's port in the passive band, as the least Re Z/abs(Z)."""
     spec, band = controller.spec, controller.spec.passive_band_hz
-    if band is None or controller.design is None:
-        return []
-    port = port_of(controller.design[0], values, spec.measured, controller.current_per_force_A_per_N)
-    cosine, at_hz = least_cosine(port, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
-    held = held_stable(port, controller)
-    met = cosine >= PASSIVE and held
-    mend = "" if met else "; tune with this band, or narrow it" if held else "; the loop grows with its link held"
-    where = f"design, Re Z/|Z| at {at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz{mend}"
-    return [Requirement(name="passive_band_hz", limit=0.0, value=cosine, met=met, where=where)]
+    port = None
+    if band is not None and controller.design is not None:
+        held = port_of(controller.design[0], values, spec.measured, controller.current_per_force_A_per_N)
+        port = measure_port(held, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
+    verdicts = judge(spec, MeasuredLoop(name="design", figures=achieved, port=port), "design plant")
+    return [_requirement(verdict, _passive_where(verdict, port, band)) for verdict in verdicts]
 
 
 def plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
     """Return what is required of every plant at the nominal parameters."""
-    spec = controller.spec
+    verdicts = judge(controller.spec, MeasuredLoop(name=name, figures=figures), "every plant")
     return [
-        Requirement(
-            name="spectral_radius",
-            limit=1.0,
-            value=figures.spectral_radius,
-            met=figures.stable,
-            where=name if figures.stable else f"{name}: the loop is UNSTABLE",
-        ),
-        *_upper("max_sensitivity", spec.max_sensitivity, figures.ms, name),
-        *_upper("max_complementary", spec.max_complementary, figures.mt, name),
-        *_lower("min_disk_margin", spec.min_disk_margin, figures.disk_margin, name),
+        _requirement(item, "" if figures.stable or item.limit.has_field else ": the loop is UNSTABLE")
+        for item in verdicts
     ]
 
 
-def _upper(name: str, limit: float | None, value: float, where: str) -> list[Requirement]:
-    if limit is None:
-        return []
-    return [Requirement(name=name, limit=limit, value=value, met=bool(value <= limit * (1 + ROUNDING)), where=where)]
+def _requirement(verdict: Verdict, remark: str) -> Requirement:
+    name = verdict.limit.requirement or verdict.limit.name
+    return Requirement(
+        name=name, limit=verdict.allowed, value=verdict.value, met=verdict.met, where=f"{verdict.plant}{remark}"
+    )
 
 
-def _lower(name: str, limit: float | None, value: float, where: str) -> list[Requirement]:
-    if limit is None:
-        return []
-    return [Requirement(name=name, limit=limit, value=value, met=bool(value >= limit * (1 - ROUNDING)), where=where)]
+def _passive_where(verdict: Verdict, port: PortFigures | None, band: tuple[float, float] | None) -> str:
+    """Return where in the passive band its port is least passive, and what to do where it is not."""
+    if verdict.limit.name != "passive_band_hz" or port is None or band is None:
+        return ""
+    where = f", Re Z/|Z| at {port.at_hz:.4g} Hz, of {band[0]:g} to {band[1]:g} Hz"
+    if verdict.met:
+        return where
+    return where + (f"; {verdict.limit.remedy}" if port.held_stable else "; the loop grows with its link held")
 
 
 def draw_requirements(

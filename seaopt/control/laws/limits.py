@@ -1,0 +1,283 @@
+r"""The limits that a controller can be asked to keep, one row each, for tuner, certificate, problem file and report.
+
+A limit has a *figure* of one closed loop, and is kept where that figure is at most, at least or equal to what the
+specification allows. While tuning, most limits are also a *curve*: with :math:`L = P C_y`, at every frequency up to
+`until_hz`,
+
+.. math:: |X| \le m\,|1 + L| \quad (\text{or} \ge), \qquad X \in \{1,\, L,\, 1 - L,\, C_y,\, P C_r\},
+
+which is affine in the gains between the absolute values. Scan, quadratic programs and interior point need no more than
+X and m, and the certificate no more than the figure.
+
+A new limit is one row here, and a field of the same name where it is typed: in `laws.spec.ControllerSpec` and
+`problem.schema.ControllerTable`, which take default, range and description from the row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+from seaopt.control.loops.loop import STABLE, LoopFigures
+from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.records import record
+
+LIMIT_ROUNDING = 1e-6  # by which a figure that lies on its limit may be beyond it
+BANDWIDTH_TOLERANCE = 0.005
+PASSIVE_ROUNDING = 1e-9  # Re Z/abs(Z) that is still called zero
+PLACED_BELOW = 0.97  # of the bandwidth: up to here abs(F/F_ref) must be above -3 dB, which it reaches at the bandwidth
+
+Sense = Literal["at most", "at least", "equal to"]
+Scope = Literal["every plant", "design plant"]
+
+
+@record
+class PortFigures:
+    """How passive the design plant's port is in the band asked.
+
+    Parameters
+    ----------
+    least_cosine : float
+        Least Re Z/abs(Z).
+    at_hz : float
+        Where it is.
+    held_stable : bool
+        Nothing grows in the loop with its link held; where something does, it is passive nowhere.
+
+    """
+
+    least_cosine: float
+    at_hz: float
+    held_stable: bool
+
+
+@record
+class MeasuredLoop:
+    """One plant's loop as limits are judged on it; `port` is the design plant's, where a passive band is asked for."""
+
+    name: str
+    figures: LoopFigures
+    port: PortFigures | None = None
+
+
+@record(eq=False)
+class LimitCurve:
+    """What the tuner keeps at every frequency: abs(X) below, or above, m abs(1 + L).
+
+    Parameters
+    ----------
+    of : str
+        X.
+    level : callable
+        m, of what the specification allows; that itself if left out.
+    until_hz : callable, optional
+        Where it ends, of what is allowed and of the bandwidth asked; at every frequency if left out.
+    floor : bool
+        abs(X) is to be above, not below.
+    symbol : str
+        Of abs(X)/abs(1 + L), where a message states this rather than the figure.
+
+    """
+
+    of: Literal["1", "L", "1 - L", "C_y", "P C_r"]
+    level: Callable[[float], float] = float
+    until_hz: Callable[[float, float], float] | None = None
+    floor: bool = False
+    symbol: str = ""
+
+    def numerator(self, p: Any, c_y: Any, c_r: Any, open_loop: Any) -> Any:
+        """Return X of responses, which may be arrays or a solver's expressions."""
+        match self.of:
+            case "1":
+                return 1.0
+            case "L":
+                return open_loop
+            case "1 - L":
+                return 1.0 - open_loop
+            case "C_y":
+                return c_y
+            case "P C_r":
+                return p * c_r
+
+    def change(self, p: Any, by_y: Any, by_r: Any, by_loop: Any) -> Any:
+        """Return the change of X with changes of C_y, C_r and L: X is affine in them."""
+        return {"1": 0.0, "L": by_loop, "1 - L": -by_loop, "C_y": by_y, "P C_r": p * by_r}[self.of]
+
+
+@record(eq=False)
+class Limit:
+    """One limit.
+
+    Parameters
+    ----------
+    name : str
+        Of the specification's field, of the problem file's key, and in messages.
+    label : str
+        Of the figure, in tables.
+    figure : callable
+        The figure of a measured loop.
+    sense : {"at most", "at least", "equal to"}
+        What the figure is to be to what is allowed.
+    scope : {"every plant", "design plant"}
+        Whose figure.
+    unit : str
+        Of the figure; empty for a ratio.
+    meaning, remedy : str
+        What it means, and what to do where it is broken.
+    default : float, optional
+        What is allowed where the specification leaves it out; None: it is then not imposed.
+    bandwidth_divisor : float, optional
+        The default is bandwidth_hz over this instead.
+    allowed : float, optional
+        What is always allowed, of a limit whose field says where it holds, or that has none.
+    has_field : bool
+        Of the specification; without one the limit always holds.
+    above, below : float
+        Ends, exclusive, of what may be asked; `above` is None where the specification has a check of its own.
+    condition : callable, optional
+        What must be true of the loop besides.
+    tolerance : float
+        By which the figure may miss what is allowed: a share of it, or an amount where it is zero.
+    reserve : {"figure", "curve", "none"}
+        Where the tuner takes the specification's reserve off: the figure itself; only the curve's level, where the
+        figure is a frequency; nowhere.
+    curve : LimitCurve, optional
+        What the tuner looks at.
+    requirement : str
+        The name in a certificate, where it is another.
+
+    """
+
+    name: str
+    label: str
+    figure: Callable[[MeasuredLoop], float]
+    sense: Sense
+    scope: Scope
+    meaning: str
+    remedy: str
+    unit: str = ""
+    default: float | None = None
+    bandwidth_divisor: float | None = None
+    allowed: float | None = None
+    has_field: bool = True
+    condition: Callable[[MeasuredLoop], bool] | None = None
+    above: float | None = 0.0
+    below: float | None = None
+    tolerance: float = LIMIT_ROUNDING
+    reserve: Literal["figure", "curve", "none"] = "figure"
+    curve: LimitCurve | None = None
+    requirement: str = ""
+
+    @property
+    def symbol(self) -> str:
+        """The sense as a sign."""
+        return {"at most": "≤", "at least": "≥", "equal to": "="}[self.sense]
+
+    @property
+    def default_text(self) -> str:
+        """The default in words."""
+        if not self.has_field:
+            return "always"
+        if self.bandwidth_divisor is not None:
+            return f"bandwidth_hz/{self.bandwidth_divisor:g}"
+        return "not imposed" if self.default is None else f"{self.default:g}"
+
+    @property
+    def description(self) -> str:
+        """What it means, whose figure it is, what is allowed where it is left out, and what to do where broken."""
+        return f"{self.meaning} ({self.scope}; left out: {self.default_text}). Where it is broken: {self.remedy}."
+
+    def in_range(self, asked: float) -> bool:
+        """Tell whether a loop could keep what is asked."""
+        return (self.above is None or asked > self.above) and (self.below is None or asked < self.below)
+
+    def keeps(self, value: float, allowed: float) -> bool:
+        """Tell whether a figure keeps the limit."""
+        slack = self.tolerance * (abs(allowed) or 1.0)
+        if self.sense == "equal to":
+            return bool(abs(value - allowed) <= slack)
+        return bool(value <= allowed + slack if self.sense == "at most" else value >= allowed - slack)
+
+    def usage(self, value: float, allowed: float) -> float:
+        """Return how much of the limit a figure uses: 1 is all of it."""
+        if self.allowed == 0.0:
+            return 1.0 - value
+        return value / allowed if self.sense == "at most" else allowed / max(value, 1e-12)
+
+
+def _port(loop: MeasuredLoop) -> PortFigures:
+    assert loop.port is not None, "a passive band is judged on the port's figures"
+    return loop.port
+
+
+LIMITS = (
+    Limit(
+        name="stability", requirement="spectral_radius", has_field=False, label="spectral radius",
+        figure=lambda loop: loop.figures.spectral_radius, sense="at most", scope="every plant", allowed=1.0,
+        tolerance=STABLE - 1.0, reserve="none",
+        meaning="largest magnitude of the closed loop's eigenvalues; below 1 the loop is stable",
+        remedy="tune with that plant in robust_to",
+    ),
+    Limit(
+        name="max_sensitivity", label="Ms", figure=lambda loop: loop.figures.ms, sense="at most", scope="every plant",
+        above=1.0, curve=LimitCurve(of="1"),
+        meaning="Ms, peak of |S|: 1/Ms is the distance of the loop gain from -1",
+        remedy="lower the bandwidth, allow more noise gain, or sample faster",
+    ),
+    Limit(
+        name="max_complementary", label="Mt", figure=lambda loop: loop.figures.mt, sense="at most",
+        scope="every plant", curve=LimitCurve(of="L"),
+        meaning="Mt, peak of |L/(1 + L)|: 1/Mt is the relative error of the plant that the loop bears",
+        remedy="lower the bandwidth, or raise max_sensitivity with it",
+    ),
+    Limit(
+        name="min_disk_margin", label="disk margin", figure=lambda loop: loop.figures.disk_margin, sense="at least",
+        scope="every plant", below=2.0, curve=LimitCurve(of="1 - L", level=lambda margin: 2.0 / margin),
+        meaning="symmetric disk margin, below 2: gain and phase may both be off by so much at once",
+        remedy="lower the bandwidth",
+    ),
+    Limit(
+        name="max_reference_peak", label="reference peak", figure=lambda loop: loop.figures.reference_peak,
+        sense="at most", scope="design plant", above=1.0, curve=LimitCurve(of="P C_r"),
+        meaning="peak of |F/F_ref| over its static value",
+        remedy="use a pid_dob or derivative = \"measurement\", or lower the bandwidth",
+    ),
+    Limit(
+        name="max_noise_gain", label="noise gain", figure=lambda loop: loop.figures.noise_gain, sense="at most",
+        scope="design plant", unit="N/N", curve=LimitCurve(of="C_y"),
+        meaning="peak of |F_m/noise on F|: motor force that the sensor's noise makes",
+        remedy="lower the bandwidth, or filter the sensor",
+    ),
+    Limit(
+        name="min_sensitivity_bandwidth_hz", label="sensitivity bandwidth",
+        figure=lambda loop: loop.figures.sensitivity_bandwidth_hz, sense="at least", scope="design plant", unit="Hz",
+        above=None, bandwidth_divisor=5.0, tolerance=1e-3, reserve="curve",
+        curve=LimitCurve(of="1", level=lambda _: HALF_POWER, until_hz=lambda allowed, _: allowed, symbol="|S|"),
+        meaning="|S| stays below -3 dB up to here: feedback, not feedforward, makes the bandwidth",
+        remedy="raise max_sensitivity, lower the bandwidth, or shorten the delay",
+    ),
+    Limit(
+        name="bandwidth_hz", label="bandwidth",
+        figure=lambda loop: math.inf if loop.figures.bandwidth_hz is None else loop.figures.bandwidth_hz,
+        sense="equal to", scope="design plant", unit="Hz", above=None,
+        default=30.0, tolerance=BANDWIDTH_TOLERANCE, reserve="none",
+        curve=LimitCurve(
+            of="P C_r", level=lambda _: HALF_POWER, until_hz=lambda _, bandwidth_hz: PLACED_BELOW * bandwidth_hz,
+            floor=True,
+        ),
+        meaning="lowest frequency at which |F/F_ref| is 3 dB below its value at 0 Hz, met to 0.5 %",
+        remedy="ask for the largest bandwidth that the result names",
+    ),
+    Limit(
+        name="passive_band_hz", label="least Re Z/|Z| in the passive band", sense="at least",
+        scope="design plant", figure=lambda loop: _port(loop).least_cosine,
+        condition=lambda loop: _port(loop).held_stable, above=None, allowed=0.0, tolerance=PASSIVE_ROUNDING,
+        meaning="from low to high the port at link 2 is passive with link 1 held: Re Z/|Z| is not negative, "
+        "and the loop does not grow",
+        remedy="tune with this band, or narrow it",
+    ),
+)  # fmt: skip
+BY_NAME = {limit.name: limit for limit in LIMITS}
+BY_REQUIREMENT = {limit.requirement or limit.name: limit for limit in LIMITS}
+FIELDS = tuple(limit for limit in LIMITS if limit.has_field)
