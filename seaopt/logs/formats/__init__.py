@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Window, check_count, reading
+from seaopt.logs.formats.source import Field, Source, Window, check_count, translate_errors
 
 __all__ = ["Field", "Source", "Window", "open_source", "sniff"]
 
@@ -55,7 +55,7 @@ def open_source(path: Path) -> Source:
     """
     module, function, form = sniff(path)
     opener: Callable[[Path], Source] = getattr(import_module(f"seaopt.logs.formats.{module}"), function)
-    with reading(path, form):
+    with translate_errors(path, form):
         source = opener(path)
     check_count(path, source.fields)
     return source

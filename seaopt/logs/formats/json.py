@@ -13,35 +13,32 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import MAX_PARTS, Field, Source, Window, one_line
-from seaopt.logs.formats.text_layout import MAX_LINE, too_long
+from seaopt.logs.formats.source import MAX_DEPTH, MAX_PARTS, Field, Source, Window, summarise_error
+from seaopt.logs.formats.text_layout import MAX_LINE, line_length_error
 from seaopt.units import header_unit
 
 MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
-DEPTH = 32
-Record = Mapping[str, Any]
+Entry = Mapping[str, Any]
 
 
 def open_json(path: Path) -> Source:
     """List the keys of a JSON log; nested objects become dotted paths, lists carry an index."""
-    columns, notes, length = _columns(path)
-    fields = tuple(
-        Field(name=name, kind=found, length=length, unit=header_unit(name)) for name, found in columns.items()
-    )
+    columns, notes, length = _list_columns(path)
+    fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
     return Source(path=path, format="JSON", fields=fields, load=partial(_load, path), notes=tuple(notes))
 
 
-def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
+def _list_columns(path: Path) -> tuple[dict[str, str], list[str], int]:
     """Return each key with its kind, what the header says, and the number of entries."""
     notes: list[str] = []
     columns: dict[str, str] = {}
     length = 0
-    with closing(_records(path, notes)) as records:
+    with closing(_read_entries(path, notes)) as records:
         for _, record in records:
             length += 1
-            for name, value in flat(record):
+            for name, value in flatten(record):
                 if value is not None and columns.get(name, "empty") == "empty":
-                    columns[name] = kind(value)
+                    columns[name] = name_kind(value)
                 else:
                     columns.setdefault(name, "empty")
     if not length:
@@ -51,20 +48,20 @@ def _columns(path: Path) -> tuple[dict[str, str], list[str], int]:
 
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     columns: dict[str, list[float]] = {name: [] for name in names}
-    with closing(_records(path, [])) as records:
+    with closing(_read_entries(path, [])) as records:
         for place, record in records:
-            row = dict(flat(record))
+            row = dict(flatten(record))
             for name, values in columns.items():
-                values.append(_number(path, place, name, row.get(name)))
+                values.append(_to_number(path, place, name, row.get(name)))
     return {name: np.array(values) for name, values in columns.items()}
 
 
-def kind(value: Any) -> str:
+def name_kind(value: Any) -> str:
     """Return the kind of a JSON value."""
     return "bool" if isinstance(value, bool) else "float64" if isinstance(value, int | float) else "text"
 
 
-def _number(path: Path, place: str, name: str, value: Any) -> float:
+def _to_number(path: Path, place: str, name: str, value: Any) -> float:
     if value is None:
         return float("nan")
     if not isinstance(value, int | float):
@@ -74,25 +71,25 @@ def _number(path: Path, place: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def _records(path: Path, notes: list[str]) -> Generator[tuple[str, Record]]:
+def _read_entries(path: Path, notes: list[str]) -> Generator[tuple[str, Entry]]:
     """Return the entries with their places; of a header, a note."""
     with path.open("rb") as stream:
-        first = _line(path, stream, 1)
+        first = _read_line(path, stream, 1)
         if not _is_entry(first) or not any(line.strip() for line in stream):
-            yield from _whole(path, notes)
+            yield from _read_whole(path, notes)
             return
         stream.seek(0)
         number = 1
-        while line := _line(path, stream, number):
+        while line := _read_line(path, stream, number):
             if line.strip():
-                yield f"line {number}", _object(path, _parsed(path, line.rstrip(), number), f"line {number}")
+                yield f"line {number}", _check_object(path, _parse(path, line.rstrip(), number), f"line {number}")
             number += 1
 
 
-def _line(path: Path, stream: Any, number: int) -> bytes:
+def _read_line(path: Path, stream: Any, number: int) -> bytes:
     line = stream.readline(MAX_LINE + 1)
     if len(line) > MAX_LINE and number > 1:
-        raise too_long(path, number)
+        raise line_length_error(path, number)
     return line.removeprefix(b"\xef\xbb\xbf") if number == 1 else line
 
 
@@ -104,14 +101,14 @@ def _is_entry(line: bytes) -> bool:
         return False
 
 
-def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
+def _read_whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Entry]]:
     size = path.stat().st_size
     if size > MAX_WHOLE:
         raise LogError(f"{path}: is {size >> 20} MiB of JSON in one piece; save it as JSON lines, one entry a line")
-    content = _parsed(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
+    content = _parse(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
     entries = content
     if isinstance(content, dict):
-        entries = content["entries"] if "entries" in content else _turned(path, content)
+        entries = content["entries"] if "entries" in content else _transpose(path, content)
         header = [f"{key} = {value}" for key, value in content.items() if isinstance(value, str | int | float)]
         if header:
             notes.append(f"header: {', '.join(header)}"[:400])
@@ -120,22 +117,22 @@ def _whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Record]]:
             f'{path}: holds no list of entries; write {{"entries": [{{"time": 0.0, ...}}, ...]}} or JSON lines'
         )
     for number, entry in enumerate(entries, start=1):
-        yield f"entry {number}", _object(path, entry, f"entry {number}")
+        yield f"entry {number}", _check_object(path, entry, f"entry {number}")
 
 
-def _turned(path: Path, content: dict[str, Any]) -> list[Record]:
+def _transpose(path: Path, content: dict[str, Any]) -> list[Entry]:
     """Return the entries of an object of lists, one list a column; without lists it is an entry itself."""
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     lengths = {len(value) for value in lists.values()}
     if len(lengths) > 1:
-        shown = ", ".join(f"{key}: {len(value)}" for key, value in list(lists.items())[:10])
-        raise LogError(f"{path}: its lists differ in length ({shown}); write one value a sample in each")
+        counts = ", ".join(f"{key}: {len(value)}" for key, value in list(lists.items())[:10])
+        raise LogError(f"{path}: its lists differ in length ({counts}); write one value a sample in each")
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else [content]
 
 
-def _parsed(path: Path, text: bytes, line: int) -> Any:
+def _parse(path: Path, text: bytes, line: int) -> Any:
     try:
-        return json.loads(text, object_pairs_hook=partial(_unique, path))
+        return json.loads(text, object_pairs_hook=partial(_check_unique, path))
     except json.JSONDecodeError as error:
         raise LogError(
             f"{path}: line {line + error.lineno - 1}, column {error.colno}: is not valid JSON ({error.msg}); the file "
@@ -144,32 +141,34 @@ def _parsed(path: Path, text: bytes, line: int) -> Any:
     except RecursionError as error:
         raise LogError(f"{path}: line {line}: is nested too deep; is it a log?") from error
     except ValueError as error:  # bytes that are no text, integers of thousands of digits
-        raise LogError(f"{path}: line {line}: is not valid JSON ({one_line(error)}); correct that place") from error
+        raise LogError(
+            f"{path}: line {line}: is not valid JSON ({summarise_error(error)}); correct that place"
+        ) from error
 
 
-def _unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _check_unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entry = dict(pairs)
+    if len(entry) < len(pairs):
         keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise LogError(f'{path}: {keys.count(twice)} keys of one entry are named "{twice}"; rename all but one')
-    return found
-
-
-def _object(path: Path, entry: Any, place: str) -> Record:
-    if not isinstance(entry, dict):
-        raise LogError(f"{path}: {place} is no object but {json.dumps(entry)[:40]}; write one with named values")
+        double = next(key for key in keys if keys.count(key) > 1)
+        raise LogError(f'{path}: {keys.count(double)} keys of one entry are named "{double}"; rename all but one')
     return entry
 
 
-def flat(record: Record, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+def _check_object(path: Path, entry: Any, place: str) -> Entry:
+    if not isinstance(entry, dict):
+        raise LogError(f"{path}: {place} is not an object but {json.dumps(entry)[:40]}; write one with named values")
+    return entry
+
+
+def flatten(record: Entry, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
     """Return names and values; a list gives one name for each of its first elements."""
     for key, value in record.items():
         name = f"{prefix}{key}"
-        if isinstance(value, dict) and depth < DEPTH:
-            yield from flat(value, f"{name}.", depth + 1)
+        if isinstance(value, dict) and depth < MAX_DEPTH:
+            yield from flatten(value, f"{name}.", depth + 1)
         elif isinstance(value, list):
-            named = {f"{name}[{index}]": item for index, item in enumerate(value[:MAX_PARTS])}
-            yield from flat(named, "", depth + 1) if depth < DEPTH else ()
+            named = {f"{name}[{index}]": element for index, element in enumerate(value[:MAX_PARTS])}
+            yield from flatten(named, "", depth + 1) if depth < MAX_DEPTH else ()
         else:
             yield name, value

@@ -16,19 +16,19 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Window, check_size, optional, rows_of
+from seaopt.logs.formats.source import Field, Source, Window, check_size, find_rows, import_optional
 
-NUMERIC = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
-INTEGERS, FLOATS = frozenset({0, 1, 2, 3}), frozenset({4, 5})
+NUMERIC_CONVERSIONS = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
+INTEGER_TYPES, FLOAT_TYPES = frozenset({0, 1, 2, 3}), frozenset({4, 5})
 TIME_MASTER = 1
-Places = Mapping[str, tuple[int, int]]
+ChannelPlaces = Mapping[str, tuple[int, int]]
 
 
 def open_mdf(path: Path) -> Source:
     """List the channels of an MDF 4 file; a name that several groups have carries the group's number."""
     fields: list[Field] = []
     places: dict[str, tuple[int, int]] = {}
-    with _opened(path) as file:
+    with _open_file(path) as file:
         groups = list(file.groups)
         check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
         names = Counter(channel.name for group in groups for channel in group.channels)
@@ -49,12 +49,12 @@ def open_mdf(path: Path) -> Source:
 
 
 @contextmanager
-def _opened(path: Path) -> Generator[Any]:
-    asammdf = optional("asammdf", "mdf", path, "MDF")
+def _open_file(path: Path) -> Generator[Any]:
+    asammdf = import_optional("asammdf", "mdf", path, "MDF")
     with path.open("rb") as stream:
         if stream.read(68)[64:] != b"##HD":
-            raise LogError(f"{path}: is no MDF 4 file, or is cut off; convert an older one to MDF 4")
-    complain = sys.unraisablehook
+            raise LogError(f"{path}: is not an MDF 4 file, or is cut off; convert an older one to MDF 4")
+    hook = sys.unraisablehook
     try:
         with path.open("rb") as stream, asammdf.MDF(stream) as file:
             yield file
@@ -67,7 +67,7 @@ def _opened(path: Path) -> Generator[Any]:
         gc.collect()
         raise
     finally:
-        sys.unraisablehook = complain
+        sys.unraisablehook = hook
 
 
 def _label(name: str, group: int, names: Mapping[str, int]) -> str:
@@ -76,11 +76,11 @@ def _label(name: str, group: int, names: Mapping[str, int]) -> str:
 
 def _kind(channel: Any) -> str:
     conversion = channel.conversion
-    if conversion is not None and conversion.conversion_type not in NUMERIC:
+    if conversion is not None and conversion.conversion_type not in NUMERIC_CONVERSIONS:
         return "text, or a formula"
-    if channel.data_type in FLOATS:
+    if channel.data_type in FLOAT_TYPES:
         return f"float{channel.bit_count}"
-    if channel.data_type in INTEGERS:
+    if channel.data_type in INTEGER_TYPES:
         return f"{'int' if channel.data_type > 1 else 'uint'}{channel.bit_count}"
     return "text"
 
@@ -91,24 +91,24 @@ def _unit(channel: Any) -> str | None:
 
 
 def _load(
-    path: Path, places: Places, names: Sequence[str], window: Window | None
+    path: Path, places: ChannelPlaces, names: Sequence[str], window: Window | None
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    with _opened(path) as file:
+    with _open_file(path) as file:
 
-        def one(name: str, rows: slice) -> Float[np.ndarray, " n"]:
+        def load_column(name: str, rows: slice) -> Float[np.ndarray, " n"]:
             group, index = places[name]
             start = rows.start or 0
             count = None if rows.stop is None else rows.stop - start
-            found, bad = file.get(
+            samples, invalid = file.get(
                 group=group, index=index, record_offset=start, record_count=count, samples_only=True,
                 ignore_invalidation_bits=False,
             )  # fmt: skip
-            values = np.array(found, dtype=float).reshape(-1)
-            if bad is not None:
-                values[np.asarray(bad, dtype=bool)] = np.nan
+            values = np.array(samples, dtype=float).reshape(-1)
+            if invalid is not None:
+                values[np.asarray(invalid, dtype=bool)] = np.nan
             return values
 
-        rows = slice(None) if window is None else rows_of(one(window.clock, slice(None)), window)
+        rows = slice(None) if window is None else find_rows(load_column(window.clock, slice(None)), window)
         if rows.stop is not None and rows.stop <= (rows.start or 0):
             return {name: np.empty(0) for name in names}
-        return {name: one(name, rows) for name in names}
+        return {name: load_column(name, rows) for name in names}

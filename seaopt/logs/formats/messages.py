@@ -11,13 +11,13 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from seaopt.logs.formats.source import MAX_DEPTH
 from seaopt.records import record
 
 MAX_ELEMENTS = 256
-DEPTH = 32
 PAD = "structure_needs_at_least_one_member"
 CDR_HEADER = 4
-NUMBERS = {
+NUMBER_CODES = {
     "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
@@ -25,7 +25,7 @@ TIMES = {"builtin_interfaces/msg/Time": "Ii", "builtin_interfaces/msg/Duration":
 
 
 @record
-class Number:
+class NumberNode:
     """A number of fixed size."""
 
     kind: str
@@ -34,17 +34,17 @@ class Number:
 
 
 @record
-class Stamp:
+class StampNode:
     """Seconds and nanoseconds, decoded as whole nanoseconds."""
 
 
 @record
-class Text:
+class TextNode:
     """A string."""
 
 
 @record
-class Many:
+class ArrayNode:
     """An array; `count` is None where each message says its own."""
 
     child: Node
@@ -52,40 +52,40 @@ class Many:
 
 
 @record
-class Struct:
+class StructNode:
     """Named parts, in order."""
 
     parts: tuple[tuple[str, Node], ...]
 
 
-Node = Number | Stamp | Text | Many | Struct
+Node = NumberNode | StampNode | TextNode | ArrayNode | StructNode
 Wanted = Mapping[str | int, Any]
 
 
-def tree(name: str, types: Mapping[str, Any], depth: int = 0) -> Node:
+def build_tree(name: str, types: Mapping[str, Any], depth: int = 0) -> Node:
     """Return the tree of a message type, from rosbags' parsed definitions."""
     if name in TIMES:
-        return Stamp()
-    if depth > DEPTH or name not in types:
+        return StampNode()
+    if depth > MAX_DEPTH or name not in types:
         raise ValueError(f"message type {name} is not defined in the file")
-    parts = tuple((part, _node(found, types, depth + 1)) for part, found in types[name][1])
+    parts = tuple((part, _build_node(definition, types, depth + 1)) for part, definition in types[name][1])
     # A struct without members takes a byte in CDR.
-    return Struct(parts=parts or ((PAD, Number(kind="uint8", code="B", size=1)),))
+    return StructNode(parts=parts or ((PAD, NumberNode(kind="uint8", code="B", size=1)),))
 
 
-def _node(found: Any, types: Mapping[str, Any], depth: int) -> Node:
-    kind, detail = int(found[0]), found[1]
+def _build_node(definition: Any, types: Mapping[str, Any], depth: int) -> Node:
+    kind, detail = int(definition[0]), definition[1]
     if kind == 1:  # a base type
         if detail[0] in ("string", "wstring"):
-            return Text()
-        if detail[0] not in NUMBERS:
+            return TextNode()
+        if detail[0] not in NUMBER_CODES:
             raise ValueError(f"numbers of type {detail[0]} are not read")
-        code = NUMBERS[detail[0]]
+        code = NUMBER_CODES[detail[0]]
         number = detail[0] if detail[0].rstrip("0123456789") in ("int", "uint", "float", "bool") else "uint8"
-        return Number(kind=number, code=code, size=struct.calcsize("=" + code))
+        return NumberNode(kind=number, code=code, size=struct.calcsize("=" + code))
     if kind == 2:
-        return tree(detail, types, depth)
-    return Many(child=_node(detail[0], types, depth), count=detail[1] if kind == 3 else None)
+        return build_tree(detail, types, depth)
+    return ArrayNode(child=_build_node(detail[0], types, depth), count=detail[1] if kind == 3 else None)
 
 
 @record
@@ -96,7 +96,7 @@ class Wire:
     order: str = "<"
 
     @classmethod
-    def of(cls, data: bytes, encoding: str) -> Wire:
+    def detect(cls, data: bytes, encoding: str) -> Wire:
         """Return the encoding of a message.
 
         Raises
@@ -116,39 +116,39 @@ class Wire:
         """First byte of the first field."""
         return CDR_HEADER if self.cdr else 0
 
-    def aligned(self, at: int, size: int) -> int:
+    def align(self, at: int, size: int) -> int:
         """Return where a number of this size begins at or after `at`."""
         return at + (CDR_HEADER - at) % size if self.cdr else at
 
 
-def leaves(node: Node, data: bytes, encoding: str) -> list[tuple[str, str]]:
+def list_leaves(node: Node, data: bytes, encoding: str) -> list[tuple[str, str]]:
     """Return path and kind of everything in one message; arrays are as long as there."""
-    found: list[tuple[str, str]] = []
-    wire = Wire.of(data, encoding)
-    _describe(node, wire, data, wire.start, "", found)
-    return found
+    leaves: list[tuple[str, str]] = []
+    wire = Wire.detect(data, encoding)
+    _describe(node, wire, data, wire.start, "", leaves)
+    return leaves
 
 
-def values(node: Node, data: bytes, encoding: str, wanted: Wanted) -> dict[str, float | int]:
+def take_values(node: Node, data: bytes, encoding: str, wanted: Wanted) -> dict[str, float | int]:
     """Return the wanted leaves of one message by the name that `wanted` gives them; an absent element is left out."""
     out: dict[str, float | int] = {}
-    wire = Wire.of(data, encoding)
+    wire = Wire.detect(data, encoding)
     _take(node, wire, data, wire.start, wanted, out)
     return out
 
 
-def wanted_tree(paths: Mapping[str, str]) -> dict[str | int, Any]:
+def build_wanted_tree(paths: Mapping[str, str]) -> dict[str | int, Any]:
     """Return paths such as "a.b[2].c", with what to call them, as nested keys.
 
     Examples
     --------
-    >>> wanted_tree({"a.b[2]": "x", "a.c": "y"})
+    >>> build_wanted_tree({"a.b[2]": "x", "a.c": "y"})
     {'a': {'b': {2: 'x'}, 'c': 'y'}}
 
     """
     root: dict[str | int, Any] = {}
     for path, name in paths.items():
-        keys = list(_keys(path))
+        keys = list(_split_path(path))
         branch = root
         for key in keys[:-1]:
             branch = branch.setdefault(key, {})
@@ -156,7 +156,7 @@ def wanted_tree(paths: Mapping[str, str]) -> dict[str | int, Any]:
     return root
 
 
-def _keys(path: str) -> Iterator[str | int]:
+def _split_path(path: str) -> Iterator[str | int]:
     for part in path.split("."):
         name, *indices = part.split("[")
         if name:
@@ -164,11 +164,11 @@ def _keys(path: str) -> Iterator[str | int]:
         yield from (int(index.rstrip("]")) for index in indices)
 
 
-def _count(node: Many, wire: Wire, data: bytes, at: int) -> tuple[int, int]:
+def _read_count(node: ArrayNode, wire: Wire, data: bytes, at: int) -> tuple[int, int]:
     """Return the length of an array and where its elements begin."""
     if node.count is not None:
         return node.count, at
-    at = wire.aligned(at, 4)
+    at = wire.align(at, 4)
     count = struct.unpack_from(wire.order + "I", data, at)[0]
     if count > len(data):  # an element has at least a byte
         raise ValueError("a message claims more elements than it holds")
@@ -176,25 +176,25 @@ def _count(node: Many, wire: Wire, data: bytes, at: int) -> tuple[int, int]:
 
 
 def _skip_text(wire: Wire, data: bytes, at: int) -> int:
-    at = wire.aligned(at, 4)
+    at = wire.align(at, 4)
     return at + 4 + struct.unpack_from(wire.order + "I", data, at)[0]
 
 
-def _describe(node: Node, wire: Wire, data: bytes, at: int, path: str, found: list[tuple[str, str]]) -> int:
-    if isinstance(node, Struct):
+def _describe(node: Node, wire: Wire, data: bytes, at: int, path: str, leaves: list[tuple[str, str]]) -> int:
+    if isinstance(node, StructNode):
         for name, part in node.parts:
             if name != PAD or wire.cdr:
-                at = _describe(part, wire, data, at, f"{path}.{name}" if path else name, found)
+                at = _describe(part, wire, data, at, f"{path}.{name}" if path else name, leaves)
         return at
-    if isinstance(node, Many):
-        count, at = _count(node, wire, data, at)
+    if isinstance(node, ArrayNode):
+        count, at = _read_count(node, wire, data, at)
         for index in range(count):
             # Beyond the limit elements are walked, and not listed.
-            listed = found if index < MAX_ELEMENTS else []
+            listed = leaves if index < MAX_ELEMENTS else []
             at = _describe(node.child, wire, data, at, f"{path}[{index}]", listed)
         return at
-    kind = "float64" if isinstance(node, Stamp) else "text" if isinstance(node, Text) else node.kind
-    found.append((path, kind))
+    kind = "float64" if isinstance(node, StampNode) else "text" if isinstance(node, TextNode) else node.kind
+    leaves.append((path, kind))
     return _take(node, wire, data, at, None, {})
 
 
@@ -202,28 +202,28 @@ def _take(
     node: Node, wire: Wire, data: bytes, at: int, wanted: Wanted | str | None, out: dict[str, float | int]
 ) -> int:
     """Walk one node, decode what is wanted, and return where the next begins."""
-    if isinstance(node, Number):
-        at = wire.aligned(at, node.size)
+    if isinstance(node, NumberNode):
+        at = wire.align(at, node.size)
         if isinstance(wanted, str):
             out[wanted] = struct.unpack_from(wire.order + node.code, data, at)[0]
         return at + node.size
-    if isinstance(node, Stamp):
-        at = wire.aligned(at, 4)
+    if isinstance(node, StampNode):
+        at = wire.align(at, 4)
         if isinstance(wanted, str):
             seconds, rest = struct.unpack_from(wire.order + "iI", data, at)
             out[wanted] = seconds * 1_000_000_000 + rest
         return at + 8
-    if isinstance(node, Text):
+    if isinstance(node, TextNode):
         return _skip_text(wire, data, at)
     branches: Wanted = wanted if isinstance(wanted, Mapping) else {}
-    if isinstance(node, Struct):
+    if isinstance(node, StructNode):
         for name, part in node.parts:
             if name != PAD or wire.cdr:
                 at = _take(part, wire, data, at, branches.get(name), out)
         return at
-    count, at = _count(node, wire, data, at)
-    if isinstance(node.child, Number) and count:
-        at = wire.aligned(at, node.child.size)
+    count, at = _read_count(node, wire, data, at)
+    if isinstance(node.child, NumberNode) and count:
+        at = wire.align(at, node.child.size)
         for index, name in branches.items():
             if isinstance(index, int) and index < count and isinstance(name, str):
                 place = at + index * node.child.size

@@ -23,11 +23,11 @@ def open_parquet(path: Path) -> Source:
 
     frame = pl.scan_parquet(path, glob=False)
     length = int(frame.select(pl.len()).collect().item())
-    fields = tuple(_field(name, dtype, length) for name, dtype in frame.collect_schema().items())
+    fields = tuple(_make_field(name, dtype, length) for name, dtype in frame.collect_schema().items())
     return Source(path=path, format="Parquet", fields=fields, load=partial(_load, path))
 
 
-def _field(name: str, dtype: pl.DataType, length: int) -> Field:
+def _make_field(name: str, dtype: pl.DataType, length: int) -> Field:
     if dtype.is_temporal():  # seconds, counted from 1970 or from zero
         known = str(dtype).startswith(("Datetime", "Duration"))
         return Field(name=name, kind="float64" if known else str(dtype), length=length, unit="s")
@@ -41,13 +41,13 @@ def _load(path: Path, names: Sequence[str], window: Window | None) -> dict[str, 
     frame = pl.scan_parquet(path, glob=False)
     schema = frame.collect_schema()
     if window is not None:
-        clock = _number(window.clock, schema[window.clock])
+        clock = _select_number(window.clock, schema[window.clock])
         frame = frame.filter(clock.is_between(window.start, window.stop))
-    found = frame.select(_number(name, schema[name]).alias(name) for name in names).collect()
-    return {name: np.array(found[name].to_numpy(), dtype=float) for name in names}
+    columns = frame.select(_select_number(name, schema[name]).alias(name) for name in names).collect()
+    return {name: np.array(columns[name].to_numpy(), dtype=float) for name in names}
 
 
-def _number(name: str, dtype: Any) -> pl.Expr:
+def _select_number(name: str, dtype: Any) -> pl.Expr:
     import polars as pl
 
     column = pl.col(name)

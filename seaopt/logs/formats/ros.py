@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.json import flat, kind
-from seaopt.logs.formats.messages import Node, leaves, tree, values, wanted_tree
-from seaopt.logs.formats.source import Field, Source, Window, one_line, optional
+from seaopt.logs.formats.json import flatten, name_kind
+from seaopt.logs.formats.messages import Node, build_tree, build_wanted_tree, list_leaves, take_values
+from seaopt.logs.formats.source import Field, Source, Window, import_optional, summarise_error
 from seaopt.records import record
 
-MAX_CHUNK = 1 << 30
-UNIX = 1_000_000_000 * 1_000_000_000  # stamps after 2001 count from 1970; earlier ones are a simulation's
+MAX_CHUNK = 1 << 30  # bytes
+UNIX_STAMP_NS = 1_000_000_000 * 1_000_000_000  # stamps after 2001 count from 1970; earlier ones are a simulation's
 ENCODINGS = ("cdr", "ros1", "json")
 
 
@@ -50,53 +50,53 @@ class Bag:
     messages: Callable[[str, int | None, int | None], Iterator[tuple[int, bytes]]]
 
 
-Opened = Callable[[Path], AbstractContextManager[Bag]]
+BagOpener = Callable[[Path], AbstractContextManager[Bag]]
 
 
-def open_bag(path: Path) -> Source:
+def open_open_bag_file(path: Path) -> Source:
     """List a ROS 1 bag."""
-    return _source(path, "ROS 1 bag", _bag)
+    return _source(path, "ROS 1 bag", _open_bag_file)
 
 
-def open_db3(path: Path) -> Source:
+def open_open_db3_file(path: Path) -> Source:
     """List a ROS 2 SQLite recording."""
-    return _source(path, "ROS 2 db3", _db3)
+    return _source(path, "ROS 2 db3", _open_db3_file)
 
 
-def open_mcap(path: Path) -> Source:
+def open_open_mcap_file(path: Path) -> Source:
     """List an MCAP recording."""
-    return _source(path, "MCAP", _mcap)
+    return _source(path, "MCAP", _open_mcap_file)
 
 
-def _source(path: Path, form: str, opened: Opened) -> Source:
-    optional("rosbags", "ros", path, form)
+def _source(path: Path, form: str, open_file: BagOpener) -> Source:
+    import_optional("rosbags", "ros", path, form)
     fields: list[Field] = []
     notes: list[str] = []
     nodes: dict[str, Node | None] = {}
-    with opened(path) as bag:
+    with open_file(path) as bag:
         for topic in bag.topics.values():
             fields.append(Field(name=topic.name, kind="float64", length=topic.count, unit="s", clock=topic.name))
             try:
-                nodes[topic.name] = _tree(topic)
-                fields += _fields(bag, topic, nodes[topic.name])
+                nodes[topic.name] = _decode_definition(topic)
+                fields += _list_fields(bag, topic, nodes[topic.name])
             except Exception as error:  # one odd definition leaves the other topics readable
-                notes.append(f"{topic.name}: {topic.kind} cannot be decoded ({one_line(error)})")
+                notes.append(f"{topic.name}: {topic.kind} cannot be decoded ({summarise_error(error)})")
         count = sum(topic.count for topic in bag.topics.values())
         began = datetime.fromtimestamp(bag.start * 1e-9, UTC).isoformat(timespec="microseconds") if count else "nothing"
     notes.insert(0, f"{count} messages; times count from {began} ({bag.start} ns)")
     return Source(
-        path=path, format=form, fields=tuple(fields), load=partial(_load, path, opened, nodes), notes=tuple(notes)
+        path=path, format=form, fields=tuple(fields), load=partial(_load, path, open_file, nodes), notes=tuple(notes)
     )  # fmt: skip
 
 
-def _tree(topic: Topic) -> Node | None:
+def _decode_definition(topic: Topic) -> Node | None:
     """Return how a topic's messages are built; None where they carry their own names (JSON)."""
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     if topic.encoding == "json":
         return None
     if topic.encoding not in ENCODINGS:
-        raise ValueError(f"its encoding is {topic.encoding or 'not said'}")
+        raise ValueError(f"its encoding is {topic.encoding or 'not given'}")
     if topic.syntax == "idl":
         types: Any = {}
         for part in topic.definition.split("=" * 80 + "\n"):
@@ -105,21 +105,21 @@ def _tree(topic: Topic) -> Node | None:
         types = get_types_from_msg(topic.definition, topic.kind)
     else:  # ROS 2 up to Humble stores no definitions in db3; the standard messages are known
         types = get_typestore(Stores.LATEST).fielddefs
-    return tree(topic.kind, types)
+    return build_tree(topic.kind, types)
 
 
-def _fields(bag: Bag, topic: Topic, node: Node | None) -> list[Field]:
+def _list_fields(bag: Bag, topic: Topic, node: Node | None) -> list[Field]:
     """Return the fields of a topic, as long as its first message has them."""
     first = next(bag.messages(topic.name, None, None), None)
     if first is None:
         return []
     if node is None:
-        found = [(name, kind(value)) for name, value in flat(json.loads(first[1]))]
+        leaves = [(name, name_kind(value)) for name, value in flatten(json.loads(first[1]))]
     else:
-        found = leaves(node, first[1], topic.encoding)
+        leaves = list_leaves(node, first[1], topic.encoding)
     return [
         Field(name=f"{topic.name}.{path}", kind=word, length=topic.count, unit=_unit(path), clock=topic.name)
-        for path, word in found
+        for path, word in leaves
     ]
 
 
@@ -128,13 +128,13 @@ def _unit(path: str) -> str | None:
 
 
 def _load(
-    path: Path, opened: Opened, nodes: Mapping[str, Node | None], names: Sequence[str], window: Window | None
+    path: Path, open_file: BagOpener, nodes: Mapping[str, Node | None], names: Sequence[str], window: Window | None
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    with opened(path) as bag:
-        topic = next(item for item in bag.topics.values() if _of(item.name, names))
+    with open_file(path) as bag:
+        topic = next(topic for topic in bag.topics.values() if _covers(topic.name, names))
         paths = {name.removeprefix(f"{topic.name}."): name for name in names if name != topic.name}
-        span = _span(bag, window) if window is not None and window.clock == topic.name else (None, None)
-        take = _taker(topic, nodes[topic.name], paths) if paths else None
+        span = _window_ns(bag, window) if window is not None and window.clock == topic.name else (None, None)
+        take = _make_taker(topic, nodes[topic.name], paths) if paths else None
         times: list[int] = []
         rows: list[Mapping[str, float | int]] = []
         for time, data in bag.messages(topic.name, *span):
@@ -144,51 +144,53 @@ def _load(
     out = {name: np.array([row.get(name, np.nan) for row in rows], dtype=float) for name in paths.values()}
     for name in paths.values():
         if _unit(name) == "s":
-            out[name] = _seconds([int(row[name]) for row in rows], bag.start)
+            out[name] = _to_seconds([int(row[name]) for row in rows], bag.start)
     if topic.name in names:
         out[topic.name] = np.array(times, dtype=np.int64) * 1e-9
     return out
 
 
-def _of(topic: str, names: Sequence[str]) -> bool:
+def _covers(topic: str, names: Sequence[str]) -> bool:
     return all(name == topic or name.startswith(f"{topic}.") for name in names)
 
 
-def _span(bag: Bag, window: Window) -> tuple[int | None, int | None]:
+def _window_ns(bag: Bag, window: Window) -> tuple[int | None, int | None]:
     edges = (window.start, window.stop)
     start, stop = (None if np.isinf(edge) else bag.start + int(edge * 1e9) for edge in edges)
     return None if start is None else max(start - 1, 0), None if stop is None else max(stop + 2, 0)
 
 
-def _taker(topic: Topic, node: Node | None, paths: Mapping[str, str]) -> Callable[[bytes], Mapping[str, float | int]]:
+def _make_taker(
+    topic: Topic, node: Node | None, paths: Mapping[str, str]
+) -> Callable[[bytes], Mapping[str, float | int]]:
     if node is not None:
-        wanted = wanted_tree(paths)
-        return lambda data: values(node, data, topic.encoding, wanted)
+        wanted = build_wanted_tree(paths)
+        return lambda data: take_values(node, data, topic.encoding, wanted)
 
     def from_json(data: bytes) -> Mapping[str, float | int]:
-        found = dict(flat(json.loads(data)))
-        return {name: found[path] for path, name in paths.items() if isinstance(found.get(path), int | float)}
+        record = dict(flatten(json.loads(data)))
+        return {name: record[path] for path, name in paths.items() if isinstance(record.get(path), int | float)}
 
     return from_json
 
 
-def _seconds(stamps: list[int], start: int) -> Float[np.ndarray, " n"]:
+def _to_seconds(stamps: list[int], start: int) -> Float[np.ndarray, " n"]:
     """Return stamps in seconds, from the start of the recording where they are of its kind."""
     whole = np.array(stamps, dtype=np.int64)
-    return np.where(whole > UNIX, whole - start, whole) * 1e-9
+    return np.where(whole > UNIX_STAMP_NS, whole - start, whole) * 1e-9
 
 
 @contextmanager
-def _bag(path: Path) -> Generator[Bag]:
+def _open_bag_file(path: Path) -> Generator[Bag]:
     from rosbags.rosbag1 import Reader
 
     with Reader(path) as reader:
-        reader.chunks = {at: chunk._replace(decompressor=_bounded(chunk)) for at, chunk in reader.chunks.items()}
-        yield _rosbags(reader, reader.connections, reader.start_time if reader.message_count else 0, "ros1")
+        reader.chunks = {at: chunk._replace(decompressor=_limit_size(chunk)) for at, chunk in reader.chunks.items()}
+        yield _wrap_rosbags(reader, reader.connections, reader.start_time if reader.message_count else 0, "ros1")
 
 
 @contextmanager
-def _db3(path: Path) -> Generator[Bag]:
+def _open_db3_file(path: Path) -> Generator[Bag]:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     _check_pages(path)
@@ -196,7 +198,7 @@ def _db3(path: Path) -> Generator[Bag]:
     reader.open()
     try:
         meta = reader.metadata
-        yield _rosbags(reader, reader.connections, meta.start_time if meta.message_count else 0, "cdr")
+        yield _wrap_rosbags(reader, reader.connections, meta.start_time if meta.message_count else 0, "cdr")
     finally:
         reader.close()
 
@@ -211,29 +213,33 @@ def _check_pages(path: Path) -> None:
         raise LogError(f"{path}: is cut off, {path.stat().st_size} of {whole} bytes are there; copy or record it again")
 
 
-def _rosbags(reader: Any, connections: Sequence[Any], start: int, encoding: str) -> Bag:
+def _wrap_rosbags(reader: Any, connections: Sequence[Any], start: int, encoding: str) -> Bag:
     """Return rosbags' reader as a Bag; a topic with several publishers has several connections."""
     topics: dict[str, Topic] = {}
-    for item in connections:
-        known = topics.get(item.topic)
-        if known is not None and known.kind != item.msgtype:
+    for connection in connections:
+        known = topics.get(connection.topic)
+        if known is not None and known.kind != connection.msgtype:
             raise ValueError(
-                f"topic {item.topic} carries {known.kind} and {item.msgtype}; record them on topics of their own"
+                f"topic {connection.topic} carries {known.kind} and {connection.msgtype}; "
+                "record them on topics of their own"
             )
-        said = getattr(item.ext, "serialization_format", encoding) or encoding
-        topics[item.topic] = Topic(
-            name=item.topic, kind=item.msgtype, count=item.msgcount + (known.count if known else 0), encoding=said,
-            definition=item.msgdef.data, syntax=item.msgdef.format.name.lower().replace("none", ""),
+        message_encoding = getattr(connection.ext, "serialization_format", encoding) or encoding
+        definition = connection.msgdef
+        topics[connection.topic] = Topic(
+            name=connection.topic, kind=connection.msgtype, encoding=message_encoding, definition=definition.data,
+            count=connection.msgcount + (known.count if known else 0),
+            syntax=definition.format.name.lower().replace("none", ""),
         )  # fmt: skip
 
     def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
-        for _, time, data in reader.messages([item for item in connections if item.topic == topic], start, stop):
+        chosen = [connection for connection in connections if connection.topic == topic]
+        for _, time, data in reader.messages(chosen, start, stop):
             yield time, bytes(data)
 
     return Bag(start=start, topics=topics, messages=messages)
 
 
-def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
+def _limit_size(chunk: Any) -> Callable[[bytes], bytes]:
     """Return the chunk's own decompressor, stopped at the limit."""
 
     def unpacked(data: bytes) -> bytes:
@@ -254,8 +260,8 @@ def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
 
 
 @contextmanager
-def _mcap(path: Path) -> Generator[Bag]:
-    reading = optional("mcap.reader", "ros", path, "MCAP")
+def _open_mcap_file(path: Path) -> Generator[Bag]:
+    reading = import_optional("mcap.reader", "ros", path, "MCAP")
     with path.open("rb") as stream:
         reader = reading.make_reader(stream)
         summary = reader.get_summary()
@@ -267,11 +273,12 @@ def _mcap(path: Path) -> Generator[Bag]:
         topics: dict[str, Topic] = {}
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
-            before = topics[channel.topic].count if channel.topic in topics else 0
+            earlier = topics[channel.topic].count if channel.topic in topics else 0
             topics[channel.topic] = Topic(
-                name=channel.topic, kind=_long(schema.name) if schema else "", count=before + counts.get(channel.id, 0),
-                encoding=channel.message_encoding, definition=schema.data.decode(errors="replace") if schema else "",
-                syntax=_syntax(schema.encoding) if schema else "",
+                name=channel.topic, kind=_long_type_name(schema.name) if schema else "",
+                count=earlier + counts.get(channel.id, 0), encoding=channel.message_encoding,
+                definition=schema.data.decode(errors="replace") if schema else "",
+                syntax=_definition_syntax(schema.encoding) if schema else "",
             )  # fmt: skip
 
         def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
@@ -282,10 +289,10 @@ def _mcap(path: Path) -> Generator[Bag]:
         yield Bag(start=start, topics=topics, messages=messages)
 
 
-def _syntax(encoding: str) -> str:
+def _definition_syntax(encoding: str) -> str:
     return {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl"}.get(encoding, "")
 
 
-def _long(name: str) -> str:
+def _long_type_name(name: str) -> str:
     """Return a type's name as rosbags writes it: "std_msgs/String" is "std_msgs/msg/String"."""
     return "/msg/".join(name.split("/")) if name.count("/") == 1 else name

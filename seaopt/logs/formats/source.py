@@ -1,4 +1,4 @@
-"""What every format gives: the fields of a file without their data, and the data of chosen fields."""
+"""What every format reader returns: the fields of a file without their data, and the data of chosen fields."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from seaopt.records import record
 
 # What one file may unfold to in memory: archives are checked before they are unpacked.
 MAX_UNPACKED = 8 << 30
-_NUMBERS = re.compile(r"bool|u?int\d+|float\d+")
+_NUMBER_KIND = re.compile(r"bool|u?int\d+|float\d+")
 MAX_FIELDS = 100_000
 MAX_PARTS = 256  # columns of one matrix, or elements of one array, that get a name each
+MAX_DEPTH = 32  # of groups, structs, objects or messages inside one another
 
 
 @record
@@ -55,7 +56,7 @@ class Field:
     @property
     def numeric(self) -> bool:
         """Whether it holds numbers."""
-        return _NUMBERS.fullmatch(self.kind) is not None
+        return _NUMBER_KIND.fullmatch(self.kind) is not None
 
 
 @record
@@ -100,26 +101,26 @@ class Source:
             The file is damaged, or a cell is not a number.
 
         """
-        with reading(self.path, self.format):
+        with translate_errors(self.path, self.format):
             return self.load(list(dict.fromkeys(names)), window)
 
 
-def by_rows(
+def make_row_loader(
     load: Callable[[str, slice], Any],
 ) -> Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]:
     """Return the `load` of a source whose fields can be read by name and rows."""
 
-    def rows_loaded(names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " _"]]:
-        def one(name: str, rows: slice) -> Float[np.ndarray, " _"]:
-            return np.array(load(name, rows), dtype=float).reshape(-1)
+    def load_column(name: str, rows: slice) -> Float[np.ndarray, " _"]:
+        return np.array(load(name, rows), dtype=float).reshape(-1)
 
-        rows = slice(None) if window is None else rows_of(one(window.clock, slice(None)), window)
-        return {name: one(name, rows) for name in names}
+    def load_columns(names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " _"]]:
+        rows = slice(None) if window is None else find_rows(load_column(window.clock, slice(None)), window)
+        return {name: load_column(name, rows) for name in names}
 
-    return rows_loaded
+    return load_columns
 
 
-def rows_of(clock: Float[np.ndarray, " n"], window: Window) -> slice:
+def find_rows(clock: Float[np.ndarray, " n"], window: Window) -> slice:
     """Return the rows from the first to the last sample inside the window."""
     inside = np.flatnonzero((clock >= window.start) & (clock <= window.stop))
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
@@ -133,7 +134,7 @@ class Place:
     index: int | None = None
     axis: int = 1
 
-    def cut(self, rows: slice) -> tuple[slice | int, ...]:
+    def index_rows(self, rows: slice) -> tuple[slice | int, ...]:
         """Return what to index the array with."""
         if self.index is None:
             return (rows,)
@@ -163,19 +164,19 @@ def spread(
     if len(sizes) != 2 or min(sizes) > MAX_PARTS:
         return [(Field(name=name, kind=f"{kind} array of {'x'.join(map(str, sizes))}", length=None), Place(array=name))]
     axis = 1 if sizes[1] <= sizes[0] else 0
-    shown = "({})" if matlab else "[{}]"
-    out: list[tuple[Field, Place]] = []
+    brackets = "({})" if matlab else "[{}]"
+    parts: list[tuple[Field, Place]] = []
     for index in range(sizes[axis]):
         number = str(index + 1 if matlab else index)
-        label = name + shown.format(f":,{number}" if axis == 1 else f"{number},:")
+        label = name + brackets.format(f":,{number}" if axis == 1 else f"{number},:")
         place = Place(array=name, index=index, axis=axis)
-        out.append((Field(name=label, kind=kind, length=sizes[1 - axis], unit=unit), place))
-    return out
+        parts.append((Field(name=label, kind=kind, length=sizes[1 - axis], unit=unit), place))
+    return parts
 
 
 @contextmanager
-def reading(path: Path, form: str) -> Generator[None]:
-    """Turn whatever a library raises on a damaged file into one line, and keep what else it says to ourselves."""
+def translate_errors(path: Path, form: str) -> Generator[None]:
+    """Turn whatever a library raises on a damaged file into a LogError of one line; its warnings and logs are muted."""
     silenced = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -190,20 +191,20 @@ def reading(path: Path, form: str) -> Generator[None]:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise  # an interrupt; a panic of polars is no Exception, but a damaged file all the same
         raise LogError(
-            f"{path}: cannot be read as {form} ({one_line(error)}); the file may be cut off or damaged, copy or record "
-            "it again"
+            f"{path}: cannot be read as {form} ({summarise_error(error)}); the file may be cut off or damaged, "
+            "copy or record it again"
         ) from error
     finally:
         logging.disable(silenced)
 
 
-def one_line(error: BaseException) -> str:
+def summarise_error(error: BaseException) -> str:
     """Return an error's text on one short line."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 160 else text[:157] + "..."
 
 
-def optional(module: str, extra: str, path: Path, form: str) -> Any:
+def import_optional(module: str, extra: str, path: Path, form: str) -> Any:
     """Import an optional library.
 
     Raises

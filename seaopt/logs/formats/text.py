@@ -21,21 +21,30 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Window, one_line
-from seaopt.logs.formats.text_layout import BLANK, MAX_LINE, Layout, cells, is_number, layout, not_text, too_long
+from seaopt.logs.formats.source import Field, Source, Window, summarise_error
+from seaopt.logs.formats.text_layout import (
+    BLANK,
+    MAX_LINE,
+    TextLayout,
+    encoding_error,
+    find_layout,
+    is_number,
+    line_length_error,
+    split_cells,
+)
 
 if TYPE_CHECKING:
     import polars as pl
 
-BLOCK = 4 << 20
-AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
+BLOCK_BYTES = 4 << 20
+BLOCKS_AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
 _RUNS = re.compile(rb"[ \t]+")
 _BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
 
 
 def open_text(path: Path) -> Source:
     """List a text file's columns."""
-    form = layout(path)
+    form = find_layout(path)
     fields = tuple(
         Field(name=name, kind="float64" if numeric else "text", length=None, unit=unit)
         for name, unit, numeric in zip(form.headers, form.units, form.numeric, strict=True)
@@ -44,27 +53,27 @@ def open_text(path: Path) -> Source:
     return Source(path=path, format="CSV", fields=fields, load=partial(_load, path, form), notes=form.notes)
 
 
-def _load(path: Path, form: Layout, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+def _load(path: Path, form: TextLayout, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     """Return columns by header; text has no index, so a window reads it whole."""
     index = {name: form.headers.index(name) for name in names}
-    columns = _Columns(names)
+    columns = _GrowingColumns(names)
     size = path.stat().st_size
     pending: deque[tuple[float, Future[dict[str, Any]]]] = deque()
     try:
-        with closing(_blocks(path, form)) as blocks, ThreadPoolExecutor(AHEAD) as pool:
+        with closing(_read_blocks(path, form)) as blocks, ThreadPoolExecutor(BLOCKS_AHEAD) as pool:
             for number, block in enumerate(blocks):
                 if not block.isspace():
                     pending.append((size / len(block), pool.submit(_parse, path, form, block, index, number)))
-                if len(pending) > AHEAD:
+                if len(pending) > BLOCKS_AHEAD:
                     columns.add(*pending.popleft())
             while pending:
                 columns.add(*pending.popleft())
     except UnicodeError as error:
-        raise not_text(path, form.encoding, error) from error
-    return columns.whole()
+        raise encoding_error(path, form.encoding, error) from error
+    return columns.finish()
 
 
-class _Columns:
+class _GrowingColumns:
     """Arrays that grow block by block, sized by the first block so that they are rarely moved."""
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -84,85 +93,85 @@ class _Columns:
             array[self.rows : stop] = values
         self.rows = stop
 
-    def whole(self) -> dict[str, Float[np.ndarray, " n"]]:
+    def finish(self) -> dict[str, Float[np.ndarray, " n"]]:
         for array in self.arrays.values():
             array.resize(self.rows, refcheck=False)
         return self.arrays
 
 
-def _blocks(path: Path, form: Layout) -> Generator[bytes]:
+def _read_blocks(path: Path, form: TextLayout) -> Generator[bytes]:
     """Return blocks of whole lines as UTF-8."""
-    with _opened(path, form.encoding) as stream:
+    with _open_file(path, form.encoding) as stream:
         for _ in range(form.first):
             stream.readline()
         number = 0
-        while block := _block(stream, form):
+        while block := _read_block(stream, form):
             _check_lines(path, form, block, number)
             if not number:
                 block = block.removeprefix(codecs.BOM_UTF8)
-            if len(block) < BLOCK:  # the last one may end in blank lines, and in the end-of-file mark of DOS
+            if len(block) < BLOCK_BYTES:  # the last one may end in blank lines, and in the end-of-file mark of DOS
                 block = block.rstrip(b"\x1a \t\r\n") + b"\n"
             yield block
             number += 1
 
 
-def _block(stream: IO[Any], form: Layout) -> bytes:
+def _read_block(stream: IO[Any], form: TextLayout) -> bytes:
     """Return the next block, up to the end of a line."""
     if form.encoding == "utf-16":
-        return (stream.read(BLOCK) + stream.readline(MAX_LINE + 1)).encode()
+        return (stream.read(BLOCK_BYTES) + stream.readline(MAX_LINE + 1)).encode()
     start = stream.tell()
-    stream.seek(start + BLOCK)
+    stream.seek(start + BLOCK_BYTES)
     stream.readline(MAX_LINE + 1)
     end = stream.tell()
     stream.seek(start)
     return stream.read(end - start)
 
 
-def _first_line(path: Path, form: Layout, number: int) -> int:
+def _find_first_line(path: Path, form: TextLayout, number: int) -> int:
     """Return the line on which a block begins; counted only to name a line, as it takes a while."""
-    with closing(_blocks(path, form)) as blocks:
+    with closing(_read_blocks(path, form)) as blocks:
         return form.first + 1 + sum(block.count(b"\n") for block in islice(blocks, number))
 
 
-def _opened(path: Path, encoding: str) -> IO[Any]:
+def _open_file(path: Path, encoding: str) -> IO[Any]:
     if encoding == "utf-16":
         return path.open(encoding=encoding, newline="\n")
     return path.open("rb")
 
 
-def _check_lines(path: Path, form: Layout, block: bytes, number: int) -> None:
+def _check_lines(path: Path, form: TextLayout, block: bytes, number: int) -> None:
     start = 0
     while len(block) - start > MAX_LINE:
         end = block.rfind(b"\n", start, start + MAX_LINE)
         if end < start:
-            raise too_long(path, _first_line(path, form, number) + block.count(b"\n", 0, start))
+            raise line_length_error(path, _find_first_line(path, form, number) + block.count(b"\n", 0, start))
         start = end + 1
 
 
-def _parse(path: Path, form: Layout, block: bytes, index: dict[str, int], number: int) -> dict[str, Any]:
+def _parse(path: Path, form: TextLayout, block: bytes, index: dict[str, int], number: int) -> dict[str, Any]:
     import polars as pl
 
-    def bad(reason: str) -> LogError:
-        return _bad_cell(path, form, block, index, _first_line(path, form, number), reason)
+    def error_at(reason: str) -> LogError:
+        return _cell_error(path, form, block, index, _find_first_line(path, form, number), reason)
 
     try:
-        frame = _frame(_blanks_as_tabs(block, form), form, index, pl.Float64)
+        frame = _parse_frame(_replace_blanks(block, form), form, index, pl.Float64)
     except (pl.exceptions.PolarsError, ValueError):
-        return _parse_text(form, block, index, bad)
+        return _parse_text(form, block, index, error_at)
     if frame.to_series(0).null_count() and _BLANK_LINES.search(block):
-        return _parse_text(form, block, index, bad)
+        return _parse_text(form, block, index, error_at)
     parsed = {name: frame[f"column_{at}"].to_numpy() for name, at in index.items()}
     if any(np.isinf(values).any() for values in parsed.values()):
-        raise bad("a cell is infinite")
+        raise error_at("a cell is infinite")
     return parsed
 
 
-def _blanks_as_tabs(block: bytes, form: Layout) -> bytes:
+def _replace_blanks(block: bytes, form: TextLayout) -> bytes:
     """Return a block whose delimiter is one byte."""
     return re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", block)) if form.delimiter == " " else block
 
 
-def _frame(block: bytes, form: Layout, index: dict[str, int], kind: Any) -> pl.DataFrame:
+def _parse_frame(block: bytes, form: TextLayout, index: dict[str, int], kind: Any) -> pl.DataFrame:
     import polars as pl
 
     wanted = set(index.values())
@@ -180,29 +189,31 @@ def _frame(block: bytes, form: Layout, index: dict[str, int], kind: Any) -> pl.D
     )
 
 
-def _parse_text(form: Layout, block: bytes, index: dict[str, int], bad: Callable[[str], LogError]) -> dict[str, Any]:
+def _parse_text(
+    form: TextLayout, block: bytes, index: dict[str, int], error_at: Callable[[str], LogError]
+) -> dict[str, Any]:
     """Parse a block with blank lines, or with blanks around its numbers; what is still no number is named."""
     import polars as pl
 
     try:
-        frame = _frame(_blanks_as_tabs(_BLANK_LINES.sub(b"", block), form), form, index, pl.String)
+        frame = _parse_frame(_replace_blanks(_BLANK_LINES.sub(b"", block), form), form, index, pl.String)
     except (pl.exceptions.PolarsError, ValueError) as error:
-        raise bad(one_line(error)) from error
+        raise error_at(summarise_error(error)) from error
     parsed: dict[str, Any] = {}
     for name, at in index.items():
         text = frame[f"column_{at}"].str.strip_chars()
         values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
         blank = text.is_null() | text.str.to_lowercase().is_in(list(BLANK))
         if (values.is_null() & ~blank).any() or values.is_infinite().any():
-            raise bad("a cell is no number")
+            raise error_at("a cell is no number")
         parsed[name] = values.to_numpy()
     return parsed
 
 
-def _bad_cell(path: Path, form: Layout, block: bytes, index: dict[str, int], line: int, reason: str) -> LogError:
+def _cell_error(path: Path, form: TextLayout, block: bytes, index: dict[str, int], line: int, reason: str) -> LogError:
     """Return the error that names the first cell, or row, that cannot be read."""
     for number, text in enumerate(block.decode().split("\n"), start=line):
-        row = cells(text.rstrip("\r"), form.delimiter) if text.strip() else []
+        row = split_cells(text.rstrip("\r"), form.delimiter) if text.strip() else []
         if len(row) > len(form.headers):
             return LogError(
                 f"{path}: cannot be read as CSV (line {number} has {len(row)} columns and the header "

@@ -17,9 +17,9 @@ from seaopt.records import record
 from seaopt.units import header_unit, is_unit
 
 MAX_LINE = 1 << 20
-HEAD = 2 * MAX_LINE  # bytes in which the data must begin
-LINES = 2000  # lines in which the data must begin
-SAMPLE = 200  # lines that decide on delimiter and decimal sign
+HEAD_BYTES = 2 * MAX_LINE  # bytes in which the data must begin
+HEAD_LINES = 2000  # lines in which the data must begin
+SAMPLE_LINES = 200  # lines that decide on delimiter and decimal sign
 COMMENTS = ("#", "%", "//")
 BLANK = frozenset({"", "nan", "na", "n/a"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?inf(inity)?", re.IGNORECASE | re.ASCII)
@@ -28,7 +28,7 @@ _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codec
 
 
 @record
-class Layout:
+class TextLayout:
     """How a text file is laid out.
 
     Parameters
@@ -58,7 +58,7 @@ class Layout:
     notes: tuple[str, ...]
 
 
-def layout(path: Path) -> Layout:
+def find_layout(path: Path) -> TextLayout:
     """Return the layout of a text file.
 
     Raises
@@ -67,30 +67,30 @@ def layout(path: Path) -> Layout:
         The file is empty, is not text, has a line beyond 1 MiB, or no data below its header.
 
     """
-    encoding, lines = _head(path)
+    encoding, lines = _read_head(path)
     filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not _is_comment(line)]
     if not filled:
         raise LogError(f"{path}: the file holds no data, only comments or blank lines; record the log again")
-    sample = [line for _, line in filled[-SAMPLE:]]
-    delimiter, comma = _delimiter(sample, filled[0][1])
-    width = Counter(len(cells(line, delimiter)) for line in sample).most_common(1)[0][0]
+    sample = [line for _, line in filled[-SAMPLE_LINES:]]
+    delimiter, comma = _find_delimiter(sample, filled[0][1])
+    width = Counter(len(split_cells(line, delimiter)) for line in sample).most_common(1)[0][0]
     first = next((at for at, line in filled if _is_data(line, delimiter, comma, width)), None)
     if first is None:  # the header is the first line, and text stands in every row below it
         first = filled[1][0] if len(filled) > 1 else len(lines)
     if first >= len(lines):
         raise LogError(f"{path}: 0 rows below the header; record the log again")
-    rows = [cells(line, delimiter) for at, line in filled if at >= first]
-    headers, units, notes = _headers(path, lines[:first], delimiter, width, rows)
+    rows = [split_cells(line, delimiter) for at, line in filled if at >= first]
+    headers, units, notes = _find_headers(path, lines[:first], delimiter, width, rows)
     numeric = tuple(_is_numeric(rows, index, comma) for index in range(len(headers)))
     if comma:
         notes.append("the decimal sign is a comma")
-    return Layout(
+    return TextLayout(
         encoding=encoding, delimiter=delimiter, comma=comma, headers=tuple(headers), units=tuple(units),
         numeric=numeric, first=first, notes=tuple(notes),
     )  # fmt: skip
 
 
-def cells(line: str, delimiter: str) -> list[str]:
+def split_cells(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, stripped."""
     if delimiter == " ":
         return line.split()
@@ -105,10 +105,10 @@ def is_number(cell: str, comma: bool) -> bool:
     return _NUMBER.fullmatch(cell.replace(",", ".", 1) if comma else cell) is not None
 
 
-def _head(path: Path) -> tuple[str, list[str]]:
+def _read_head(path: Path) -> tuple[str, list[str]]:
     """Return the encoding and the first lines, the last one only if it is whole."""
     with path.open("rb") as stream:
-        raw = stream.read(HEAD)
+        raw = stream.read(HEAD_BYTES)
     if not raw.strip(b" \t\r\n\x1a\x00"):
         raise LogError(f"{path}: the file is empty; record the log again")
     encoding = next((name for bom, name in _BOMS if raw.startswith(bom)), "utf-8")
@@ -116,14 +116,15 @@ def _head(path: Path) -> tuple[str, list[str]]:
         line = raw.count(b"\n", 0, raw.index(0)) + 1
         raise LogError(f"{path}: line {line} holds a zero byte, it is not a text file; save the log as CSV")
     try:
-        text = codecs.getincrementaldecoder(encoding)().decode(raw, final=len(raw) < HEAD)
+        text = codecs.getincrementaldecoder(encoding)().decode(raw, final=len(raw) < HEAD_BYTES)
     except UnicodeError as error:
-        raise not_text(path, encoding, error) from error
-    whole = len(raw) < HEAD
-    lines = text.rstrip("\x1a" if whole else "").split("\n", LINES)
-    rest = len(lines) > LINES  # the last item is all that is left
-    if (long := next((at for at, line in enumerate(lines[:LINES], start=1) if len(line) > MAX_LINE), None)) is not None:
-        raise too_long(path, long)
+        raise encoding_error(path, encoding, error) from error
+    whole = len(raw) < HEAD_BYTES
+    lines = text.rstrip("\x1a" if whole else "").split("\n", HEAD_LINES)
+    rest = len(lines) > HEAD_LINES  # the last item is all that is left
+    for number, line in enumerate(lines[:HEAD_LINES], start=1):
+        if len(line) > MAX_LINE:
+            raise line_length_error(path, number)
     if not whole or rest:
         lines.pop()
     if len(lines) <= 1 and "\r" in text.rstrip("\r\n"):
@@ -131,14 +132,14 @@ def _head(path: Path) -> tuple[str, list[str]]:
     return encoding, [line.rstrip("\r") for line in lines]
 
 
-def not_text(path: Path, encoding: str, error: UnicodeError) -> LogError:
+def encoding_error(path: Path, encoding: str, error: UnicodeError) -> LogError:
     """Return the error of a byte that is no text."""
     name = "UTF-16" if encoding == "utf-16" else "UTF-8"
     at = f"byte {error.start}" if isinstance(error, UnicodeDecodeError) else "no text"
     return LogError(f"{path}: is not {name} text ({at}); save the log as UTF-8 CSV")
 
 
-def too_long(path: Path, line: int) -> LogError:
+def line_length_error(path: Path, line: int) -> LogError:
     """Return the error of a line that no log has."""
     return LogError(f"{path}: line {line} is longer than {MAX_LINE >> 20} MiB; is it a log? save one row a line")
 
@@ -147,18 +148,18 @@ def _is_comment(line: str) -> bool:
     return line.lstrip().startswith(COMMENTS)
 
 
-def _delimiter(sample: list[str], header: str) -> tuple[str, bool]:
+def _find_delimiter(sample: list[str], header: str) -> tuple[str, bool]:
     """Return the delimiter and decimal sign that make most cells numbers."""
     best = max(
         ((_score(sample, delimiter, comma), delimiter, comma) for delimiter in _DELIMITERS
          for comma in ((False,) if delimiter == "," else (False, True))),
-        key=lambda item: item[0],
+        key=lambda scored: scored[0],
     )  # fmt: skip
     return (best[1], best[2]) if best[0] > 0 else (max(",;\t|", key=header.count), False)
 
 
 def _score(sample: list[str], delimiter: str, comma: bool) -> float:
-    rows = [cells(line, delimiter) for line in sample]
+    rows = [split_cells(line, delimiter) for line in sample]
     width, count = Counter(map(len, rows)).most_common(1)[0]
     if width < 2:
         return 0.0
@@ -170,9 +171,9 @@ def _score(sample: list[str], delimiter: str, comma: bool) -> float:
 
 
 def _is_data(line: str, delimiter: str, comma: bool, width: int) -> bool:
-    row = [cell for cell in cells(line, delimiter) if cell.casefold() not in BLANK]
+    row = [cell for cell in split_cells(line, delimiter) if cell.casefold() not in BLANK]
     numbers = sum(is_number(cell, comma) for cell in row)
-    return len(cells(line, delimiter)) == width and numbers > 0 and 2 * numbers >= len(row)
+    return len(split_cells(line, delimiter)) == width and numbers > 0 and 2 * numbers >= len(row)
 
 
 def _is_numeric(rows: list[list[str]], index: int, comma: bool) -> bool:
@@ -183,44 +184,46 @@ def _is_numeric(rows: list[list[str]], index: int, comma: bool) -> bool:
     return True
 
 
-def _headers(
+def _find_headers(
     path: Path, above: list[str], delimiter: str, width: int, rows: list[list[str]]
 ) -> tuple[list[str], list[str | None], list[str]]:
     """Return header and unit of each column, and what was found above the data."""
     notes: list[str] = []
-    candidates = [(at, _header_cells(line, delimiter)) for at, line in enumerate(above) if line.strip()]
+    candidates = [(at, _split_header(line, delimiter)) for at, line in enumerate(above) if line.strip()]
     table = [(at, row) for at, row in candidates if not _is_comment(above[at])]
-    found = [(at, row) for at, row in table if _fits(row, width, rows) and sum(map(bool, row)) > min(1, width - 1)]
-    if not found and table:  # a lone line above the data is the header, whatever its width
+    header_rows = [
+        (at, row) for at, row in table if _fits(row, width, rows) and sum(map(bool, row)) > min(1, width - 1)
+    ]
+    if not header_rows and table:  # a lone line above the data is the header, whatever its width
         at, row = table[-1]
         raise LogError(
             f"{path}: cannot be read as CSV (line {at + 1} has {len(row)} columns and the rows below have {width}); "
             "check that every row has the header's columns, and that a decimal comma is not the delimiter as well"
         )
-    if not found:
-        found = [(at, row) for at, row in candidates if len(row) == width][-1:]
-    skipped = len(candidates) - len(found)
+    if not header_rows:
+        header_rows = [(at, row) for at, row in candidates if len(row) == width][-1:]
+    skipped = len(candidates) - len(header_rows)
     if skipped:
         notes.append(f"{skipped} line{'s' if skipped > 1 else ''} above the header passed over")
-    if not found:
+    if not header_rows:
         notes.append("no header was found; columns are numbered from 1")
         return [f"column {index + 1}" for index in range(width)], [None] * width, notes
     units: list[str | None] = [None] * width
-    if len(found) > 1 and _is_units_row(found[-1][1]):
-        notes.append(f"line {found[-1][0] + 1} was read as the units")
-        units = [_bare_unit(cell) for cell in _padded(found.pop()[1], width)]
-    if len(found) > 1:
-        notes.append(f"{len(found)} header lines were joined")
-    names = zip(*(_padded(row, width) for _, row in found), strict=True)
+    if len(header_rows) > 1 and _is_units_row(header_rows[-1][1]):
+        notes.append(f"line {header_rows[-1][0] + 1} was read as the units")
+        units = [_strip_brackets(cell) for cell in _pad(header_rows.pop()[1], width)]
+    if len(header_rows) > 1:
+        notes.append(f"{len(header_rows)} header lines were joined")
+    names = zip(*(_pad(row, width) for _, row in header_rows), strict=True)
     headers = [" ".join(cell for cell in column if cell) for column in names]
     return headers, [unit or header_unit(name) for unit, name in zip(units, headers, strict=True)], notes
 
 
-def _header_cells(line: str, delimiter: str) -> list[str]:
+def _split_header(line: str, delimiter: str) -> list[str]:
     if _is_comment(line):
         line = line.lstrip().lstrip("#%/").strip()
     if delimiter != " ":
-        return cells(line, delimiter)
+        return split_cells(line, delimiter)
     joined: list[str] = []  # "time [s]" is one header
     for token in line.split():
         if joined and token[0] in "[(":
@@ -237,14 +240,14 @@ def _fits(row: list[str], width: int, rows: list[list[str]]) -> bool:
     return len(row) > 0 and not any(cell for data in rows for cell in data[len(row) :])
 
 
-def _padded(row: list[str], width: int) -> list[str]:
+def _pad(row: list[str], width: int) -> list[str]:
     return (row + [""] * width)[:width]
 
 
-def _bare_unit(cell: str) -> str | None:
+def _strip_brackets(cell: str) -> str | None:
     return cell.strip("[]() ") or None
 
 
 def _is_units_row(row: list[str]) -> bool:
-    filled = [unit for cell in row if (unit := _bare_unit(cell))]
+    filled = [unit for cell in row if (unit := _strip_brackets(cell))]
     return bool(filled) and all(is_unit(unit) for unit in filled)

@@ -31,7 +31,7 @@ class Hold:
     max_age_s: float = np.inf
 
     def __post_init__(self) -> None:
-        _positive("Hold", "max_age_s", self.max_age_s)
+        _check_positive("Hold", "max_age_s", self.max_age_s)
 
     @property
     def reach_s(self) -> float:
@@ -66,7 +66,7 @@ class Linear:
     max_gap_s: float = np.inf
 
     def __post_init__(self) -> None:
-        _positive("Linear", "max_gap_s", self.max_gap_s)
+        _check_positive("Linear", "max_gap_s", self.max_gap_s)
 
     @property
     def reach_s(self) -> float:
@@ -106,7 +106,7 @@ class Nearest:
     tolerance_s: float
 
     def __post_init__(self) -> None:
-        _positive("Nearest", "tolerance_s", self.tolerance_s)
+        _check_positive("Nearest", "tolerance_s", self.tolerance_s)
 
     @property
     def reach_s(self) -> float:
@@ -125,7 +125,7 @@ class Nearest:
 Rule = Hold | Linear | Nearest
 
 
-def check_clock(time: Float[np.ndarray, " m"], place: str) -> None:
+def check_increasing(time: Float[np.ndarray, " m"], place: str) -> None:
     """Refuse a clock that no rule can work on.
 
     Raises
@@ -155,6 +155,6 @@ def _neighbours(
     return before, after, (at >= time[0] - TICK) & (at <= time[-1] + TICK)
 
 
-def _positive(rule: str, name: str, value: float) -> None:
+def _check_positive(rule: str, name: str, value: float) -> None:
     if not value > 0:
         raise LogError(f"{rule}: {name} = {value:g} must be above 0; give seconds")

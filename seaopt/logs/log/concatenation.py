@@ -61,14 +61,14 @@ def concatenate(logs: Sequence[Log], *, gap_s: float | None = None) -> Log:
     sources = ", ".join(dict.fromkeys(log.source for log in logs))
     notes = [f"{log.source}: {note}" for log in logs for note in log.notes]
     signals = {
-        name: replace(signal, values=values[name], origin=_origin([log.signal(name).origin for log in logs]))
+        name: replace(signal, values=values[name], origin=_merge_origins([log.signal(name).origin for log in logs]))
         for name, signal in first.signals.items()
     }
     note = f"{len(logs)} logs appended"
     return Log(time=np.concatenate(times), signals=signals, source=sources, notes=(*dict.fromkeys(notes), note))
 
 
-def _origin(origins: list[Origin]) -> Origin:
+def _merge_origins(origins: list[Origin]) -> Origin:
     """Return where an appended channel came from: what differs is listed, in the order of the logs."""
     fields = ("file", "sha256", "column", "conversion")
     return Origin(**{name: "; ".join(dict.fromkeys(getattr(origin, name) for origin in origins)) for name in fields})

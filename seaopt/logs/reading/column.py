@@ -38,7 +38,7 @@ class Column:
 
     Examples
     --------
-    >>> Column(column="load", unit="-", wrap_bits=16, scale=1e-3).conversion("-")
+    >>> Column(column="load", unit="-", wrap_bits=16, scale=1e-3).describe_conversion("-")
     "two's complement of 16 bits, times 0.001"
 
     """
@@ -67,7 +67,7 @@ class Column:
     def to_si(self, values: Float[np.ndarray, " n"], unit: str, place: str) -> Float[np.ndarray, " n"]:
         """Return the values in the SI unit of `unit`; the array given is used up."""
         if self.wrap_bits is not None:
-            values = _wrapped(values, self.wrap_bits, f'{place}: column "{self.column}"')
+            values = _decode_twos_complement(values, self.wrap_bits, f'{place}: column "{self.column}"')
         for step in (self.scale, factor(unit, si_unit(unit))):
             if step != 1.0:
                 values *= step
@@ -75,7 +75,7 @@ class Column:
                 values += self.offset
         return values
 
-    def conversion(self, unit: str) -> str:
+    def describe_conversion(self, unit: str) -> str:
         """Return in words what `to_si` does."""
         steps = [f"two's complement of {self.wrap_bits} bits"] if self.wrap_bits is not None else []
         steps += [f"times {self.scale:g}"] if self.scale != 1 else []
@@ -109,13 +109,13 @@ def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> in
     return bits if whole and apart and np.ptp(small) > 0 and np.ptp(large) > 0 else None
 
 
-def _wrapped(values: Float[np.ndarray, " n"], bits: int, where: str) -> Float[np.ndarray, " n"]:
+def _decode_twos_complement(values: Float[np.ndarray, " n"], bits: int, where: str) -> Float[np.ndarray, " n"]:
     """Return two's complement of unsigned integers."""
     whole = 2.0**bits
-    good = np.isnan(values) | ((values >= 0) & (values < whole) & (values == np.floor(values)))
-    if not np.all(good):
-        row = int(np.flatnonzero(~good)[0])
+    valid = np.isnan(values) | ((values >= 0) & (values < whole) & (values == np.floor(values)))
+    if not np.all(valid):
+        row = int(np.flatnonzero(~valid)[0])
         raise LogError(
-            f"{where} is {values[row]:g} in sample {row + 1}, no unsigned integer of {bits} bits; correct wrap_bits"
+            f"{where} is {values[row]:g} in sample {row + 1}, not an unsigned integer of {bits} bits; correct wrap_bits"
         )
     return np.where(values >= whole / 2, values - whole, values)

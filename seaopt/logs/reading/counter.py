@@ -1,4 +1,4 @@
-"""A column that counts samples shows which ones were lost, where the recorder numbers its rows all the same.
+"""A column that counts samples shows which ones were lost, although the recorder's clock runs on without a gap.
 
 Each count stands for a fixed number of samples. A count that was held shorter, or skipped, tells how many samples are
 missing; the recorder's time column does not, because it counts rows. The first and the last count may be cut.
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from seaopt.errors import LogError
 from seaopt.records import record
 
-PROBE = 1000  # samples that must look like a counter before all are looked at
+PROBE_SAMPLES = 1000  # samples that must look like a counter before all are looked at
 
 
 @record
@@ -49,21 +49,21 @@ class Counter:
         Raises
         ------
         LogError
-            The column is no counter: not whole, or falling.
+            The column is not a counter: not whole, or falling.
 
         """
         if not np.all(np.isfinite(values)) or np.any(values != np.floor(values)) or np.any(np.diff(values) < 0):
             raise LogError(
                 f'{place}: counter "{self.column}" is not a whole number that only rises; choose another column'
             )
-        starts, lost = _losses(values, self.samples_per_count)
+        starts, lost = _count_losses(values, self.samples_per_count)
         total = int(lost.sum())
         if not total:
             return time, f'counter "{self.column}" shows no lost sample'
-        late = np.zeros(time.size)
-        late[starts] = lost
+        shift = np.zeros(time.size)
+        shift[starts] = lost
         first = float(time[starts[np.flatnonzero(lost)[0]]])
-        moved = time + np.cumsum(late) * float(np.median(np.diff(time)))
+        moved = time + np.cumsum(shift) * float(np.median(np.diff(time)))
         plural = "s" if total > 1 else ""
         return moved, (
             f'counter "{self.column}" shows {total} lost sample{plural}, the first before t = {first:.6g} s; later '
@@ -73,7 +73,7 @@ class Counter:
     @staticmethod
     def suspect(values: Float[np.ndarray, " n"]) -> int:
         """Return how many samples a column seems to miss, if it looks like a counter; 0 otherwise."""
-        for part in (values[:PROBE], values):
+        for part in (values[:PROBE_SAMPLES], values):
             step = np.diff(part)
             if part.size < 10 or not np.all((step >= 0) & (part[1:] == np.floor(part[1:]))):
                 return 0
@@ -84,14 +84,14 @@ class Counter:
         jumps = np.diff(values)[np.diff(values) > 0]
         if np.mean(runs == usual) < 0.8 or np.mean(jumps == 1) < 0.8:
             return 0
-        return int(_losses(values, usual)[1].sum())
+        return int(_count_losses(values, usual)[1].sum())
 
 
-def _losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+def _count_losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Return where each count but the first begins, and how many samples are missing before it."""
     starts = np.flatnonzero(np.diff(values)) + 1
     skipped = (np.diff(values)[starts - 1].astype(int) - 1) * each
-    held = np.diff(np.concatenate([[0], starts]))
-    short = np.maximum(each - held, 0)
-    short[:1] = 0  # the recording may begin within a count
-    return starts, skipped + short
+    lengths = np.diff(np.concatenate([[0], starts]))
+    missing = np.maximum(each - lengths, 0)
+    missing[:1] = 0  # the recording may begin within a count
+    return starts, skipped + missing

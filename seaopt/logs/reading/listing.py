@@ -8,7 +8,7 @@ from pathlib import Path
 from seaopt.logs.formats import Field, open_source
 from seaopt.records import record
 
-SHOWN = 200
+MAX_ROWS = 200  # that are printed
 
 
 @record
@@ -22,7 +22,7 @@ class Contents:
     fields : tuple of Field
         Name, kind, length, unit and clock of each column; the name is what `Column(column=...)` takes.
     notes : tuple of str
-        What was found besides.
+        Remarks on how the file was understood.
 
     """
 
@@ -33,13 +33,13 @@ class Contents:
 
     def __repr__(self) -> str:
         rows = [("column", "kind", "samples", "unit", "clock")]
-        rows += [_row(item) for item in self.fields[:SHOWN]]
+        rows += [_format_row(field) for field in self.fields[:MAX_ROWS]]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = [f"{self.path}: {self.format}, {len(self.fields)} columns"]
         lines += [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
         ]
-        lines += [f"... and {len(self.fields) - SHOWN} more"] if len(self.fields) > SHOWN else []
+        lines += [f"... and {len(self.fields) - MAX_ROWS} more"] if len(self.fields) > MAX_ROWS else []
         return "\n".join([*lines, *self.notes])
 
     def _repr_html_(self) -> str:
@@ -70,6 +70,6 @@ def contents(path: str | Path) -> Contents:
     return Contents(path=str(path), format=source.format, fields=source.fields, notes=source.notes)
 
 
-def _row(item: Field) -> tuple[str, str, str, str, str]:
-    length = "" if item.length is None else str(item.length)
-    return item.name, item.kind, length, item.unit or "", item.clock or ""
+def _format_row(field: Field) -> tuple[str, str, str, str, str]:
+    length = "" if field.length is None else str(field.length)
+    return field.name, field.kind, length, field.unit or "", field.clock or ""

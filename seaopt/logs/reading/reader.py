@@ -13,11 +13,11 @@ from jaxtyping import Float
 from seaopt.errors import LogError
 from seaopt.files import write_text
 from seaopt.logs.formats import Window, open_source
-from seaopt.logs.log.alignment import Rule, check_clock
+from seaopt.logs.log.alignment import Rule, check_increasing
 from seaopt.logs.log.log import Log
 from seaopt.logs.reading.column import Column, suspect_wrap
 from seaopt.logs.reading.counter import Counter
-from seaopt.logs.reading.selection import Channel, Clock, Selection, select
+from seaopt.logs.reading.selection import ClockColumn, SelectedChannel, Selection, select
 from seaopt.signals import Origin, Signal, Table
 from seaopt.units import factor, si_unit
 
@@ -73,21 +73,21 @@ def read_table(
     ('columns that hold no numbers were left out: note',)
 
     """
-    files = [Path(path)] if isinstance(path, str | Path) else [Path(item) for item in path]
+    files = [Path(path)] if isinstance(path, str | Path) else [Path(file) for file in path]
     if not files:
         raise LogError("path is an empty list; give a file")
     sources = [open_source(file) for file in files]
-    window = _window(window_s)
+    _check_window(window_s)
     with ThreadPoolExecutor(max_workers=1) as pool:  # the files are hashed while they are parsed
-        digests = {source.path: pool.submit(_digest, source.path) if digest else None for source in sources}
+        digests = {source.path: pool.submit(_hash_file, source.path) if digest else None for source in sources}
         chosen = select(sources, time, channels, align, counter)
-        arrays, clock, notes = _read(chosen, window, counter)
+        arrays, clock, notes = _read_channels(chosen, window_s, counter)
         hashes = {file: future.result() if future is not None else "" for file, future in digests.items()}
     notes = [*chosen.notes, *notes]
     signals = {}
     for name, channel in chosen.channels.items():
-        signals[name] = _signal(name, channel, arrays.pop(name), chosen.clock, hashes[channel.source.path])
-        notes += _remarks(signals[name])
+        signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, hashes[channel.source.path])
+        notes += _remark_on(signals[name])
     return Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
 
 
@@ -143,47 +143,48 @@ def write_log(log: Log, path: str | Path) -> Path:
     return write_text(path, log.to_polars().write_csv())
 
 
-def _digest(path: Path) -> str:
+def _hash_file(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _window(given: tuple[float, float] | None) -> tuple[float, float] | None:
-    if given is not None and not (len(given) == 2 and given[0] < given[1]):
-        raise LogError(f"window_s = {given}: give (start, stop) with start before stop")
-    return given
+def _check_window(window_s: tuple[float, float] | None) -> None:
+    if window_s is not None and not (len(window_s) == 2 and window_s[0] < window_s[1]):
+        raise LogError(f"window_s = {window_s}: give (start, stop) with start before stop")
 
 
-def _read(
+def _read_channels(
     chosen: Selection, window: tuple[float, float] | None, counter: Counter | None
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"], list[str]]:
     """Return the channels in their files' units and the clock in seconds, and what was done."""
     notes: list[str] = []
     arrays: dict[str, Float[np.ndarray, " n"]] = {}
-    own = {name: channel for name, channel in chosen.channels.items() if channel.clock == chosen.clock}
+    on_clock = {name: channel for name, channel in chosen.channels.items() if channel.clock == chosen.clock}
     extra = [counter.column] if counter is not None else []
-    columns, clock = _read_clock(chosen.clock, [channel.field.name for channel in own.values()] + extra, window)
+    columns, clock = _read_clock(chosen.clock, [channel.field.name for channel in on_clock.values()] + extra, window)
     if clock.size < 2:
         span = f" in window_s = {window}" if window else ""
         raise LogError(f"{chosen.clock.source.path}: too few samples ({clock.size}){span}; a log needs at least 2")
     if counter is not None:
         clock, note = counter.open_gaps(clock, columns[counter.column], str(chosen.clock.source.path))
         notes.append(note)
-    arrays |= _one_each(own, columns)
+    arrays |= _separate_arrays(on_clock, columns)
     others = [channel.clock for channel in chosen.channels.values() if channel.clock != chosen.clock]
     for other in dict.fromkeys(others):
         group = {name: channel for name, channel in chosen.channels.items() if channel.clock == other}
-        found, time = _read_clock(other, [channel.field.name for channel in group.values()], _wider(window, group))
-        check_clock(time, f'{other.source.path}: clock "{other.name}"')
+        columns, time = _read_clock(
+            other, [channel.field.name for channel in group.values()], _widen_window(window, group)
+        )
+        check_increasing(time, f'{other.source.path}: clock "{other.name}"')
         for name, channel in group.items():
             assert channel.rule is not None
-            arrays[name] = channel.rule(clock, time, found[channel.field.name])
-            notes.append(_aligned_note(name, channel, clock, time))
+            arrays[name] = channel.rule(clock, time, columns[channel.field.name])
+            notes.append(_describe_alignment(name, channel, clock, time))
     return arrays, clock, notes
 
 
 def _read_clock(
-    clock: Clock, names: list[str], window: tuple[float, float] | None
+    clock: ClockColumn, names: list[str], window: tuple[float, float] | None
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
     """Return columns that share a clock, and the clock in seconds, cut to the window."""
     scale = factor(clock.unit, "s")
@@ -203,8 +204,8 @@ def _read_clock(
     return columns, time
 
 
-def _one_each(
-    group: Mapping[str, Channel], columns: dict[str, Float[np.ndarray, " n"]]
+def _separate_arrays(
+    group: Mapping[str, SelectedChannel], columns: dict[str, Float[np.ndarray, " n"]]
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Return an array of its own for each channel: two channels of one column are converted apart."""
     names = [channel.field.name for channel in group.values()]
@@ -214,7 +215,9 @@ def _one_each(
     }
 
 
-def _wider(window: tuple[float, float] | None, group: Mapping[str, Channel]) -> tuple[float, float] | None:
+def _widen_window(
+    window: tuple[float, float] | None, group: Mapping[str, SelectedChannel]
+) -> tuple[float, float] | None:
     """Return the window in which the rules may find neighbours."""
     if window is None:
         return None
@@ -222,8 +225,10 @@ def _wider(window: tuple[float, float] | None, group: Mapping[str, Channel]) -> 
     return window[0] - margin, window[1] + margin
 
 
-def _aligned_note(name: str, channel: Channel, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> str:
-    """Say by which rule a channel came over, and how much of the log its clock does not reach."""
+def _describe_alignment(
+    name: str, channel: SelectedChannel, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
+) -> str:
+    """Return a note: by which rule a channel came over, and how much of the log its clock does not reach."""
     outside = int(np.sum(~((at >= time[0]) & (at <= time[-1]))))
     text = f'{name}: brought from clock "{channel.clock.name}" by {channel.rule}'
     if outside:
@@ -231,18 +236,22 @@ def _aligned_note(name: str, channel: Channel, at: Float[np.ndarray, " n"], time
     return text
 
 
-def _signal(name: str, channel: Channel, values: Float[np.ndarray, " n"], clock: Clock, digest: str) -> Signal:
+def _build_signal(
+    name: str, channel: SelectedChannel, values: Float[np.ndarray, " n"], clock: ClockColumn, digest: str
+) -> Signal:
     column, unit = channel.column, channel.unit
     converted = column.to_si(values, unit, str(channel.source.path))
-    words = [text for text in (column.conversion(unit), "" if channel.clock == clock else str(channel.rule)) if text]
+    words = [
+        text for text in (column.describe_conversion(unit), "" if channel.clock == clock else str(channel.rule)) if text
+    ]
     origin = Origin(
         file=str(channel.source.path), sha256=digest, column=channel.field.name, conversion=", then ".join(words)
     )
     return Signal(name=name, values=converted, unit=si_unit(unit), origin=origin)
 
 
-def _remarks(signal: Signal) -> list[str]:
-    """Say what is odd about a channel at first sight."""
+def _remark_on(signal: Signal) -> list[str]:
+    """Return notes on what looks wrong with a channel at first sight."""
     low, high = np.fmin.reduce(signal.values), np.fmax.reduce(signal.values)
     if not np.isfinite(low):
         return [f"{signal.name}: holds no number"]

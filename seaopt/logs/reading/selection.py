@@ -1,10 +1,10 @@
-"""Which columns of which files are the channels, and which clock each is on; whatever is not said is asked for."""
+"""Which columns of which files become the channels, and which clock each is on; what is not clear is an error."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 
 from seaopt.errors import LogError, SeaoptError, suggestion
@@ -17,14 +17,14 @@ from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
-SHOWN = 20  # names in a message
+MAX_NAMES = 20  # in a message
 
 
 @record
-class Clock:
+class ClockColumn:
     """A column of times: two are the same clock if all of this is the same."""
 
-    source: Source = field(compare=False)
+    source: Source = dataclasses.field(compare=False)
     path: Path
     name: str
     unit: str
@@ -32,14 +32,14 @@ class Clock:
 
 
 @record
-class Channel:
+class SelectedChannel:
     """A channel before it is read."""
 
     column: Column
     source: Source
     field: Field
     unit: str
-    clock: Clock
+    clock: ClockColumn
     rule: Rule | None
 
 
@@ -47,8 +47,8 @@ class Channel:
 class Selection:
     """What is to be read."""
 
-    clock: Clock
-    channels: Mapping[str, Channel]
+    clock: ClockColumn
+    channels: Mapping[str, SelectedChannel]
     notes: tuple[str, ...]
 
 
@@ -72,263 +72,270 @@ def select(
     """
     if channels is not None and "time" in channels:
         raise LogError(f'{sources[0].path}: a channel is named "time"; rename it, time is the clock')
-    given = None if channels is None else {name: as_column(item) for name, item in channels.items()}
-    found = None if given is None else {name: find(sources, name, column) for name, column in given.items()}
-    clock = _log_clock(sources, time, None if found is None else list(found.values()))
+    columns = None if channels is None else {name: as_column(column) for name, column in channels.items()}
+    places = None if columns is None else {name: find_column(sources, name, column) for name, column in columns.items()}
+    clock = _find_log_clock(sources, time, None if places is None else list(places.values()))
     notes = [note for source in sources for note in source.notes]
-    if given is None or found is None:
-        given, found, more = _every_channel(sources, clock, align)
+    if columns is None or places is None:
+        columns, places, more = _select_every_channel(sources, clock, align)
         notes += more
     if counter is not None:
-        find([clock.source], "the counter", Column(column=counter.column))
-    out: dict[str, Channel] = {}
-    for name, column in given.items():
-        source, item = found[name]
-        own = _channel_clock(sources, clock, column, source, item)
+        find_column([clock.source], "the counter", Column(column=counter.column))
+    selected: dict[str, SelectedChannel] = {}
+    for name, column in columns.items():
+        source, field = places[name]
+        channel_clock = _find_channel_clock(sources, clock, column, source, field)
         rule = column.align or align
-        if own != clock and rule is None:
+        if channel_clock != clock and rule is None:
             raise LogError(
-                f'{source.path}: "{item.name}" is on the clock "{own.name}", the log on "{clock.name}" of '
+                f'{source.path}: "{field.name}" is on the clock "{channel_clock.name}", the log on "{clock.name}" of '
                 f"{clock.path.name}; bring it over by align=Hold(), Linear() or Nearest(tolerance_s=...)"
             )
-        unit = unit_of(source, column, item)
-        out[name] = Channel(
-            column=column, source=source, field=item, unit=unit, clock=own, rule=rule if own != clock else None
-        )
-    notes += check_distinct(
-        {name: ((str(item.source.path), item.field.name), si_unit(item.unit)) for name, item in out.items()}
-    )
-    return Selection(clock=clock, channels=out, notes=tuple(notes))
+        selected[name] = SelectedChannel(
+            column=column, source=source, field=field, unit=resolve_unit(source, column, field), clock=channel_clock,
+            rule=rule if channel_clock != clock else None,
+        )  # fmt: skip
+    origins = {name: (str(channel.source.path), channel.field.name) for name, channel in selected.items()}
+    notes += check_distinct({name: (origins[name], si_unit(channel.unit)) for name, channel in selected.items()})
+    return Selection(clock=clock, channels=selected, notes=tuple(notes))
 
 
-def as_column(given: str | Column) -> Column:
-    """Return a column; a bare header is one."""
-    return given if isinstance(given, Column) else Column(column=given)
+def as_column(column: str | Column) -> Column:
+    """Return a column, of which the header alone may be given."""
+    return column if isinstance(column, Column) else Column(column=column)
 
 
-def find(sources: Sequence[Source], name: str, column: Column) -> tuple[Source, Field]:
+def find_column(sources: Sequence[Source], name: str, column: Column) -> tuple[Source, Field]:
     """Return the file and the field that a column names."""
     places = [source for source in sources if column.file is None or source.path == Path(column.file)]
     if not places:
         known = ", ".join(str(source.path) for source in sources)
         raise LogError(f'{name}: file = "{column.file}" is none of those read; give one of {known}')
-    hits = [(source, item) for source in places for item in source.fields if item.name == column.column]
+    hits = [(source, field) for source in places for field in source.fields if field.name == column.column]
     if not hits:
-        names = [item.name for source in places for item in source.fields]
-        raise LogError(f'{_paths(places)}: no column "{column.column}" for {name}; {known_names(column.column, names)}')
+        names = [field.name for source in places for field in source.fields]
+        raise LogError(
+            f'{_list_paths(places)}: no column "{column.column}" for {name}; {suggest_names(column.column, names)}'
+        )
     if len(hits) > 1 and hits[0][0] is hits[1][0]:
         raise LogError(f'{hits[0][0].path}: {len(hits)} columns are named "{column.column}"; rename all but one')
     if len(hits) > 1:
         raise LogError(
-            f'"{column.column}" for {name} is in {_paths([source for source, _ in hits])}; say which with '
+            f'"{column.column}" for {name} is in {_list_paths([source for source, _ in hits])}; say which with '
             f'Column(column="{column.column}", file=...)'
         )
-    source, item = hits[0]
-    if not item.numeric and source.format != "CSV":  # a text file names the cell, on reading
-        raise LogError(f'{source.path}: "{item.name}" holds {item.kind}, no numbers; {item.remedy}')
-    return source, item
+    source, field = hits[0]
+    if not field.numeric and source.format != "CSV":  # a text file names the cell, on reading
+        raise LogError(f'{source.path}: "{field.name}" holds {field.kind}, not numbers; {field.remedy}')
+    return source, field
 
 
-def known_names(name: str, names: Sequence[str]) -> str:
+def suggest_names(name: str, names: Sequence[str]) -> str:
     """Return what to say after an unknown name, however many names there are."""
-    said = suggestion(name, names)
-    if said.startswith("known") and len(names) > SHOWN:
-        shown = ", ".join(names[:SHOWN])
+    text = suggestion(name, names)
+    if text.startswith("known") and len(names) > MAX_NAMES:
+        shown = ", ".join(names[:MAX_NAMES])
         return f"known: {shown}, ... ({len(names)} in all; contents(path), or seaopt inspect --list, lists them)"
-    return said
+    return text
 
 
-def unit_of(source: Source, column: Column, item: Field) -> str:
+def resolve_unit(source: Source, column: Column, field: Field) -> str:
     """Return a column's unit: as given, else as the file says."""
-    unit = column.unit if column.unit is not None else item.unit
+    unit = column.unit if column.unit is not None else field.unit
     if unit is None:
         how = (
-            f'write it in the header\'s brackets, "{item.name} [unit]", or give it with the column (--unit)'
+            f'write it in the header\'s brackets, "{field.name} [unit]", or give it with the column (--unit)'
             if source.format == "CSV"
-            else f'give it: Column(column="{item.name}", unit="...") (--unit)'
+            else f'give it: Column(column="{field.name}", unit="...") (--unit)'
         )
-        raise LogError(f'{source.path}: column "{item.name}" has no unit; {how}')
+        raise LogError(f'{source.path}: column "{field.name}" has no unit; {how}')
     try:
         factor(unit, si_unit(unit))
     except SeaoptError as error:
-        raise type(error)(f'{source.path}: column "{item.name}": {error}') from error
+        raise type(error)(f'{source.path}: column "{field.name}": {error}') from error
     return unit
 
 
-def _paths(sources: Sequence[Source]) -> str:
+def _list_paths(sources: Sequence[Source]) -> str:
     return ", ".join(str(source.path) for source in sources)
 
 
-def _clock(source: Source, column: Column, item: Field) -> Clock:
-    unit = unit_of(source, column, item)
+def _make_clock(source: Source, field: Field, column: Column) -> ClockColumn:
+    unit = resolve_unit(source, column, field)
     try:
         factor(unit, "s")
     except SeaoptError as error:
         raise type(error)(f"{source.path}: time: {error}") from error
-    return Clock(source=source, path=source.path, name=item.name, unit=unit, offset_s=column.clock_offset_s)
+    return ClockColumn(source=source, path=source.path, name=field.name, unit=unit, offset_s=column.clock_offset_s)
 
 
-def _log_clock(sources: Sequence[Source], time: str | Column | None, found: list[tuple[Source, Field]] | None) -> Clock:
+def _find_log_clock(
+    sources: Sequence[Source], time: str | Column | None, places: list[tuple[Source, Field]] | None
+) -> ClockColumn:
     """Return the log's clock: as given, else the one that all channels share."""
     if time is not None:
         column = as_column(time)
-        if len(sources) > 1 and column.file is None and found:
+        if len(sources) > 1 and column.file is None and places:
             # A header that several files have is the clock of the first channel's file.
-            sources = [found[0][0]] if any(item.name == column.column for item in found[0][0].fields) else sources
-        return _clock(*_with(column, find(sources, "time", column)))
-    if found is None:
-        found = [(source, item) for source in sources for item in source.fields if item.numeric]
-    files = list(dict.fromkeys(str(source.path) for source, _ in found))
+            sources = [places[0][0]] if any(field.name == column.column for field in places[0][0].fields) else sources
+        return _make_clock(*find_column(sources, "time", column), column)
+    if places is None:
+        places = [(source, field) for source in sources for field in source.fields if field.numeric]
+    files = list(dict.fromkeys(str(source.path) for source, _ in places))
     if len(files) > 1:
         raise LogError(f"{', '.join(files)}: several files have several clocks; name the log's with time= (--time)")
-    if not found:
+    if not places:
         raise LogError(
-            f"{_paths(sources)}: holds no column of numbers; list it with contents(path) (seaopt inspect --list)"
+            f"{_list_paths(sources)}: holds no column of numbers; list it with contents(path) (seaopt inspect --list)"
         )
-    if all(item.length == 0 for _, item in found):
-        raise LogError(f"{_paths(sources)}: holds no sample; record the log again")
-    source = found[0][0]
-    clocks = list(dict.fromkeys(item.clock for _, item in found))
+    if all(field.length == 0 for _, field in places):
+        raise LogError(f"{_list_paths(sources)}: holds no sample; record the log again")
+    source = places[0][0]
+    clocks = list(dict.fromkeys(field.clock for _, field in places))
     if len(clocks) > 1:
         names = [clock for clock in clocks if clock is not None]
-        shown = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+        shown = ", ".join(names[:MAX_NAMES]) + (", ..." if len(names) > MAX_NAMES else "")
         raise LogError(f"{source.path}: holds several clocks ({shown}); name the log's with time= (--time)")
-    column = Column(column=clocks[0]) if clocks[0] is not None else _time_like(source)
-    return _clock(*_with(column, find([source], "time", column)))
+    column = Column(column=clocks[0]) if clocks[0] is not None else _find_time_column(source)
+    return _make_clock(*find_column([source], "time", column), column)
 
 
-def _with(column: Column, found: tuple[Source, Field]) -> tuple[Source, Column, Field]:
-    return found[0], column, found[1]
-
-
-def _time_like(source: Source) -> Column:
+def _find_time_column(source: Source) -> Column:
     """Return the one column that is named like a time."""
-    names = [item.name for item in source.fields if item.numeric]
-    named = [item for item in source.fields if item.numeric and _last(item.name).casefold() in _TIME_NAMES]
+    names = [field.name for field in source.fields if field.numeric]
+    named = [field for field in source.fields if field.numeric and _last_part(field.name).casefold() in _TIME_NAMES]
     # Of several, T in degrees is a temperature.
-    found = [item.name for item in named if len(named) == 1 or _maybe_time(item.unit)]
-    if len(found) == 1:
-        return Column(column=found[0])
-    why = "no column is" if not found else f"{len(found)} columns are"
-    shown = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+    times = [field.name for field in named if len(named) == 1 or _may_be_time(field.unit)]
+    if len(times) == 1:
+        return Column(column=times[0])
+    why = "no column is" if not times else f"{len(times)} columns are"
+    shown = ", ".join(names[:MAX_NAMES]) + (", ..." if len(names) > MAX_NAMES else "")
     raise LogError(
         f"{source.path}: {why} named like a time; give time= (--time), one of the columns: {shown or 'none'}"
     )
 
 
-def _maybe_time(unit: str | None) -> bool:
+def _may_be_time(unit: str | None) -> bool:
     return not unit or not is_unit(unit) or same_dimension(unit, "s")
 
 
-def _last(name: str) -> str:
+def _last_part(name: str) -> str:
     return re.split(r"[./]", bare_name(name))[-1]
 
 
-def _channel_clock(sources: Sequence[Source], clock: Clock, column: Column, source: Source, item: Field) -> Clock:
+def _find_channel_clock(
+    sources: Sequence[Source], clock: ClockColumn, column: Column, source: Source, field: Field
+) -> ClockColumn:
     """Return the clock a channel is on."""
     if column.time is not None:
-        own = as_column(column.time)
-        return _shifted(_clock(*_with(own, find([source], f'time of "{item.name}"', own))), column)
+        time = as_column(column.time)
+        return _shift_clock(_make_clock(*find_column([source], f'time of "{field.name}"', time), time), column)
     reference = next(known for known in clock.source.fields if known.name == clock.name)
-    if source is clock.source and item.clock == reference.clock:
-        if None not in (item.length, reference.length) and item.length != reference.length:
+    if source is clock.source and field.clock == reference.clock:
+        if None not in (field.length, reference.length) and field.length != reference.length:
             raise LogError(
-                f'{source.path}: "{item.name}" has {item.length} samples and the clock "{clock.name}" '
+                f'{source.path}: "{field.name}" has {field.length} samples and the clock "{clock.name}" '
                 f'{reference.length}; give it its own with Column(column=..., time="...")'
             )
-        return _shifted(clock, column)
-    if item.clock is not None:
-        known = Column(column=item.clock)
+        return _shift_clock(clock, column)
+    if field.clock is not None:
+        known = Column(column=field.clock)
     elif source is not clock.source:
         same = [known.name for known in source.fields if known.name == clock.name]
-        known = Column(column=same[0], unit=clock.unit) if same else _time_like(source)
+        known = Column(column=same[0], unit=clock.unit) if same else _find_time_column(source)
     else:
-        raise LogError(f'{source.path}: "{item.name}" has no clock of its own; give it one with Column(time="...")')
-    return _shifted(_clock(*_with(known, find([source], f'time of "{item.name}"', known))), column)
+        raise LogError(f'{source.path}: "{field.name}" has no clock of its own; give it one with Column(time="...")')
+    return _shift_clock(_make_clock(*find_column([source], f'time of "{field.name}"', known), known), column)
 
 
-def _shifted(clock: Clock, column: Column) -> Clock:
+def _shift_clock(clock: ClockColumn, column: Column) -> ClockColumn:
     if not column.clock_offset_s:
         return clock
-    return Clock(
+    return ClockColumn(
         source=clock.source, path=clock.path, name=clock.name, unit=clock.unit,
         offset_s=clock.offset_s + column.clock_offset_s,
     )  # fmt: skip
 
 
-def _every_channel(
-    sources: Sequence[Source], clock: Clock, align: Rule | None
+def _select_every_channel(
+    sources: Sequence[Source], clock: ClockColumn, align: Rule | None
 ) -> tuple[dict[str, Column], dict[str, tuple[Source, Field]], list[str]]:
     """Return every column of numbers on the clock; with a rule for all, those on other clocks too."""
-    reference = next(item for item in clock.source.fields if item.name == clock.name)
-    clocks = {(str(source.path), item.clock) for source in sources for item in source.fields if item.clock}
+    reference = next(field for field in clock.source.fields if field.name == clock.name)
+    clock_names = {(str(source.path), field.clock) for source in sources for field in source.fields if field.clock}
     notes: list[str] = []
-    every = [(source, item) for source in sources for item in source.fields if item.name != clock.name]
-    numeric = [(source, item) for source, item in every if item.numeric]
-    words = [item.name for source, item in every if not item.numeric and _on(clock, reference, source, item)]
-    if words:
-        notes.append(f"columns that hold no numbers were left out: {_listed(words)}")
-    # A clock is not a channel of its own.
-    numeric = [(source, item) for source, item in numeric if (str(source.path), item.name) not in clocks]
-    chosen = [
-        (source, item) for source, item in numeric if _on(clock, reference, source, item) or _alignable(align, item)
+    every = [(source, field) for source in sources for field in source.fields if field.name != clock.name]
+    numeric = [(source, field) for source, field in every if field.numeric]
+    words = [
+        field.name for source, field in every if not field.numeric and _is_on_clock(clock, reference, source, field)
     ]
-    if rest := [item.name for pair in numeric if pair not in chosen for item in pair[1:]]:
-        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_listed(rest)}')
+    if words:
+        notes.append(f"columns that hold no numbers were left out: {_list_names(words)}")
+    # A clock is not a channel too.
+    numeric = [(source, field) for source, field in numeric if (str(source.path), field.name) not in clock_names]
+    chosen = [
+        (source, field)
+        for source, field in numeric
+        if _is_on_clock(clock, reference, source, field) or _can_align(align, field)
+    ]
+    if rest := [field.name for pair in numeric if pair not in chosen for field in pair[1:]]:
+        notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(rest)}')
     if not chosen:
         raise LogError(
             f'{clock.path}: no column of numbers is on the clock "{clock.name}"; choose another time= (--time)'
         )
-    units, unknown = _units(chosen)
+    units, unknown = _find_units(chosen)
     notes += unknown
-    bare = [bare_name(item.name) if units[index] else item.name for index, (_, item) in enumerate(chosen)]
+    bare = [bare_name(field.name) if units[index] else field.name for index, (_, field) in enumerate(chosen)]
     columns: dict[str, Column] = {}
-    found: dict[str, tuple[Source, Field]] = {}
-    for name, unit, (source, item) in zip(bare, units, chosen, strict=True):
-        key = name if bare.count(name) == 1 and name != "time" else item.name
-        key = key if key not in columns else f"{source.path.name}:{item.name}"
-        columns[key] = Column(column=item.name, unit=unit, file=source.path)
-        found[key] = find([source], key, columns[key])
-    return columns, found, notes
+    places: dict[str, tuple[Source, Field]] = {}
+    for name, unit, (source, field) in zip(bare, units, chosen, strict=True):
+        key = name if bare.count(name) == 1 and name != "time" else field.name
+        key = key if key not in columns else f"{source.path.name}:{field.name}"
+        columns[key] = Column(column=field.name, unit=unit, file=source.path)
+        places[key] = find_column([source], key, columns[key])
+    return columns, places, notes
 
 
-def _on(clock: Clock, reference: Field, source: Source, item: Field) -> bool:
-    lengths = (item.length, reference.length)
+def _is_on_clock(clock: ClockColumn, reference: Field, source: Source, field: Field) -> bool:
+    lengths = (field.length, reference.length)
     same = None in lengths or lengths[0] == lengths[1]
-    return source is clock.source and item.clock == reference.clock and same
+    return source is clock.source and field.clock == reference.clock and same
 
 
-def _alignable(align: Rule | None, item: Field) -> bool:
-    return align is not None and item.clock is not None
+def _can_align(align: Rule | None, field: Field) -> bool:
+    return align is not None and field.clock is not None
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:SHOWN]) + (f", ... ({len(names)} in all)" if len(names) > SHOWN else "")
+def _list_names(names: list[str]) -> str:
+    return ", ".join(names[:MAX_NAMES]) + (f", ... ({len(names)} in all)" if len(names) > MAX_NAMES else "")
 
 
-def _units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str]]:
+def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str]]:
     """Return each column's unit, "" where none is known; brackets that hold no unit are part of the name."""
-    given = [item.unit for _, item in chosen]
+    declared = [field.unit for _, field in chosen]
     text = [source.format == "CSV" for source, _ in chosen]
-    for source, item in chosen:
-        known = any(unit and is_unit(unit) for unit in given)
-        if source.format == "CSV" and known and _meant(item) and not is_unit(item.unit or ""):
-            unit_of(source, Column(column=item.name), item)
-    if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, given, strict=True)):
+    for source, field in chosen:
+        known = any(unit and is_unit(unit) for unit in declared)
+        if source.format == "CSV" and known and _is_unit_bracket(field) and not is_unit(field.unit or ""):
+            resolve_unit(source, Column(column=field.name), field)
+    if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, declared, strict=True)):
         notes = ["brackets in the headers that are no units were taken as names; no unit is known"]
-        return [""] * len(given), notes
-    units = [unit if unit is not None and _scales(unit) else "" for unit in given]
-    lost = [f"{item.name} [{old}]" for old, new, (_, item) in zip(given, units, chosen, strict=True) if old and not new]
-    notes = [f"units that are not known were left out: {_listed(lost)}"] if lost else []
+        return [""] * len(declared), notes
+    units = [unit if unit is not None and _converts_by_factor(unit) else "" for unit in declared]
+    lost = [
+        f"{field.name} [{old}]" for old, new, (_, field) in zip(declared, units, chosen, strict=True) if old and not new
+    ]
+    notes = [f"units that are not known were left out: {_list_names(lost)}"] if lost else []
     return units, notes
 
 
-def _meant(item: Field) -> bool:
+def _is_unit_bracket(field: Field) -> bool:
     """Tell whether a header's brackets are meant as a unit: square ones without a number, which would be an index."""
-    return item.unit is not None and item.name.endswith("]") and not item.unit.isdecimal()
+    return field.unit is not None and field.name.endswith("]") and not field.unit.isdecimal()
 
 
-def _scales(unit: str) -> bool:
+def _converts_by_factor(unit: str) -> bool:
     """Tell whether a unit comes to SI by a factor alone."""
     try:
         factor(unit, si_unit(unit))
