@@ -1,4 +1,4 @@
-"""The reading keys of a problem file to columns, rules and paths."""
+"""What a problem file says about reading a log, as columns, alignment rules and paths."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from seaopt.logs import Column, Hold, Linear, Nearest
 from seaopt.problem.schema import AlignTable, ClockTable, ColumnTable, ExperimentTable
 
 
-def log_files(table: ExperimentTable) -> list[str]:
+def list_log_files(table: ExperimentTable) -> list[str]:
     """Return the files of an experiment: its log or logs, then those that columns name."""
     logs = [table.log] if isinstance(table.log, str) else list(table.log or [])
-    tables = [item for item in (table.time, *table.inputs.values(), *table.outputs.values()) if item is not None]
-    named = [item.file for item in tables if not isinstance(item, str) and item.file is not None]
+    columns = [column for column in (table.time, *table.inputs.values(), *table.outputs.values()) if column is not None]
+    named = [column.file for column in columns if not isinstance(column, str) and column.file is not None]
     return list(dict.fromkeys([*logs, *named]))
 
 
@@ -26,27 +26,27 @@ def check_inside(place: str, table: ExperimentTable) -> None:
         A path is absolute, or climbs out.
 
     """
-    for name in log_files(table):
+    for name in list_log_files(table):
         for kind in (PurePosixPath, PureWindowsPath):  # a problem file reads the same on every system
             if kind(name).anchor or ".." in kind(name).parts:
                 raise ProblemError(f'{place}.log = "{name}" leaves the problem file\'s folder; put the log beside it')
 
 
-def column_of(item: str | ClockTable | ColumnTable, folder: Path) -> Column:
+def make_column(table: str | ClockTable | ColumnTable, folder: Path) -> Column:
     """Return a column as the reader takes it."""
-    if isinstance(item, str):
-        return Column(column=item)
-    file = None if item.file is None else folder / item.file
-    if isinstance(item, ClockTable):
-        return Column(column=item.column, unit=item.unit, file=file, clock_offset_s=item.clock_offset_s)
-    own = item.time if item.time is None or isinstance(item.time, str) else column_of(item.time, folder)
+    if isinstance(table, str):
+        return Column(column=table)
+    file = None if table.file is None else folder / table.file
+    if isinstance(table, ClockTable):
+        return Column(column=table.column, unit=table.unit, file=file, clock_offset_s=table.clock_offset_s)
+    time = table.time if table.time is None or isinstance(table.time, str) else make_column(table.time, folder)
     return Column(
-        column=item.column, unit=item.unit, scale=item.scale, offset=item.offset, wrap_bits=item.wrap_bits, file=file,
-        time=own, clock_offset_s=item.clock_offset_s, align=rule_of(item.align),
+        column=table.column, unit=table.unit, scale=table.scale, offset=table.offset, wrap_bits=table.wrap_bits,
+        file=file, time=time, clock_offset_s=table.clock_offset_s, align=make_rule(table.align),
     )  # fmt: skip
 
 
-def rule_of(table: AlignTable | None) -> Hold | Linear | Nearest | None:
+def make_rule(table: AlignTable | None) -> Hold | Linear | Nearest | None:
     """Return an alignment rule."""
     if table is None:
         return None

@@ -26,7 +26,7 @@ from seaopt.estimation import (
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
-from seaopt.problem.columns import column_of, log_files, rule_of
+from seaopt.problem.columns import list_log_files, make_column, make_rule
 from seaopt.problem.ranges import range_remarks
 from seaopt.problem.references import check_references
 from seaopt.problem.schema import (
@@ -178,10 +178,10 @@ class Problem:
 
     def _read(self, table: ExperimentTable) -> Log:
         return read_log(
-            [self.folder / name for name in log_files(table)],
-            time=None if table.time is None else column_of(table.time, self.folder),
-            channels={name: column_of(item, self.folder) for name, item in {**table.inputs, **table.outputs}.items()},
-            align=rule_of(table.align),
+            [self.folder / name for name in list_log_files(table)],
+            time=None if table.time is None else make_column(table.time, self.folder),
+            channels={name: make_column(item, self.folder) for name, item in {**table.inputs, **table.outputs}.items()},
+            align=make_rule(table.align),
             window_s=table.window_s,
             counter=None if table.counter is None else Counter(**table.counter.model_dump()),
         )
@@ -214,7 +214,7 @@ def _on_its_clock(log: Log, table: ExperimentTable) -> Log:
         return log
     if asked == "restamp":
         return log.restamp()
-    return log.resample(rate_hz=asked.rate_hz, rule=rule_of(asked.rule), bridge_s=asked.bridge_s)
+    return log.resample(rate_hz=asked.rate_hz, rule=make_rule(asked.rule), bridge_s=asked.bridge_s)
 
 
 def _method(table: FitTable) -> Method:

@@ -118,7 +118,7 @@ def test_a_counter_opens_the_gap_that_it_shows(inspect, data):
         ("bad.csv", {"channels": ["F1=F1 [kN]"]}, 'no column "F1 \\[kN\\]"'),
         ("bad.csv", {"units": ["F1=N"]}, "name its column too"),
         ("bad.csv", {"units": ["time=s"]}, "name its column too"),
-        ("bad.csv", {"inputs": ["cur"]}, "no channel"),
+        ("bad.csv", {"inputs": ["cur"]}, 'inputs names "cur"'),
         ("bad.csv", {"out": "bad.csv"}, "is a file"),
         ("bad.csv", {"align": "nearest"}, "give hold or linear"),
         ("bad.csv", {"counter": "n=two"}, "how many samples"),

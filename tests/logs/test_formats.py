@@ -331,7 +331,7 @@ def test_cut_files_are_one_line(tmp_path, capfd, make, name):
         (b"\x1f\x8b\x08" + b"\0" * 50, "a.csv.gz", "unpack it first"),
         (b"PK\x03\x04" + b"\0" * 50, "a.xlsx", "NPZ"),
         (b"\xd0\xcf\x11\xe0" + b"\0" * 50, "a.xls", "save the sheet as CSV"),
-        (b"time,F\n0,1\n", "a.mat", "is no MAT file"),
+        (b"time,F\n0,1\n", "a.mat", "not a valid MAT file"),
         (bytes(range(256)) * 20, "a.csv", "not a text file"),
         (b"#ROSBAG V1.2\n", "a.bag", "version other than 2.0"),
         (b"\x89MCAP0\r\n" + b"\0" * 100, "a.mcap", "cannot be read as MCAP"),

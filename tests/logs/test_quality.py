@@ -292,7 +292,7 @@ def test_the_report_is_strict_json(short_log):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda log: assess_quality(log, inputs=["cur"]), "which is no channel"),
+        (lambda log: assess_quality(log, inputs=["cur"]), 'inputs names "cur"'),
         (lambda log: assess_quality(table(log, np.zeros(len(log)))), "never increases"),
         (lambda log: assess_quality(so.Log.from_arrays(time=[0.0, 1.0])), "holds no channel"),
     ],

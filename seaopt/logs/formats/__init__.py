@@ -74,7 +74,9 @@ def sniff(path: Path) -> tuple[str, str, str]:
             raise LogError(f"{path}: {reason}")
     suffix = path.suffix.lower()
     if suffix in _BINARY_NAMES:
-        raise LogError(f"{path}: is no {_BINARY_NAMES[suffix]}, whatever its name says; check how it was made")
+        raise LogError(
+            f"{path}: is not a valid {_BINARY_NAMES[suffix]} although its name says so; check how it was made"
+        )
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     if suffix in _JSON_NAMES or text.startswith(b"{") or text.startswith((b"[{", b"[\n")):
         return "json", "open_json", "JSON"

@@ -140,7 +140,7 @@ def _parse(path: Path, text: bytes, line: int) -> Any:
         ) from error
     except RecursionError as error:
         raise LogError(f"{path}: line {line}: is nested too deep; is it a log?") from error
-    except ValueError as error:  # bytes that are no text, integers of thousands of digits
+    except ValueError as error:  # bytes that are not text, integers of thousands of digits
         raise LogError(
             f"{path}: line {line}: is not valid JSON ({summarise_error(error)}); correct that place"
         ) from error

@@ -198,7 +198,7 @@ def _read_numbers(body: bytes, leaf: MatrixHeader, order: str) -> Shaped[np.ndar
     """Return a matrix of numbers, if its bytes are as many as its dimensions say."""
     kind, start, size, _ = _read_element(body, leaf.data, order)
     if kind not in STORED_TYPES:
-        raise ValueError(f'"{leaf.name}" is stored as type {kind}, which is no number')
+        raise ValueError(f'"{leaf.name}" is stored as type {kind}, which is not a number')
     stored = np.dtype(order + STORED_TYPES[kind])
     if start + size > len(body) or size // stored.itemsize != np.prod(leaf.dims, dtype=float):
         raise ValueError(f'"{leaf.name}" claims {"x".join(map(str, leaf.dims))} elements and holds {size} bytes')

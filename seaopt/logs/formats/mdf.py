@@ -33,14 +33,14 @@ def open_mdf(path: Path) -> Source:
         check_size(path, sum(g.channel_group.cycles_nr * g.channel_group.samples_byte_nr for g in groups), "the file")
         names = Counter(channel.name for group in groups for channel in group.channels)
         for number, group in enumerate(groups):
-            labels = [_label(channel.name, number, names) for channel in group.channels]
+            labels = [_name_channel(channel.name, number, names) for channel in group.channels]
             master = file.masters_db.get(number)
             for index, (label, channel) in enumerate(zip(labels, group.channels, strict=True)):
                 is_master = index == master
                 fields.append(
                     Field(
-                        name=label, kind=_kind(channel), length=int(group.channel_group.cycles_nr),
-                        unit=_unit(channel) or ("s" if is_master and channel.sync_type == TIME_MASTER else None),
+                        name=label, kind=_name_kind(channel), length=int(group.channel_group.cycles_nr),
+                        unit=_find_unit(channel) or ("s" if is_master and channel.sync_type == TIME_MASTER else None),
                         clock=None if master is None else labels[master],
                     )
                 )  # fmt: skip
@@ -70,11 +70,11 @@ def _open_file(path: Path) -> Generator[Any]:
         sys.unraisablehook = hook
 
 
-def _label(name: str, group: int, names: Mapping[str, int]) -> str:
+def _name_channel(name: str, group: int, names: Mapping[str, int]) -> str:
     return name if names[name] == 1 else f"{group}/{name}"
 
 
-def _kind(channel: Any) -> str:
+def _name_kind(channel: Any) -> str:
     conversion = channel.conversion
     if conversion is not None and conversion.conversion_type not in NUMERIC_CONVERSIONS:
         return "text, or a formula"
@@ -85,7 +85,7 @@ def _kind(channel: Any) -> str:
     return "text"
 
 
-def _unit(channel: Any) -> str | None:
+def _find_unit(channel: Any) -> str | None:
     conversion = channel.conversion
     return channel.unit or (conversion.unit if conversion is not None else "") or None
 

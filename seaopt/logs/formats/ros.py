@@ -53,22 +53,22 @@ class Bag:
 BagOpener = Callable[[Path], AbstractContextManager[Bag]]
 
 
-def open_open_bag_file(path: Path) -> Source:
+def open_bag(path: Path) -> Source:
     """List a ROS 1 bag."""
-    return _source(path, "ROS 1 bag", _open_bag_file)
+    return _list_recording(path, "ROS 1 bag", _open_bag_file)
 
 
-def open_open_db3_file(path: Path) -> Source:
+def open_db3(path: Path) -> Source:
     """List a ROS 2 SQLite recording."""
-    return _source(path, "ROS 2 db3", _open_db3_file)
+    return _list_recording(path, "ROS 2 db3", _open_db3_file)
 
 
-def open_open_mcap_file(path: Path) -> Source:
+def open_mcap(path: Path) -> Source:
     """List an MCAP recording."""
-    return _source(path, "MCAP", _open_mcap_file)
+    return _list_recording(path, "MCAP", _open_mcap_file)
 
 
-def _source(path: Path, form: str, open_file: BagOpener) -> Source:
+def _list_recording(path: Path, form: str, open_file: BagOpener) -> Source:
     import_optional("rosbags", "ros", path, form)
     fields: list[Field] = []
     notes: list[str] = []
@@ -118,12 +118,12 @@ def _list_fields(bag: Bag, topic: Topic, node: Node | None) -> list[Field]:
     else:
         leaves = list_leaves(node, first[1], topic.encoding)
     return [
-        Field(name=f"{topic.name}.{path}", kind=word, length=topic.count, unit=_unit(path), clock=topic.name)
+        Field(name=f"{topic.name}.{path}", kind=word, length=topic.count, unit=_find_unit(path), clock=topic.name)
         for path, word in leaves
     ]
 
 
-def _unit(path: str) -> str | None:
+def _find_unit(path: str) -> str | None:
     return "s" if path.split(".")[-1] == "stamp" else None
 
 
@@ -143,7 +143,7 @@ def _load(
                 rows.append(take(data))
     out = {name: np.array([row.get(name, np.nan) for row in rows], dtype=float) for name in paths.values()}
     for name in paths.values():
-        if _unit(name) == "s":
+        if _find_unit(name) == "s":
             out[name] = _to_seconds([int(row[name]) for row in rows], bag.start)
     if topic.name in names:
         out[topic.name] = np.array(times, dtype=np.int64) * 1e-9

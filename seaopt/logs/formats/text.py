@@ -1,7 +1,7 @@
 """CSV and other delimited text, parsed by polars in blocks of whole lines.
 
-A block is parsed to floats at once; only where that fails is it parsed as text, and only where a cell is no number is
-it walked line by line, to name that cell. Memory holds the wanted columns and one block.
+A block is parsed to floats at once; only where that fails is it parsed as text, and only where a cell is not a number
+is it walked line by line, to name that cell. Memory holds the wanted columns and one block.
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ def _parse_text(
         values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
         blank = text.is_null() | text.str.to_lowercase().is_in(list(BLANK))
         if (values.is_null() & ~blank).any() or values.is_infinite().any():
-            raise error_at("a cell is no number")
+            raise error_at("a cell is not a number")
         parsed[name] = values.to_numpy()
     return parsed
 

@@ -133,7 +133,7 @@ def _read_head(path: Path) -> tuple[str, list[str]]:
 
 
 def encoding_error(path: Path, encoding: str, error: UnicodeError) -> LogError:
-    """Return the error of a byte that is no text."""
+    """Return the error of a byte that is not text."""
     name = "UTF-16" if encoding == "utf-16" else "UTF-8"
     at = f"byte {error.start}" if isinstance(error, UnicodeDecodeError) else "no text"
     return LogError(f"{path}: is not {name} text ({at}); save the log as UTF-8 CSV")

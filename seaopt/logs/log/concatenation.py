@@ -29,7 +29,7 @@ def concatenate(logs: Sequence[Log], *, gap_s: float | None = None) -> Log:
     Raises
     ------
     LogError
-        Channels, units or rates differ, times overlap, or gap_s is no gap.
+        Channels, units or rates differ, times overlap, or gap_s is too short for a gap.
 
     Examples
     --------
@@ -44,7 +44,7 @@ def concatenate(logs: Sequence[Log], *, gap_s: float | None = None) -> Log:
     first = logs[0]
     if gap_s is not None and not GAP * first.period < gap_s < np.inf:
         raise LogError(
-            f"gap_s = {gap_s:g} is no gap at {first.rate_hz:.6g} Hz; give more than {GAP * first.period:.4g} s"
+            f"gap_s = {gap_s:g} is not a gap at {first.rate_hz:.6g} Hz; give more than {GAP * first.period:.4g} s"
         )
     for log in logs[1:]:
         _check_alike(first, log)

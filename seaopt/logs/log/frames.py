@@ -57,12 +57,12 @@ def read_frame(
     Raises
     ------
     LogError
-        There is no frame, or a column is missing, not numeric, or given for two channels of one unit.
+        The data are not a frame, or a column is missing, not numeric, or given for two channels of one unit.
 
     """
     columns = [str(name) for name in getattr(frame, "columns", ())]
     if not columns:
-        raise LogError(f"{type(frame).__name__} is no frame with columns; give a polars or pandas DataFrame")
+        raise LogError(f"{type(frame).__name__} is not a frame with columns; give a polars or pandas DataFrame")
     channels = _all_channels(columns, time) if channels is None else channels
     if "time" in channels:
         raise LogError(f'{source}: a channel is named "time"; rename it, time is the clock')

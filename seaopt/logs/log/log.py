@@ -105,7 +105,7 @@ class Log:
         units = dict(units or {})
         for name in units:
             if name not in channels and name != "time":
-                raise LogError(f'units names "{name}", which is no channel; {suggestion(name, channels)}')
+                raise LogError(f'units names "{name}", which is not a channel; {suggestion(name, channels)}')
         signals = {name: _signal(name, values, units.get(name), source) for name, values in channels.items()}
         seconds = _array("time", time, source) * factor(units.get("time", "s"), "s")
         return cls(time=seconds, signals=signals, source=source)
@@ -263,7 +263,7 @@ class Log:
         Log
             With a note that names the pass band and the samples that were cut at the ends: 25 periods of the new clock
             at each end of each stretch. A short run of missing samples is bridged by a line for the filter, and the
-            output is missing where they carry more than 20 % of its weight. An input that was held is no longer: fit
+            output is missing where they carry more than 20 % of its weight. An input that was held no longer is: fit
             with ``hold="first"``.
 
         Raises

@@ -31,7 +31,7 @@ class ClockQuality:
     rounded_only : bool
         Whether the rounding explains the jitter: behind it the sampling may be perfect.
     not_numbers, backwards, repeated, gaps : array of int
-        Rows whose time is no number, lies before or at that of the row ahead of it, or follows a gap.
+        Rows whose time is not a number, lies before or at that of the row ahead of it, or follows a gap.
     lost : array of int
         Samples that are missing in each gap.
 

@@ -235,7 +235,7 @@ def count_repeats(values: Float[np.ndarray, " n"]) -> int:
 
 
 def find_counter_losses(values: Float[np.ndarray, " n"]) -> CounterLosses | None:
-    """Return the samples that a counter shows to be missing; None where the channel is no counter.
+    """Return the samples that a counter shows to be missing; None where the channel does not count.
 
     A counter goes up by one, at regular intervals, and may wrap.
 

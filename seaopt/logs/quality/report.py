@@ -156,7 +156,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     Raises
     ------
     LogError
-        An input is no channel, there is no channel, or time never increases.
+        An input is not a channel, there is no channel, or time never increases.
 
     Examples
     --------
@@ -173,7 +173,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     for name in inputs or ():
         if name not in data.signals:
             raise LogError(
-                f'{data.source}: inputs names "{name}", which is no channel; {suggestion(name, data.signals)}'
+                f'{data.source}: inputs names "{name}", which is not a channel; {suggestion(name, data.signals)}'
             )
     clock = assess_clock(data.time, data.source)
     channels = {name: assess_channel(signal) for name, signal in data.signals.items()}

@@ -320,7 +320,7 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
         if source.format == "CSV" and known and _is_unit_bracket(field) and not is_unit(field.unit or ""):
             resolve_unit(source, Column(column=field.name), field)
     if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, declared, strict=True)):
-        notes = ["brackets in the headers that are no units were taken as names; no unit is known"]
+        notes = ["brackets in the headers that are not units were taken as names; no unit is known"]
         return [""] * len(declared), notes
     units = [unit if unit is not None and _converts_by_factor(unit) else "" for unit in declared]
     lost = [
