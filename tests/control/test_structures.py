@@ -11,8 +11,8 @@ from scipy.signal import bilinear, lfilter
 
 import seaopt as so
 from seaopt.control import Controller, Gains, Notch, Observer, corners, current_per_force, draw, sample
-from seaopt.control.laws.spec_checks import sensitivity_possible
 from seaopt.control.laws.structures import Nominal
+from seaopt.control.tuning.feasibility import sensitivity_possible
 from seaopt.errors import ControlError
 from seaopt.robustness import placed
 

@@ -26,13 +26,13 @@ from jaxtyping import Complex
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
-from seaopt.control.laws.spec_checks import check_current, check_delay
 from seaopt.control.laws.structures import Nominal
 from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import sample
 from seaopt.control.tuning.convex_concave import improved
+from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.interior_point import polished
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, frequencies
 from seaopt.control.tuning.starts import starts

@@ -269,6 +269,7 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     """
     if failures >= samples:
         return 1.0
+    # scipy.stats.binomtest searches for the same number, to 2e-12, and costs as much to import as 1,000 draws take.
     from scipy.special import betaincinv
 
     return float(betaincinv(failures + 1, samples - failures, confidence))

@@ -1,4 +1,4 @@
-r"""What no controller can do: requests that a delay or a current limit rules out before anything is tuned.
+r"""Refuse, before anything is tuned, what a delay or a current limit rules out for every controller.
 
 **Delay.** If the loop's first response comes k samples late, the sensitivity of every stable loop is
 :math:`S(q) = 1 + O(q^k)`, analytic in the unit disk. It is to stay below w: :math:`1/\sqrt2` up to :math:`f_s`,

@@ -1,0 +1,128 @@
+"""The table of limits: specification, problem schema, documentation and judgement are what its rows say."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
+from seaopt.control.laws.verdict import judge_all, list_active, list_broken
+from seaopt.errors import ControlError
+from seaopt.problem.schema import ControllerTable
+
+TUNING = Path(__file__).resolve().parents[2] / "docs" / "tuning.md"
+SPEC = so.ControllerSpec(
+    bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, min_disk_margin=0.5, max_reference_peak=1.2,
+    max_noise_gain=25, passive_band_hz=(1, 60),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def figures(stand, thor):
+    """Return figures that keep every limit of SPEC with room to spare."""
+    loop = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).close(stand, thor)
+    return replace(
+        loop.figures(), stable=True, spectral_radius=0.999, ms=1.4, mt=1.1, disk_margin=0.8, reference_peak=1.0,
+        noise_gain=10.0, sensitivity_bandwidth_hz=8.0, bandwidth_hz=30.1,
+    )  # fmt: skip
+
+
+def loops(design, other=None, cosine=0.5, *, held_stable=True):
+    port = PortFigures(least_cosine=cosine, at_hz=5.0, held_stable=held_stable)
+    return [
+        MeasuredLoop(name="stand", figures=design, port=port),
+        MeasuredLoop(name="swing", figures=other or design),
+    ]
+
+
+def table_of_the_docs():
+    """Return the rows of the table below "Limits" as lists of cells."""
+    section = TUNING.read_text(encoding="utf-8").split("## Limits\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+
+
+def test_the_documentation_has_the_table():
+    head, _, *rows = table_of_the_docs()
+    assert head == ["limit", "meaning", "the figure is", "of", "unit", "left out", "where it is broken"]
+    assert rows == [
+        [f"`{limit.name}`", limit.meaning, limit.sense, limit.scope, limit.unit, limit.default_text, limit.remedy]
+        for limit in LIMITS
+    ]
+
+
+def test_specification_and_schema_have_the_rows_fields_and_defaults():
+    defaults = {field.name: field.default for field in fields(so.ControllerSpec)}
+    for limit in FIELDS:
+        column = ControllerTable.model_fields[limit.name]
+        assert defaults[limit.name] == limit.default
+        assert column.is_required() if limit.name == "bandwidth_hz" else column.default == limit.default
+        assert column.description == limit.description
+
+
+def test_every_field_that_limits_a_figure_has_a_row():
+    named = {
+        field.name for field in fields(so.ControllerSpec) if re.match("m(ax|in)_|.*bandwidth_hz|passive", field.name)
+    }
+    assert named == {limit.name for limit in FIELDS}
+
+
+@pytest.mark.parametrize("limit", [limit for limit in FIELDS if limit.above is not None], ids=lambda limit: limit.name)
+def test_the_range_of_a_field_is_the_rows(limit):
+    for value in (limit.above, limit.below):
+        if value is not None:
+            with pytest.raises(ControlError, match=limit.name):
+                so.ControllerSpec(**{limit.name: value})
+    assert getattr(so.ControllerSpec(**{limit.name: limit.above + 0.1}), limit.name) == limit.above + 0.1
+
+
+def test_nothing_is_broken_or_active_with_room_to_spare(figures):
+    verdicts = judge_all(SPEC, loops(figures))
+    assert list_broken(verdicts) == list_active(SPEC, verdicts) == []
+    assert len(verdicts) == 2 * 4 + 5
+
+
+# What the figures become; just within the limit, and just beyond it.
+EDGES = {
+    "stability": ({"spectral_radius": 1.0 - 2e-11}, {"spectral_radius": 1.0 - 1e-12, "stable": False}),
+    "max_sensitivity": ({"ms": 1.6 * (1 + 0.9e-6)}, {"ms": 1.6 * (1 + 1.1e-6)}),
+    "max_complementary": ({"mt": 1.3 * (1 + 0.9e-6)}, {"mt": np.inf}),
+    "min_disk_margin": ({"disk_margin": 0.5 * (1 - 0.9e-6)}, {"disk_margin": 0.0}),
+    "max_reference_peak": ({"reference_peak": 1.2}, {"reference_peak": 1.21}),
+    "max_noise_gain": ({"noise_gain": 25.0}, {"noise_gain": 25.1}),
+    "min_sensitivity_bandwidth_hz": ({"sensitivity_bandwidth_hz": 5.995}, {"sensitivity_bandwidth_hz": 5.993}),
+    "bandwidth_hz": ({"bandwidth_hz": 30.149}, {"bandwidth_hz": None}),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_a_limit_is_kept_up_to_its_tolerance(name, figures):
+    within, beyond = (replace(figures, **changes) for changes in EDGES[name])
+    everywhere = BY_NAME[name].scope == "every plant"
+    assert list_broken(judge_all(SPEC, loops(within))) == []
+    label = f"{name} (swing)" if everywhere else name
+    broken = judge_all(SPEC, loops(figures, beyond)) if everywhere else judge_all(SPEC, loops(beyond, figures))
+    assert list_broken(broken) == [label]
+    if not everywhere:
+        assert list_broken(judge_all(SPEC, loops(figures, beyond))) == []
+    active = list_active(SPEC, judge_all(SPEC, loops(figures, within) if everywhere else loops(within, figures)))
+    assert active == ([] if BY_NAME[name].reserve == "none" else [label])
+
+
+@pytest.mark.parametrize(
+    ("cosine", "held_stable", "broken"), [(-0.9e-9, True, False), (-1.1e-9, True, True), (0.5, False, True)]
+)
+def test_a_passive_band_needs_a_held_loop_that_does_not_grow(figures, cosine, held_stable, broken):
+    verdicts = judge_all(SPEC, loops(figures, cosine=cosine, held_stable=held_stable))
+    assert list_broken(verdicts) == ["passive_band_hz"] * broken
+
+
+def test_what_is_left_out_is_not_judged(figures):
+    verdicts = judge_all(so.ControllerSpec(bandwidth_hz=30), loops(figures)[:1])
+    assert [verdict.limit.name for verdict in verdicts] == ["stability", "min_sensitivity_bandwidth_hz", "bandwidth_hz"]
+    assert verdicts[1].allowed == 6.0
