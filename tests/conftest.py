@@ -1,20 +1,28 @@
-"""Shared fixtures. Array shapes and types of seaopt are checked while the tests run (jaxtyping and beartype)."""
+"""Shared fixtures. Array shapes and types of seaopt are checked while the tests run (jaxtyping and beartype).
+
+A check of one call costs about 0.1 ms, more than most functions here: see `check_calls`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
 import os
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Literal
 
 os.environ.setdefault("SEAOPT_CACHE_DIR", tempfile.mkdtemp(prefix="seaopt-tests-"))
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost these small problems more than they bring
 
+import jaxtyping
 import pytest
 from beartype import BeartypeConf, FrozenDict, beartype
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
 # A whole number is a float, and choices are strings: the tests give wrong ones on purpose, to see seaopt's own errors.
 CHOICES = (
@@ -37,7 +45,37 @@ OVERRIDES = FrozenDict({Literal[choices]: str for choices in (*CHOICES, PARTS)})
 checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker
-install_import_hook("seaopt", "seaopt_type_checker.check")
+
+ALWAYS, EVERY = 50, 50
+check_all_calls, calls = jaxtyping.jaxtyped, Counter[CodeType]()
+
+
+def check_calls(function):
+    """Check a function's first calls, `ALWAYS` of them, then one in `EVERY`; a class's those of its constructor.
+
+    Checking each call takes half of the tests' time. What is defined inside a function counts as one function.
+    """
+    if inspect.isclass(function):
+        if dataclasses.is_dataclass(function) and "__init__" in vars(function):
+            function.__init__ = check_calls(function.__init__)
+        return function
+    code, checked = function.__code__, None
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        nonlocal checked
+        calls[code] += 1
+        if calls[code] > ALWAYS and calls[code] % EVERY:
+            return function(*args, **kwargs)
+        if checked is None:
+            checked = check_all_calls(function, typechecker=checker.check)
+        return checked(*args, **kwargs)
+
+    return call
+
+
+jaxtyping.jaxtyped = lambda typechecker: check_calls
+jaxtyping.install_import_hook("seaopt", "seaopt_type_checker.check")
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402

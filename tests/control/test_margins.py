@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import DigitalPlant, Loop, TransferFunction, peaks
+from seaopt.control import DigitalPlant, Loop, TransferFunction
+from seaopt.control.loops import peaks
 from seaopt.control.loops.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from tests.control.test_loop import loop_of
