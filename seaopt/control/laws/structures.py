@@ -178,7 +178,7 @@ class Gains:
     observer: Observer | None = None
     notch: Notch | None = None
 
-    def named(self) -> dict[str, float]:
+    def by_name(self) -> dict[str, float]:
         """Return the numbers by name, those of observer and notch too."""
         out = {name: getattr(self, name) for name in ("k_p", "k_i", "k_d", "T_f", "k_ff")}
         if self.observer is not None:
@@ -204,13 +204,13 @@ class Gains:
             np.convolve(difference, difference) if integrates else difference
         )  # fmt: skip
         whole = self.k_i * sample_time_s / 2 * np.convolve([1.0, 1.0], lag) if integrates else np.zeros(1)
-        measurement = _added(self.k_p * unit, rate, whole)
-        reference = _added((self.k_ff + self.k_p) * unit, rate if self.derivative == "error" else np.zeros(1), whole)
+        measurement = _add(self.k_p * unit, rate, whole)
+        reference = _add((self.k_ff + self.k_p) * unit, rate if self.derivative == "error" else np.zeros(1), whole)
         if self.observer is not None:
             q, inverse = self.observer.filters(sample_time_s)
             through = inverse.den  # holds the lags of Q
-            rest = np.convolve(_added(q.den, -q.num), self.observer.nominal.inverse.den)
-            measurement = _added(np.convolve(measurement, through), np.convolve(inverse.num, den))
+            rest = np.convolve(_add(q.den, -q.num), self.observer.nominal.inverse.den)
+            measurement = _add(np.convolve(measurement, through), np.convolve(inverse.num, den))
             reference, den = np.convolve(reference, through), np.convolve(den, rest)
         if self.notch is not None:
             over, under = self.notch.biquad(sample_time_s)
@@ -220,14 +220,14 @@ class Gains:
         return tuple(TransferFunction(num=num / den[0], den=den / den[0]) for num in (reference, measurement))  # type: ignore[return-value]
 
 
-def _added(*polynomials: Float[np.ndarray, " _"]) -> Float[np.ndarray, " m"]:
+def _add(*polynomials: Float[np.ndarray, " _"]) -> Float[np.ndarray, " m"]:
     out = np.zeros(max(p.size for p in polynomials))
     for p in polynomials:
         out[: p.size] += p
     return out
 
 
-class Terms(NamedTuple):
+class LawTerms(NamedTuple):
     """What a law is made of at some frequencies: C_y = series (k_p + k_i integral + k_d rate + observer)."""
 
     series: Any
@@ -236,9 +236,9 @@ class Terms(NamedTuple):
     observer: Any
 
 
-def terms(
+def evaluate_terms(
     q: Any, ts: Any, T_f: Any, observer: tuple[Any, Any, Any] | None = None, notch: tuple[Any, Any, Any] | None = None
-) -> Terms:
+) -> LawTerms:
     """Return the terms of a law at q, for numbers that may be arrays or symbols.
 
     Parameters
@@ -264,4 +264,4 @@ def terms(
         s = (1.0 - q) / (1.0 + q)
         series = series * (s * s + s * (2.0 * depth * width * w) + w * w) / (s * s + s * (2.0 * width * w) + w * w)
     rate = (1.0 - q) / (T_f + ts - q * T_f)
-    return Terms(series=series, integral=(1.0 + q) / (1.0 - q) * (ts / 2), rate=rate, observer=more)
+    return LawTerms(series=series, integral=(1.0 + q) / (1.0 - q) * (ts / 2), rate=rate, observer=more)

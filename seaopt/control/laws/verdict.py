@@ -77,8 +77,10 @@ def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop:
         return f"{limit.name}, {_reached(spec, verdict, loop)}"
     if limit.name == "passive_band_hz" and port is not None and spec.passive_band_hz is not None:
         low, high = spec.passive_band_hz
-        held = "" if port.held_stable else "; the loop grows with its link held"
-        return f"{limit.name} = [{low:g}, {high:g}], Re Z/|Z| {port.least_cosine:.3g} of 0 at {port.at_hz:.4g} Hz{held}"
+        growth = "" if port.held_stable else "; the loop grows with its link held"
+        return (
+            f"{limit.name} = [{low:g}, {high:g}], Re Z/|Z| {port.least_cosine:.3g} of 0 at {port.at_hz:.4g} Hz{growth}"
+        )
     if limit.sense == "equal to" and not np.isfinite(verdict.value):
         return f"{verdict.label}, of which there is none"
     return f"{verdict.label} {verdict.value:.4g} of {verdict.allowed:g}"

@@ -1,4 +1,4 @@
-r"""Gains by successive quadratic programs: the convex-concave procedure on the Nyquist curves of all plants.
+r"""Improve a law's gains by successive quadratic programs, the convex-concave procedure, for the tuner's second step.
 
 At fixed filters C_r and C_y, and with them every :math:`L_m = P_m C_y`, are affine in the gains
 :math:`\theta = (k_p, k_i, k_d)`. At the last iterate let :math:`\alpha_m = \arg(1 + L_m)`. Then
@@ -34,18 +34,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, prominent
+from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, choose_prominent
 from seaopt.records import record
 
-STEPS = 8
-ROWS = 10  # per kind of limit
-RADIUS = 0.4
-SMALLEST = 0.01  # trust region, as a fraction of the gains
-PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of the objective
+MOST_PROGRAMS = 8
+ROWS_PER_LIMIT = 10  # per kind of limit
+FIRST_RADIUS = 0.4
+SMALLEST_RADIUS = 0.01  # trust region, as a fraction of the gains
+USAGE_PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of the objective
 
 
 @dataclass(slots=True)
-class _Rows:
+class _LinearLimits:
     """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
 
     value: list[Float[np.ndarray, " n"]] = field(default_factory=list)
@@ -66,7 +66,7 @@ class _Affine:
     by_r: Complex[np.ndarray, "3 m"]
 
 
-def improved(task: Task, grid: Grid, start: LawNumbers, steps: int = STEPS) -> tuple[float, LawNumbers]:
+def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAMS) -> tuple[float, LawNumbers]:
     """Return the merit and the numbers after successive quadratic programs in the gains, filters as they are.
 
     Parameters
@@ -81,50 +81,50 @@ def improved(task: Task, grid: Grid, start: LawNumbers, steps: int = STEPS) -> t
         Programs solved at most.
 
     """
-    x, radius = start, RADIUS
-    scale = np.maximum(np.abs(start[:3]), _floor(task, grid))
-    merit = _merit(task, grid, x)
+    x, radius = start, FIRST_RADIUS
+    scale = np.maximum(np.abs(start[:3]), _choose_least_gains(task, grid))
+    merit = _measure_merit(task, grid, x)
     for _ in range(steps):
-        step = _step(task, grid, x, radius * scale)
+        step = _solve_step(task, grid, x, radius * scale)
         if step is None:
             break
         trial = x.copy()
         trial[:3] += step
         trial = task.tidy(trial)
-        found = _merit(task, grid, trial)
-        if found < merit and task.stable(trial):
-            small = merit - found < 1e-3
-            x, merit, radius = trial, found, min(1.5 * radius, 1.0)
+        trial_merit = _measure_merit(task, grid, trial)
+        if trial_merit < merit and task.is_stable(trial):
+            small = merit - trial_merit < 1e-3
+            x, merit, radius = trial, trial_merit, min(1.5 * radius, 1.0)
             scale = np.maximum(np.abs(x[:3]), 0.1 * scale)
             if small:
                 break
         else:
             radius *= 0.35
-            if radius < SMALLEST:
+            if radius < SMALLEST_RADIUS:
                 break
     return merit, x
 
 
-def _floor(task: Task, grid: Grid) -> Float[np.ndarray, " 3"]:
+def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " 3"]:
     """Return gains that make a difference: a tenth of the inverse plant's at the bandwidth."""
     w_b = 2 * np.pi * task.spec.bandwidth_hz
     inverse = 1.0 / abs(np.interp(task.spec.bandwidth_hz, grid.f, np.abs(grid.p[0])))
     return 0.1 * inverse * np.array([1.0, 0.1 * w_b, 1.0 / w_b])
 
 
-def _merit(task: Task, grid: Grid, x: LawNumbers) -> float:
+def _measure_merit(task: Task, grid: Grid, x: LawNumbers) -> float:
     """Return the logarithm of the objective and the price of the worst usage."""
     usage = task.usage(grid, x)
     worst = max(float(np.max(curve)) for curve in usage.values())
-    worst = max(worst, 1.0 + abs(task.miss(grid, x)), _integral(task, x) + 1.0)
-    return float(np.log(task.objective(grid, x))) + PRICE * max(0.0, worst - 1.0)
+    worst = max(worst, 1.0 + abs(task.miss(grid, x)), _measure_missing_integral(task, x) + 1.0)
+    return float(np.log(task.objective(grid, x))) + USAGE_PRICE * max(0.0, worst - 1.0)
 
 
-def _integral(task: Task, x: LawNumbers) -> float:
+def _measure_missing_integral(task: Task, x: LawNumbers) -> float:
     return task.least_rate * (1 + x[0]) - x[1]
 
 
-def _affine(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
+def _linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     series, integral, rate, _ = task.terms(grid, x)
     c_r, c_y = task.law(grid, x)
     by_y = series * np.array([np.ones_like(grid.q), integral, rate])
@@ -134,20 +134,20 @@ def _affine(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     return _Affine(c_y=c_y, c_r=c_r, by_y=by_y, by_r=by_r)
 
 
-def _along(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 3"]:
+def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 3"]:
     """Return the derivative of abs(value): the part of `by` along it."""
     size = np.maximum(np.abs(value), 1e-300)
     return np.real(np.conj(value) / size * by).T
 
 
-def _rows(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _Rows:
+def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _LinearLimits:
     """Return the linearised limits at the frequencies and plants where they matter."""
-    rows, m = _Rows(), grid.f.size
+    rows, m = _LinearLimits(), grid.f.size
     usage = task.usage(grid, x)
 
     def chosen(name: str) -> tuple[Any, Any, Any, Any]:
         """Return usage, plant response, law's columns, and 1 + L of the points that matter."""
-        index = prominent(usage[name], ROWS)
+        index = choose_prominent(usage[name], ROWS_PER_LIMIT)
         index = index[usage[name].ravel()[index] > 0.4]
         p, column = grid.p.ravel()[index], index % m
         return usage[name].ravel()[index], p, column, 1.0 + p * law.c_y[column]
@@ -155,40 +155,44 @@ def _rows(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _Rows:
     for name, curve in CURVES.items():
         used, p, column, one = chosen(name)
         c_y, c_r, by_y, by_r = law.c_y[column], law.c_r[column], law.by_y[:, column], law.by_r[:, column]
-        near = _along(one, p * by_y) / np.abs(one)[:, None]
+        near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
         if curve.of == "1":  # the limit is on abs(1 + L) itself
             rows.add(2.0 - 1.0 / used, -near / used[:, None])
             continue
         value, change = curve.numerator(p, c_y, c_r, p * c_y), curve.change(p, by_y, by_r, p * by_y)
-        relative = _along(value, change) / np.abs(value)[:, None]
+        relative = _differentiate_size(value, change) / np.abs(value)[:, None]
         rows.add(used, used[:, None] * ((near - relative) if curve.floor else (relative - near)))
     if task.port is not None:
         used, _, column, _ = chosen(PASSIVE)
         turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
         rows.add(used, -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * size[:, None]))
-    _bandwidth_rows(task, grid, x, law, rows)
-    rows.add(np.array([1.0 + _integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
+    _add_bandwidth(task, grid, x, law, rows)
+    rows.add(np.array([1.0 + _measure_missing_integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
     return rows
 
 
-def _bandwidth_rows(task: Task, grid: Grid, x: LawNumbers, law: _Affine, rows: _Rows) -> None:
+def _add_bandwidth(task: Task, grid: Grid, x: LawNumbers, law: _Affine, rows: _LinearLimits) -> None:
     at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
     p, one = grid.p[0, at], np.array([1.0 + grid.p[0, at] * law.c_y[at]])
     through = np.array([p * law.c_r[at]])
-    slope = _along(through, p * law.by_r[:, [at]]) / np.abs(through) - _along(one, p * law.by_y[:, [at]]) / np.abs(one)
+    slope = _differentiate_size(through, p * law.by_r[:, [at]]) / np.abs(through) - _differentiate_size(
+        one, p * law.by_y[:, [at]]
+    ) / np.abs(one)
     miss = task.miss(grid, x)
     rows.add(np.array([1.0 + miss, 1.0 - miss]), np.concatenate([slope, -slope]))
 
 
-def _objective(
+def _expand_objective(
     task: Task, grid: Grid, x: LawNumbers, law: _Affine
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
     if task.spec.objective == "noise":
         used = np.abs(law.c_y / (1.0 + grid.p[0] * law.c_y))[None]
-        index = prominent(used / np.max(used), ROWS)
+        index = choose_prominent(used / np.max(used), ROWS_PER_LIMIT)
         one, used, column = 1.0 + grid.p[0, index] * law.c_y[index], used[0, index], law.by_y[:, index]
-        slope = _along(law.c_y[index], column) - used[:, None] * _along(one, grid.p[0, index] * column)
+        slope = _differentiate_size(law.c_y[index], column) - used[:, None] * _differentiate_size(
+            one, grid.p[0, index] * column
+        )
         size = np.max(used)
         return np.zeros((3, 3)), used / size, slope / np.abs(one)[:, None] / size
     w = task.weights(grid.f)
@@ -203,11 +207,13 @@ def _objective(
     return curvature / size, values / size, slopes / size
 
 
-def _step(task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"] | None:
+def _solve_step(
+    task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 3"] | None:
     """Return the change of the gains that the quadratic program takes; None if it has no answer."""
-    law = _affine(task, grid, x)
-    rows = _rows(task, grid, x, law)
-    curvature, values, slopes = _objective(task, grid, x, law)
+    law = _linearise_law(task, grid, x)
+    rows = _linearise_limits(task, grid, x, law)
+    curvature, values, slopes = _expand_objective(task, grid, x, law)
     low, high = (ends[:3] for ends in task.bounds())
     # Variables: the gains' changes in units of `reach`, the objective, the slack.
     value, slope = np.concatenate(rows.value), np.concatenate(rows.slope) * reach
@@ -222,10 +228,10 @@ def _step(task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 3"])
     size = np.maximum(1.0, np.max(np.abs(matrix), axis=1))
     quadratic = np.zeros((5, 5))
     quadratic[:3, :3] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(3)
-    found = solve_qp(
-        quadratic, np.array([0.0, 0.0, 0.0, 1.0, PRICE]), matrix / size[:, None], lower / size, upper / size
+    answer = solve_qp(
+        quadratic, np.array([0.0, 0.0, 0.0, 1.0, USAGE_PRICE]), matrix / size[:, None], lower / size, upper / size
     )
-    return None if found is None else found[:3] * reach
+    return None if answer is None else answer[:3] * reach
 
 
 def solve_qp(
@@ -241,10 +247,10 @@ def solve_qp(
         P=csc_matrix(np.triu(quadratic)), q=linear, A=csc_matrix(matrix), l=lower, u=upper, verbose=False, eps_abs=1e-5,
         eps_rel=1e-5, max_iter=500, check_termination=10,
     )  # fmt: skip
-    found = solver.solve(raise_error=False)
+    result = solver.solve(raise_error=False)
     status: Any = osqp.SolverStatus
-    usable = found.info.status_val in (
+    usable = result.info.status_val in (
         status.OSQP_SOLVED, status.OSQP_SOLVED_INACCURATE, status.OSQP_MAX_ITER_REACHED
     )  # fmt: skip
-    x = np.asarray(found.x, dtype=float)
+    x = np.asarray(result.x, dtype=float)
     return x if usable and np.all(np.isfinite(x)) else None

@@ -1,4 +1,4 @@
-"""Parameter values at which a controller must hold while it is tuned: corners of ranges, and draws."""
+"""Choose parameter values at which a controller must hold while it is tuned: corners of ranges, and draws."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def draw(
     if isinstance(parameters, Fit):
         names, matrix = list(parameters.covariance.names), np.asarray(parameters.covariance.matrix)
     else:
-        names = [name for name, item in values.items() if item.prior_std is not None]
+        names = [name for name, parameter in values.items() if parameter.prior_std is not None]
         matrix = np.diag([float(values[name].prior_std or 0.0) ** 2 for name in names])
     used = [i for i, name in enumerate(names) if name in values and name not in uniform and np.isfinite(matrix[i, i])]
     if not used and not uniform:

@@ -1,4 +1,4 @@
-"""What a bandwidth costs: one tuned controller for each of several bandwidths, and their figures side by side."""
+"""Tabulate what a bandwidth costs: one tuned controller for each of several, and their figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 
-SCHEMA = "seaopt/frontier/1"
+FRONTIER_SCHEMA = "seaopt/frontier/1"
 MOST_ROWS = 1000
 
 
@@ -72,7 +72,7 @@ class Frontier:
         """Return the content of frontier.json (schema seaopt/frontier/1)."""
         rows = [{field.name: getattr(row, field.name) for field in fields(FrontierRow)} for row in self.rows]
         return {
-            "schema": SCHEMA,
+            "schema": FRONTIER_SCHEMA,
             "rows": rows,
             "controllers": [controller.to_dict() for controller in self.controllers],
         }
@@ -120,8 +120,8 @@ def sweep(
     >>> import seaopt as so
     >>> from seaopt.control import sweep
     >>> spec = so.ControllerSpec(max_sensitivity=1.6, max_noise_gain=25)
-    >>> found = sweep(so.plants.high_impedance(), so.plants.thor(), spec, [20, 30])
-    >>> [row.feasible for row in found.rows], found.rows[0].noise_gain <= 25
+    >>> frontier = sweep(so.plants.high_impedance(), so.plants.thor(), spec, [20, 30])
+    >>> [row.feasible for row in frontier.rows], frontier.rows[0].noise_gain <= 25
     ([True, True], True)
 
     """

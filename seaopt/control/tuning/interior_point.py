@@ -1,4 +1,4 @@
-r"""The last step of the tuner: all eight numbers at once, by an interior-point method on exact derivatives.
+r"""Refine all eight numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
 
 The quadratic programs leave filters where the scan put them and stop at a first-order step. Here gains, T_f, T_q and
 notch move together: minimise the objective subject to
@@ -22,15 +22,15 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.control.laws.structures import terms
-from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, prominent
+from seaopt.control.laws.structures import evaluate_terms
+from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, choose_prominent
 
-POINTS = 24  # of each kind of limit
-SPREAD = 10  # of them, at even distances
-REACH = 3.0  # factor by which a number may change in one solution
-WORST = 2  # plants whose objective is followed
-CHUNK = 64  # quadrature points come in multiples of this
-PRICE = 1e3
+POINTS_PER_LIMIT = 24  # of each kind of limit
+SPREAD_POINTS = 10  # of them, at even distances
+LARGEST_FACTOR = 3.0  # factor by which a number may change in one solution
+WORST_PLANTS = 2  # plants whose objective is followed
+QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
+SLACK_PRICE = 1e3
 NEGLIGIBLE = 1e-12
 
 
@@ -78,7 +78,7 @@ class _Complex:
         return self.re * self.re + self.im * self.im
 
 
-def polished(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNumbers:
+def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNumbers:
     """Return the numbers at a local optimum, or the start if no better ones are found.
 
     Parameters
@@ -93,17 +93,21 @@ def polished(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawN
         Solutions at most; each adds the points where the one before broke a limit.
 
     """
-    x, chosen = start, _choose(task, grid, start)
+    x, chosen = start, _choose_points(task, grid, start)
     rank = task.rank(grid, start)
     for _ in range(rounds):
         trial = _solve(task, grid, x, chosen)
         if trial is None:
             break
         again = _add_missed(task, grid, trial, chosen)
-        found = task.rank(grid, trial)
-        if found < rank and task.stable(trial):
-            again = again or bool(np.any(trial > 0.99 * REACH * x)) or bool(np.any(trial < 1.01 / REACH * x))
-            x, rank = trial, found
+        trial_rank = task.rank(grid, trial)
+        if trial_rank < rank and task.is_stable(trial):
+            again = (
+                again
+                or bool(np.any(trial > 0.99 * LARGEST_FACTOR * x))
+                or bool(np.any(trial < 1.01 / LARGEST_FACTOR * x))
+            )
+            x, rank = trial, trial_rank
         if not again:
             break
     return x
@@ -115,36 +119,38 @@ def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.
     for name, curve in task.usage(grid, x).items():
         if np.max(curve) > max(1.0, float(np.max(curve.ravel()[chosen[name]]))) + 1e-4:
             missed = True
-            keep = POINTS - SPREAD
-            worst = np.concatenate([prominent(curve, keep // 2), chosen[name][:keep]])[:keep]
+            keep = POINTS_PER_LIMIT - SPREAD_POINTS
+            worst = np.concatenate([choose_prominent(curve, keep // 2), chosen[name][:keep]])[:keep]
             chosen[name] = np.concatenate([worst, chosen[name][keep:]])
     return missed
 
 
-def _choose(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.ndarray, " n"]]:
-    """Return, for each limit, flat indices of POINTS points: those that matter most, and some at even distances."""
+def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.ndarray, " n"]]:
+    """Return flat indices of points for each limit: those that matter most, and some at even distances."""
     chosen: dict[str, Int[np.ndarray, " n"]] = {}
     for name, curve in task.usage(grid, x).items():
         worst = np.argmax(curve, axis=0)
         used = np.flatnonzero(np.max(curve, axis=0) > 0.0)
-        even = used[np.linspace(0, used.size - 1, SPREAD).astype(int)] if used.size else np.zeros(1, dtype=int)
-        index = np.concatenate([prominent(curve, POINTS - SPREAD), worst[even] * grid.f.size + even])
-        chosen[name] = np.resize(index, POINTS)
+        even = used[np.linspace(0, used.size - 1, SPREAD_POINTS).astype(int)] if used.size else np.zeros(1, dtype=int)
+        index = np.concatenate(
+            [choose_prominent(curve, POINTS_PER_LIMIT - SPREAD_POINTS), worst[even] * grid.f.size + even]
+        )
+        chosen[name] = np.resize(index, POINTS_PER_LIMIT)
     return chosen
 
 
 @lru_cache(maxsize=32)
-def _program(
+def _build_program(
     quadrature: int, observer: bool, notch: bool, feedback_only: bool, noise: bool, passive: bool
 ) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
     kinds = (*CURVES, *([PASSIVE] * passive))
-    n = POINTS * len(kinds)
-    total = n + quadrature * WORST * (not noise)
+    n = POINTS_PER_LIMIT * len(kinds)
+    total = n + quadrature * WORST_PLANTS * (not noise)
     shapes = {
         "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
         "inv_im": total, "weight": quadrature, "ln_level": n, "at": 8, "ts": 1, "kff": 1, "scale": 8, "rate": 1,
-        "unit": 2 * POINTS * passive,
+        "unit": 2 * POINTS_PER_LIMIT * passive,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
     v, t, slack = ca.MX.sym("v", 8), ca.MX.sym("t"), ca.MX.sym("slack")
@@ -154,7 +160,7 @@ def _program(
         """Return P, C_y and C_r at some points."""
         q = _Complex(part["q_re"], part["q_im"])
         kept, inverse = _Complex(part["kept_re"], part["kept_im"]), _Complex(part["inv_re"], part["inv_im"])
-        series, integral, rate, more = terms(
+        series, integral, rate, more = evaluate_terms(
             q, data["ts"], x[3], (x[4], kept, inverse) if observer else None, (x[5], x[6], x[7]) if notch else None
         )
         both = integral * x[1] + x[0]
@@ -166,11 +172,11 @@ def _program(
     p, c_y, c_r = law({name: data[name][:n] for name in names})
     open_loop = p * c_y
     distance = (open_loop + 1.0).square() + NEGLIGIBLE
-    slices = {kind: slice(POINTS * i, POINTS * (i + 1)) for i, kind in enumerate(kinds)}
+    slices = {kind: slice(POINTS_PER_LIMIT * i, POINTS_PER_LIMIT * (i + 1)) for i, kind in enumerate(kinds)}
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
         if kind == PASSIVE:  # P is the port's loop here
-            u, one = _Complex(data["unit"][:POINTS], data["unit"][POINTS:]), open_loop + 1.0
+            u, one = _Complex(data["unit"][:POINTS_PER_LIMIT], data["unit"][POINTS_PER_LIMIT:]), open_loop + 1.0
             cosine = (u.re * one.re[where] + u.im * one.im[where]) / ca.sqrt(distance[where])
             usage[kind] = (1 - cosine) / ca.exp(data["ln_level"][where]) - 1
             continue
@@ -188,14 +194,14 @@ def _program(
     else:
         p, c_y, _ = law({name: data[name][n:] for name in names})
         size = 1 / ca.sqrt((p * c_y + 1.0).square() + NEGLIGIBLE)
-        worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST)]
+        worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST_PLANTS)]
     g = ca.vertcat(
         bandwidth,
         (data["rate"] * (1 + x[0]) - x[1]) / data["scale"][1],
         *worst,
         *(rows - slack for rows in usage.values()),
     )
-    nlp = {"x": ca.vertcat(v, t, slack), "p": ca.vertcat(*data.values()), "f": t + PRICE * slack, "g": g}
+    nlp = {"x": ca.vertcat(v, t, slack), "p": ca.vertcat(*data.values()), "f": t + SLACK_PRICE * slack, "g": g}
     options = {
         "print_time": False, "error_on_fail": False, "show_eval_warnings": False,
         "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 80, "tol": 1e-6, "acceptable_tol": 1e-4,
@@ -218,10 +224,10 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     weights = np.zeros(0)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
-        padded = np.resize(inside, CHUNK * (1 + (inside.size - 1) // CHUNK))
+        padded = np.resize(inside, QUADRATURE_CHUNK * (1 + (inside.size - 1) // QUADRATURE_CHUNK))
         weights = np.where(np.arange(padded.size) < inside.size, task.weights(grid.f)[padded], 0.0)
-        worst = np.resize(np.argsort(-_integrals(task, grid, start))[:WORST], WORST)
-        columns = np.concatenate([columns, np.tile(padded, WORST)])
+        worst = np.resize(np.argsort(-_integrate_sensitivity(task, grid, start))[:WORST_PLANTS], WORST_PLANTS)
+        columns = np.concatenate([columns, np.tile(padded, WORST_PLANTS)])
         p = np.concatenate([p, grid.p[worst][:, padded].ravel()])
     at = int(np.argmin(np.abs(grid.f - spec.bandwidth_hz)))
     low, high = task.bounds()
@@ -230,11 +236,11 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     parts = [part for z in every for part in (np.real(z), np.imag(z))]
     one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
     data = [
-        *parts, weights, np.repeat(np.log([levels[kind] for kind in kinds]), POINTS),
+        *parts, weights, np.repeat(np.log([levels[kind] for kind in kinds]), POINTS_PER_LIMIT),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
         [task.least_rate], np.real(unit), np.imag(unit),
     ]  # fmt: skip
-    solver, _ = _program(
+    solver, _ = _build_program(
         weights.size,
         task.nominal is not None,
         spec.notch is not None,
@@ -248,16 +254,16 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     count = int(solver.size_out("g")[0])
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0
-    found = solver(
-        x0=x0, p=np.concatenate([np.asarray(item, dtype=float) for item in data]), lbg=lower, ubg=upper,
-        lbx=[*(np.maximum(low, start / REACH) / scale), -np.inf, 0.0],
-        ubx=[*(np.minimum(high, REACH * np.maximum(start, 0.3 * scale)) / scale), np.inf, np.inf],
+    answer = solver(
+        x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
+        lbx=[*(np.maximum(low, start / LARGEST_FACTOR) / scale), -np.inf, 0.0],
+        ubx=[*(np.minimum(high, LARGEST_FACTOR * np.maximum(start, 0.3 * scale)) / scale), np.inf, np.inf],
     )  # fmt: skip
-    x = np.array(found["x"]).ravel()[: start.size] * scale
+    x = np.array(answer["x"]).ravel()[: start.size] * scale
     return task.tidy(x) if np.all(np.isfinite(x)) else None
 
 
-def _integrals(task: Task, grid: Grid, x: LawNumbers) -> Float[np.ndarray, " n"]:
+def _integrate_sensitivity(task: Task, grid: Grid, x: LawNumbers) -> Float[np.ndarray, " n"]:
     """Return the integral of abs(S) of every plant."""
     _, c_y = task.law(grid, x)
     return (1.0 / np.abs(1.0 + grid.p * c_y)) @ task.weights(grid.f)

@@ -1,4 +1,4 @@
-r"""What is to be tuned: plants, frequencies and limits as arrays, and a law as a vector of eight numbers.
+r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as eight numbers.
 
 Every limit is one curve over frequency, its *usage*, which must not exceed 1 (`seaopt.control.laws.limits`):
 :math:`|X| / (m\,|1 + L|)`, or its inverse where abs(X) is to be above. As m is what the specification allows less the
@@ -26,7 +26,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.laws.limits import BY_NAME, LIMITS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
-from seaopt.control.laws.structures import Gains, Nominal, Notch, Observer, Terms, terms
+from seaopt.control.laws.structures import Gains, LawTerms, Nominal, Notch, Observer, evaluate_terms
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.port import Port, sight
 from seaopt.control.loops.sampled_plant import DigitalPlant
@@ -35,9 +35,9 @@ from seaopt.records import record
 OBJECTIVE_HZ = 0.1  # disturbances count from here
 INTEGRAL_RAD_S = 2 * np.pi * 0.05  # k_i / (1 + k_p) at least, so that the integral does something
 FREQUENCIES = 300
-SLOW = 40  # frequencies below 0.1 Hz
+SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
-LIGHT = 0.2  # damping ratio below which a mode is resolved
+LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
 NO_RATE = 1e-3  # rad/s
 NO_LIMIT = 1e9
 NEARLY_KEPT = 1.001
@@ -157,7 +157,7 @@ class Task:
         reference, measurement = self.gains(x).transfer_functions(self.spec.structure, self.spec.sample_time_s)
         return Loop(plant=self.plants[plant], reference=reference, measurement=measurement)
 
-    def stable(self, x: LawNumbers) -> bool:
+    def is_stable(self, x: LawNumbers) -> bool:
         """Tell whether every plant's loop is stable, by its eigenvalues."""
         return all(np.max(np.abs(self.loop(x, i).eigenvalues())) < 1.0 for i in range(len(self.plants)))
 
@@ -179,11 +179,11 @@ class Task:
             )  # fmt: skip
         return Grid(f=f, q=q, p=p, kept=kept, inverse=inverse, port=port, unit=unit)
 
-    def terms(self, grid: Grid, x: LawNumbers) -> Terms:
+    def terms(self, grid: Grid, x: LawNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
         observer = None if self.nominal is None else (x[4], grid.kept, grid.inverse)
         notch = None if self.spec.notch is None else (x[5], x[6], x[7])
-        return terms(grid.q, self.spec.sample_time_s, x[3], observer, notch)
+        return evaluate_terms(grid.q, self.spec.sample_time_s, x[3], observer, notch)
 
     def law(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
         """Return C_r and C_y on a grid."""
@@ -194,7 +194,7 @@ class Task:
         return series * (both + on_reference + self.k_ff), c_y
 
     def usage(self, grid: Grid, x: LawNumbers, *, design: bool = True) -> dict[str, Float[np.ndarray, "k m"]]:
-        """Return how much of each limit is used, by its name, arrays of one row a plant.
+        """Return how much of each limit is used, by its name, as arrays with one row per plant.
 
         The limits of the design plant, which is then the grid's first, are left out on request.
         """
@@ -236,8 +236,8 @@ class Task:
         """Return the usage of the limits of the design plant, the grid's first."""
         out = self.curves("design plant", grid.f, grid.p[0], c_y, c_r)
         if self.port is not None:
-            held = 1.0 + grid.port * c_y
-            cosine = np.real(grid.unit * np.conj(held)) / np.maximum(np.abs(held), 1e-300)
+            one = 1.0 + grid.port * c_y
+            cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
             out[PASSIVE] = np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)
         return out
 
@@ -284,19 +284,19 @@ class Task:
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))
 
 
-def _range(given: float | None, low: float, high: float) -> tuple[float, float]:
-    return (low, high) if given is None else (given, given)
+def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:
+    return (low, high) if fixed is None else (fixed, fixed)
 
 
-def light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
+def find_light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
     """Return frequency (Hz) and damping ratio of the modes that are lightly damped."""
     values = np.linalg.eigvals(plant.a).astype(complex)
     poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
-    found = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles]
-    return [(float(f), float(max(zeta, 1e-9))) for f, zeta in found if zeta < LIGHT]
+    modes = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles]
+    return [(float(f), float(max(zeta, 1e-9))) for f, zeta in modes if zeta < LIGHT_DAMPING]
 
 
-def frequencies(task: Task) -> Float[np.ndarray, " m"]:
+def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
     """Return a logarithmic grid up to the Nyquist frequency, coarse below 0.1 Hz, with f_b and all bands' ends in it.
 
     About lightly damped plant modes its steps are zeta f / 4, or as small as 80 points a mode and 300 in all allow;
@@ -304,12 +304,15 @@ def frequencies(task: Task) -> Float[np.ndarray, " m"]:
     """
     spec, nyquist = task.spec, 0.5 / task.spec.sample_time_s
     near: list[Float[np.ndarray, " _"]] = []
-    for f, zeta in {mode for plant in task.plants for mode in light_modes(plant)}:
+    for f, zeta in {mode for plant in task.plants for mode in find_light_modes(plant)}:
         reach = max(4 * zeta, 0.02) * f
         near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
     extra = np.sort(np.concatenate([np.zeros(0), *near]))
     extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
-    slow, base = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW), np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
+    slow, base = (
+        np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES),
+        np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES),
+    )
     ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]
     for name, curve in CURVES.items():
         allowed = spec.allowed(BY_NAME[name])
@@ -319,7 +322,7 @@ def frequencies(task: Task) -> Float[np.ndarray, " m"]:
     return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
 
 
-def prominent(usage: Float[np.ndarray, "k m"], count: int) -> Int[np.ndarray, " c"]:
+def choose_prominent(usage: Float[np.ndarray, "k m"], count: int) -> Int[np.ndarray, " c"]:
     """Return flat indices of up to `count` points that matter most: local maxima first, then the largest of others.
 
     Of the others every third is looked at: neighbours say the same.

@@ -1,12 +1,12 @@
-r"""Place a bandwidth under limits on several plants at once.
+r"""Tune a controller: place a bandwidth under limits on several plants at once, for `so.tune`.
 
 The law is eight numbers at most: gains k_p, k_i, k_d; filters T_f, T_q; a notch's frequency, width and depth. Every
 limit is a curve over frequency on every plant (`seaopt.control.tuning.optimisation_problem`), and the design plant's
 bandwidth an equality. That is solved in four steps, each the next one's start:
 
-1. a scan over filters and two gains, the third from the bandwidth equality in closed form (`starts`);
-2. from the best, successive quadratic programs in the gains, the convex-concave procedure (`convex`);
-3. an interior-point method in all numbers at once, on exact derivatives (`polish`);
+1. a scan over filters and two gains, the third from the bandwidth equality in closed form (`find_starts`);
+2. from the best, successive quadratic programs in the gains, the convex-concave procedure (`convex_concave`);
+3. an interior-point method in all numbers at once, on exact derivatives (`interior_point`);
 4. a recheck on frequencies that resolve every pole of plants and closed loops; where a limit is broken between the
    frequencies, those are added and step 3 is repeated.
 
@@ -31,21 +31,21 @@ from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, 
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import sample
-from seaopt.control.tuning.convex_concave import improved
+from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.feasibility import check_current, check_delay
-from seaopt.control.tuning.interior_point import polished
-from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, frequencies
-from seaopt.control.tuning.starts import starts
+from seaopt.control.tuning.interior_point import refine
+from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.starts import find_starts
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
-STARTS = 3  # two more where an observer or a notch makes more valleys
-POLISHED = 2  # of them; one more with an observer, all with a notch
+STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
+STARTS_REFINED = 2  # one more with an observer, all with a notch
 RECHECKS = 3
-FINEST = 0.01  # of the largest bandwidth
-OUT_OF_REACH = 1.03  # usage
-PROBES = 5  # bandwidths tried when the lowest cannot be met
+BANDWIDTH_RESOLUTION = 0.01  # to which the largest bandwidth is found
+HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more is not looked for elsewhere
+BANDWIDTHS_PROBED = 5  # when the lowest cannot be met
 
 
 def current_per_force(plant: Plant, params: ParameterSet) -> float:
@@ -120,7 +120,7 @@ def tune(
     x, loops = solve(task)
     largest = None
     if list_broken(judge_all(spec, loops)):
-        largest, near = largest_bandwidth(task, x)
+        largest, near = find_largest_bandwidth(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near is not None:
             x, loops = solve(task, (x, near))
@@ -145,7 +145,7 @@ def make_task(
     models = {"design plant": (plant, params)}
     models |= {str(name): p if isinstance(p, tuple) else (p, params) for name, p in robust_to.items()}
     names, pairs = [*models], [*models.values()]
-    for name, pair in _drawn(models, draws):
+    for name, pair in _draw_plants(models, draws):
         names.append(name)
         pairs.append(pair)
     plants = tuple(
@@ -165,7 +165,7 @@ def make_task(
     return Task(spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal, port=port)
 
 
-def _drawn(
+def _draw_plants(
     models: Mapping[str, tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]]
 ) -> list[tuple[str, tuple[Plant, ParameterSet]]]:
     """Return every plant at every draw, under a name; a draw that changes nothing of a plant is left out."""
@@ -177,18 +177,18 @@ def _drawn(
             if parameter not in known:
                 raise ControlError(f'draws name "{parameter}", which no plant has; {suggestion(parameter, known)}')
         for name, (model, nominal) in whole.items():
-            own = {key: float(value) for key, value in values.items() if key in model.parameters}
-            if not own:
+            used = {key: float(value) for key, value in values.items() if key in model.parameters}
+            if not used:
                 continue
             label = (
-                ", ".join(f"{key} = {value:.4g}" for key, value in own.items()) if len(own) < 3 else f"draw {number}"
+                ", ".join(f"{key} = {value:.4g}" for key, value in used.items()) if len(used) < 3 else f"draw {number}"
             )
-            out.append((f"{name}, {label}", (model, nominal.update(**own))))
+            out.append((f"{name}, {label}", (model, nominal.update(**used))))
     return out
 
 
 def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> tuple[LawNumbers, list[MeasuredLoop]]:
-    """Return the best numbers found, and every plant's loop with them.
+    """Find the best numbers, and return them with every plant's loop.
 
     Parameters
     ----------
@@ -198,32 +198,32 @@ def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> tuple[LawNumbers, list
         Numbers to start from besides those of the scan, which then tries one less.
 
     """
-    grid = task.grid(frequencies(task))
-    x = best(task, grid, warm)
+    grid = task.grid(place_frequencies(task))
+    x = find_best(task, grid, warm)
     for _ in range(RECHECKS):
-        missed = _missed(task, x, grid)
+        missed = _find_missed(task, x, grid)
         if not missed.size:
             break
         grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
-        x = polished(task, grid, x)
+        x = refine(task, grid, x)
     return x, task.measure(x)
 
 
-def best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = ()) -> LawNumbers:
-    """Return the best numbers on a grid."""
+def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = ()) -> LawNumbers:
+    """Find the best numbers on a grid."""
     more = task.nominal is not None or task.spec.notch is not None
-    given = [task.tidy(x) for x in warm]
-    first = [x for x in given if task.stable(x)] + starts(task, grid, STARTS + 2 * more - bool(given))
-    ranked = sorted((improved(task, grid, x) for x in first), key=lambda item: item[0])
-    polish = len(ranked) if task.spec.notch is not None else POLISHED + more
+    warm = [task.tidy(x) for x in warm]
+    first = [x for x in warm if task.is_stable(x)] + find_starts(task, grid, STARTS_TRIED + 2 * more - bool(warm))
+    ranked = sorted((improve(task, grid, x) for x in first), key=lambda pair: pair[0])
+    count = len(ranked) if task.spec.notch is not None else STARTS_REFINED + more
     chosen: list[LawNumbers] = []
     for _, x in ranked:
-        if len(chosen) < polish and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
+        if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
-    return min((polished(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
+    return min((refine(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
 
 
-def _missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
+def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
     """Return frequencies between the grid's at which more of a limit is used than anywhere on it."""
     allowed = {name: max(1.0, float(np.max(curve))) for name, curve in task.usage(grid, x).items()}
     out: list[float] = []
@@ -237,7 +237,7 @@ def _missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
     return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
 
 
-def largest_bandwidth(task: Task, x: LawNumbers) -> tuple[float, LawNumbers | None]:
+def find_largest_bandwidth(task: Task, x: LawNumbers) -> tuple[float, LawNumbers | None]:
     """Return the largest bandwidth in range that keeps the limits, and its numbers; 0 and None if there is none.
 
     Found by bisection from the bandwidth asked, which does not keep them, towards the lowest; if that does not either,
@@ -249,37 +249,37 @@ def largest_bandwidth(task: Task, x: LawNumbers) -> tuple[float, LawNumbers | No
     near: list[LawNumbers] = []
 
     def possible(bandwidth_hz: float) -> bool:
-        found = _possible(
+        feasible = _find_feasible(
             replace(task, spec=replace(spec, bandwidth_hz=bandwidth_hz)), near[-1] if near else x, near=bool(near)
         )
-        near.extend([] if found is None else [found])
-        return found is not None
+        near.extend([] if feasible is None else [feasible])
+        return feasible is not None
 
-    tried = [low, *np.geomspace(low, asked, PROBES + 2)[-2:0:-1]] if low < asked else []
+    tried = [low, *np.geomspace(low, asked, BANDWIDTHS_PROBED + 2)[-2:0:-1]] if low < asked else []
     first = next((k for k, f in enumerate(tried) if possible(float(f))), None)
     if first is None:
         return 0.0, None
     lower, upper = tried[first], tried[first - 1] if first > 1 else asked
-    while upper / lower > 1.0 + FINEST:
+    while upper / lower > 1.0 + BANDWIDTH_RESOLUTION:
         middle = float(np.sqrt(lower * upper))
         lower, upper = (middle, upper) if possible(middle) else (lower, middle)
     return float(lower), near[-1]
 
 
-def _possible(task: Task, x: LawNumbers, *, near: bool) -> LawNumbers | None:
-    """Return numbers that keep all limits on the frequencies looked at, if found: from x first, then from anywhere.
+def _find_feasible(task: Task, x: LawNumbers, *, near: bool) -> LawNumbers | None:
+    """Return numbers that keep all limits on the frequencies looked at, or None: from x first, then from anywhere.
 
     Near a bandwidth that is possible what x misses clearly is not looked for anywhere else.
     """
-    grid = task.grid(frequencies(task))
+    grid = task.grid(place_frequencies(task))
     x = task.tidy(x)
-    if task.stable(x):
-        x = polished(task, grid, x)
+    if task.is_stable(x):
+        x = refine(task, grid, x)
         usage, _ = task.rank(grid, x)
-        if usage == 0.0 or (near and usage > OUT_OF_REACH):
+        if usage == 0.0 or (near and usage > HOPELESS_USAGE):
             return x if usage == 0.0 else None
-    found = best(task, grid, [x])
-    return found if task.rank(grid, found)[0] == 0.0 else None
+    x = find_best(task, grid, [x])
+    return x if task.rank(grid, x)[0] == 0.0 else None
 
 
 def make_controller(
@@ -296,7 +296,7 @@ def make_controller(
     reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
     return Controller(
         structure=spec.structure,
-        gains=gains.named(),
+        gains=gains.by_name(),
         sample_time_s=spec.sample_time_s,
         delay_samples=spec.delay_samples,
         reference=reference,
