@@ -13,7 +13,7 @@ import numpy as np
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
-from seaopt.robustness import Budget, batch_figures, bracket, uncertainty
+from seaopt.robustness import Budget, batch_figures, bracket, combine_uncertainty
 
 DRAWS = 20_000
 WIDE, ANGLE, DELAY = {"I_p": (0.2, 0.6)}, {"phi": (-0.5, 0.5)}, {"delay_s": (0.0, 2e-4)}
@@ -36,7 +36,7 @@ def main() -> None:
     ]  # fmt: skip
     for name, plant, source, ranges in cases:
         certificate = so.certify(controller, {"plant": plant}, source, ranges=ranges, samples=500)
-        unknown = uncertainty(source, so.ParameterSet(), ranges, {"plant": plant})
+        unknown = combine_uncertainty(source, so.ParameterSet(), ranges, {"plant": plant})
         wall, cpu = time.perf_counter(), time.process_time()
         found = bracket(controller, plant, unknown, certificate.worst["plant"], Budget())
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

@@ -7,7 +7,7 @@ from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certifi
 from seaopt.robustness.certificate.nominal import PlantMargins, plant_margins
 from seaopt.robustness.certificate.simulated import Simulated, simulated
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, placed, uncertainty
+from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
 from seaopt.robustness.uncertainty.worst import Witness, Worst
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import Outcome
@@ -18,6 +18,7 @@ from seaopt.robustness.verification.verification import Verification, verify
 __all__ = [
     "BatchFigures", "Bracket", "Budget", "Certificate", "JointTuning", "LargeSignal", "MonteCarlo", "Outcome", "Phase",
     "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty", "Verification",
-    "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges", "coupled_stability", "default_scenarios",
-    "failure_bound", "large_signal", "placed", "plant_margins", "simulated", "tune_certified", "uncertainty", "verify",
+    "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges", "combine_uncertainty",
+    "coupled_stability", "default_scenarios", "failure_bound", "large_signal", "place_value", "plant_margins",
+    "simulated", "tune_certified", "verify",
 ]  # fmt: skip

@@ -10,13 +10,13 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.errors import ControlError
 from seaopt.plants import jacobians, state_space
-from seaopt.robustness import uncertainty
-from seaopt.robustness.bounds.enclosure import enclosed
-from seaopt.robustness.bounds.impulse import pulse
-from seaopt.robustness.bounds.region import Boxes, region
-from seaopt.robustness.bounds.taylor import basis, constant, linear
+from seaopt.robustness import combine_uncertainty
+from seaopt.robustness.bounds.enclosure import enclose
+from seaopt.robustness.bounds.impulse import enclose_plant
+from seaopt.robustness.bounds.region import Boxes, build_region
+from seaopt.robustness.bounds.taylor import build_basis, make_constant, make_linear
 
-OVER = basis(2, 3)
+OVER = build_basis(2, 3)
 E = np.random.default_rng(0).uniform(-1.0, 1.0, (4000, 2))
 E[:4] = [[-1, -1], [-1, 1], [1, -1], [1, 1]]
 
@@ -28,28 +28,28 @@ def polynomial(model, e):
 
 
 def variable(centre, slopes):
-    return linear(np.array([centre]), np.array(slopes)[:, None], OVER)
+    return make_linear(np.array([centre]), np.array(slopes)[:, None], OVER)
 
 
-def held(model, values):
-    """Tell whether values at the coordinates E lie inside the model."""
+def encloses(model, values):
+    """Return whether values at the coordinates E lie inside the model."""
     miss = np.abs(values - polynomial(model, E)[:, 0])
     return bool(np.all(miss <= model.r[0] + 1e-13 * (1.0 + np.abs(values))))
 
 
 def test_monomials_are_all_there_once():
-    assert basis(3, 4).powers.shape == (35, 3)
-    assert len({tuple(row) for row in basis(3, 4).powers}) == 35
-    assert basis(2, 3).place(0, 1, 1) == next(k for k, row in enumerate(OVER.powers) if tuple(row) == (1, 2))
-    assert basis(0, 5).powers.shape == (1, 0)
+    assert build_basis(3, 4).powers.shape == (35, 3)
+    assert len({tuple(row) for row in build_basis(3, 4).powers}) == 35
+    assert build_basis(2, 3).index_of(0, 1, 1) == next(k for k, row in enumerate(OVER.powers) if tuple(row) == (1, 2))
+    assert build_basis(0, 5).powers.shape == (1, 0)
 
 
 def test_what_stays_within_the_degree_is_exact():
     x, y = variable(1.0, [0.5, 0.2]), variable(-2.0, [0.1, 0.7])
-    found = (x * y - 3.0) * x
-    assert found.r[0] < 1e-13
+    product = (x * y - 3.0) * x
+    assert product.r[0] < 1e-13
     at_x, at_y = 1.0 + E @ [0.5, 0.2], -2.0 + E @ [0.1, 0.7]
-    np.testing.assert_allclose(polynomial(found, E)[:, 0], (at_x * at_y - 3.0) * at_x, rtol=1e-12)
+    np.testing.assert_allclose(polynomial(product, E)[:, 0], (at_x * at_y - 3.0) * at_x, rtol=1e-12)
 
 
 FUNCTIONS = {
@@ -64,9 +64,9 @@ FUNCTIONS = {
 def test_functions_hold_their_values(name, slopes):
     x = ca.SX.sym("x")
     function = ca.Function("f", [x], [ca.densify(FUNCTIONS[name](x))])
-    (entry,) = enclosed(function, [[variable(1.7, slopes)]])[0]
+    (entry,) = enclose(function, [[variable(1.7, slopes)]])[0]
     values = np.array(function((1.7 + E @ np.array(slopes))[None])).ravel()
-    assert held(entry, values)
+    assert encloses(entry, values)
     if slopes[0] == 1e-4:
         assert entry.r[0] < 1e-12  # of the fourth order in the width
 
@@ -79,20 +79,20 @@ def test_zero_in_a_denominator_holds_everything():
 def test_an_unknown_instruction_is_named():
     x = ca.SX.sym("x")
     with pytest.raises(ControlError, match="erf"):
-        enclosed(ca.Function("f", [x], [ca.erf(x)]), [[variable(0.0, [1.0, 0.0])]])
-    assert enclosed(ca.Function("f", [x], [ca.erf(x)]), [[0.5]])[0][0] == pytest.approx(0.5204998778)
+        enclose(ca.Function("f", [x], [ca.erf(x)]), [[variable(0.0, [1.0, 0.0])]])
+    assert enclose(ca.Function("f", [x], [ca.erf(x)]), [[0.5]])[0][0] == pytest.approx(0.5204998778)
 
 
 def test_matrix_products_hold_their_values():
     rng = np.random.default_rng(1)
     centre, slopes = rng.normal(size=(2, 1, 3, 3)), 0.3 * rng.normal(size=(2, 2, 1, 3, 3))
-    a, b = (linear(c, s, OVER) for c, s in zip(centre, slopes, strict=True))
-    found = a @ b @ a
+    a, b = (make_linear(c, s, OVER) for c, s in zip(centre, slopes, strict=True))
+    product = a @ b @ a
     at = [c + np.tensordot(E, s, axes=(1, 0)) for c, s in zip(centre, slopes, strict=True)]
-    miss = np.abs(at[0] @ at[1] @ at[0] - polynomial(found, E))
-    assert np.all(miss <= found.r + 1e-12)
+    miss = np.abs(at[0] @ at[1] @ at[0] - polynomial(product, E))
+    assert np.all(miss <= product.r + 1e-12)
     cube = a @ a @ a
-    np.testing.assert_array_equal((cube @ constant(np.eye(3)[None], OVER)).a, cube.a)
+    np.testing.assert_array_equal((cube @ make_constant(np.eye(3)[None], OVER)).a, cube.a)
 
 
 @pytest.mark.parametrize("plant", ["stand", "swing"])
@@ -100,28 +100,26 @@ def test_jacobians_hold_casadis(plant, thor, request):
     plant = request.getfixturevalue(plant)
     names = ["J", "b_r", "eta", "I_p", "L_a"]
     nominal = plant.parameter_values(thor)
-    over = basis(len(names), 4)
+    over = build_basis(len(names), 4)
     entries = [
-        linear(np.array([value]), 0.2 * value * (np.array(names) == name)[:, None], over) if name in names else value
+        make_linear(np.array([value]), 0.2 * value * (np.array(names) == name)[:, None], over)
+        if name in names
+        else value
         for name, value in zip(plant.parameters, nominal, strict=True)
     ]
     x, u = [0.0] * len(plant.states), [0.0] * len(plant.inputs)
-    found = [item for block in enclosed(jacobians(plant), [x, u, entries]) for item in block]
+    models = [entry for block in enclose(jacobians(plant), [x, u, entries]) for entry in block]
     rng = np.random.default_rng(3)
     for e in rng.uniform(-1.0, 1.0, (50, len(names))):
         scale = {name: 1.0 + 0.2 * step for name, step in zip(names, e, strict=True)}
         p = [value * scale.get(name, 1.0) for name, value in zip(plant.parameters, nominal, strict=True)]
         blocks = jacobians(plant)(x, u, p)
-        for model, value in zip(found, np.concatenate([np.array(b).ravel(order="F") for b in blocks]), strict=True):
+        for model, value in zip(models, np.concatenate([np.array(b).ravel(order="F") for b in blocks]), strict=True):
             if isinstance(model, float):
                 assert value == pytest.approx(model, rel=1e-12)
             else:
                 middle = polynomial(model, e[None])[0, 0]
                 assert abs(value - middle) <= model.r[0] + 1e-11 * abs(value)
-
-
-def controller_of(plant, params, **options):
-    return so.tune(plant, params, so.ControllerSpec(bandwidth_hz=30, **options))
 
 
 @pytest.mark.parametrize(
@@ -133,20 +131,20 @@ def controller_of(plant, params, **options):
         (("current_loop",), {"current_loop_hz": (100.0, 400.0), "I_p": (0.3, 0.5)}),
     ],
 )
-def test_the_sampled_plant_holds_exponentials(parts, ranges, stand, thor):
+def test_the_sampled_plant_holds_exponentials(parts, ranges, robust_controller, thor):
     """P(z) of every draw, by scipy's exponential, lies in the quotient of the models."""
     plant = so.plants.moving_output(parts=parts)
-    controller = controller_of(stand, thor)
-    unknown = uncertainty(thor, so.ParameterSet(), ranges, {"swing": plant})
-    within = region(plant, unknown)
+    controller = robust_controller
+    unknown = combine_uncertainty(thor, so.ParameterSet(), ranges, {"swing": plant})
+    within = build_region(plant, unknown)
     boxes = Boxes(centre=np.full((1, 2), 0.2), radius=np.full((1, 2), 0.5))
-    found = pulse(controller, plant, unknown.nominal, within, boxes)
+    enclosed = enclose_plant(controller, plant, unknown.nominal, within, boxes)
     period, gain = controller.sample_time_s, controller.current_per_force_A_per_N
     for e in np.random.default_rng(5).uniform(-1.0, 1.0, (30, 2)):
-        values = {name: float(item[0]) for name, item in within.at(0.2 + 0.5 * e[None]).items()}
-        own = thor.update(**{k: v for k, v in values.items() if k in thor})
-        own = plant.complete(own).update(**{k: v for k, v in values.items() if k in plant.parameters})
-        a, b, c, d = _at_angle(plant, own, values.get("phi", 0.0))
+        values = {name: float(column[0]) for name, column in within.evaluate(0.2 + 0.5 * e[None]).items()}
+        drawn = thor.update(**{k: v for k, v in values.items() if k in thor})
+        drawn = plant.complete(drawn).update(**{k: v for k, v in values.items() if k in plant.parameters})
+        a, b, c, d = _at_angle(plant, drawn, values.get("phi", 0.0))
         b, c, d = b[:, :1] * gain, c[:1], d[0, 0] * gain
         late = values.get("delay_s", 0.0)
         whole = int(late / period)
@@ -165,13 +163,13 @@ def test_the_sampled_plant_holds_exponentials(parts, ranges, stand, thor):
             )  # fmt: skip
             through = d * (z**-1 if rest > 0.0 else 1.0)
             exact = (c @ inner @ (newer + (every - newer) / z))[0, 0] + through
-            powers = w ** np.arange(found.denominator.r.shape[1])
+            powers = w ** np.arange(enclosed.denominator.r.shape[1])
             (head, off_head), (tail, off_tail), (below, off_below) = (
-                (polynomial(item, e[None])[0, 0] @ powers, item.r[0] @ np.abs(powers))
-                for item in (found.head, found.tail, found.denominator)
+                (polynomial(model, e[None])[0, 0] @ powers, model.r[0] @ np.abs(powers))
+                for model in (enclosed.head, enclosed.tail, enclosed.denominator)
             )
             miss = abs(exact * below - (head + tail / z))
-            assert found.whole[0] == whole
+            assert enclosed.whole[0] == whole
             assert miss <= off_head + off_tail + abs(exact) * off_below + 1e-9 * abs(exact * below)
 
 

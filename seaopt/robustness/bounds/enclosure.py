@@ -1,4 +1,4 @@
-"""CasADi functions over boxes: their instructions, one after the other, on Taylor models."""
+"""Enclosures of CasADi functions over boxes, for the bounds: their instructions, one by one, on Taylor models."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import ControlError
-from seaopt.robustness.bounds.taylor import Basis, Taylor, constant, stacked
+from seaopt.robustness.bounds.taylor import Basis, Taylor, make_constant, stack_models
 
 Entry = Taylor | float
 LARGEST_POWER = 64
 
 
-def enclosed(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[Entry]]:
+def enclose(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[Entry]]:
     """Return enclosures of the entries of a function's outputs, column by column.
 
     Entries that depend on nothing uncertain are numbers, computed as CasADi does, whatever the instruction.
@@ -32,7 +32,7 @@ def enclosed(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[E
     Raises
     ------
     ControlError
-        An instruction on something uncertain is not known here.
+        An instruction on something uncertain has no enclosure.
 
     """
     if not function.is_a("SXFunction"):
@@ -41,36 +41,35 @@ def enclosed(function: Any, arguments: Sequence[Sequence[Entry]]) -> list[list[E
     out: list[list[Entry]] = [[0.0] * function.nnz_out(k) for k in range(function.n_out())]
     for k in range(function.n_instructions()):
         op = function.instruction_id(k)
-        here, there = function.instruction_output(k), function.instruction_input(k)
+        target, source = function.instruction_output(k), function.instruction_input(k)
         if op == ca.OP_INPUT:
-            work[here[0]] = arguments[there[0]][there[1]]
+            work[target[0]] = arguments[source[0]][source[1]]
         elif op == ca.OP_OUTPUT:
-            out[here[0]][here[1]] = work[there[0]]
+            out[target[0]][target[1]] = work[source[0]]
         elif op == ca.OP_CONST:
-            work[here[0]] = float(function.instruction_constant(k))
+            work[target[0]] = float(function.instruction_constant(k))
         else:
-            work[here[0]] = _operated(op, [work[i] for i in there])
+            work[target[0]] = _apply_operation(op, [work[i] for i in source])
     return out
 
 
-def _operated(op: int, given: list[Entry]) -> Entry:
-    """Return one operation, on numbers or on models."""
-    numbers = [item for item in given if not isinstance(item, Taylor)]
-    if len(numbers) == len(given):
-        operands = [ca.SX(item) for item in numbers]
-        return float((ca.SX.binary if len(operands) == 2 else ca.SX.unary)(op, *operands))
-    known = BINARY if len(given) == 2 else UNARY
+def _apply_operation(op: int, operands: list[Entry]) -> Entry:
+    """Return the result of one operation, on numbers or on models."""
+    numbers = [ca.SX(entry) for entry in operands if not isinstance(entry, Taylor)]
+    if len(numbers) == len(operands):
+        return float((ca.SX.binary if len(numbers) == 2 else ca.SX.unary)(op, *numbers))
+    known = BINARY if len(operands) == 2 else UNARY
     if op not in known:
         names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == op]
         raise ControlError(f"the plant's equations have {names[0][3:].lower()}, which has no enclosure")
-    return known[op](*given)
+    return known[op](*operands)
 
 
-def _divided(a: Entry, b: Entry) -> Entry:
+def _divide(a: Entry, b: Entry) -> Entry:
     return a * b.reciprocal() if isinstance(b, Taylor) else a * (1.0 / b)
 
 
-def _power(a: Entry, b: Entry) -> Entry:
+def _raise_to_power(a: Entry, b: Entry) -> Entry:
     """Return a whole power by repeated products, any other of a positive number by its series."""
     if isinstance(b, Taylor):
         raise ControlError("the plant's equations have an uncertain exponent, which has no enclosure")
@@ -85,25 +84,25 @@ def _power(a: Entry, b: Entry) -> Entry:
     low, high = a.c - a.reach, a.c + a.reach
     ends = np.maximum(np.abs(low) ** (b - degree - 1), np.abs(high) ** (b - degree - 1))
     last = np.where(low > 0.0, abs(factors[-1]) * ends, np.inf)
-    return a.applied([factors[k] * a.c ** (b - k) for k in range(degree + 1)], last)
+    return a.compose([factors[k] * a.c ** (b - k) for k in range(degree + 1)], last)
 
 
 def _sine(a: Taylor, turn: float) -> Taylor:
     """Return sin(a + turn)."""
     series = [np.sin(a.c + turn + 0.5 * np.pi * k) / math.factorial(k) for k in range(a.basis.degree + 1)]
-    return a.applied(series, np.full(a.c.shape, 1.0 / math.factorial(a.basis.degree + 1)))
+    return a.compose(series, np.full(a.c.shape, 1.0 / math.factorial(a.basis.degree + 1)))
 
 
 def _exponential(a: Taylor) -> Taylor:
     degree = a.basis.degree
     series = [np.exp(a.c) / math.factorial(k) for k in range(degree + 1)]
-    return a.applied(series, np.exp(a.c + a.reach) / math.factorial(degree + 1))
+    return a.compose(series, np.exp(a.c + a.reach) / math.factorial(degree + 1))
 
 
 def _logarithm(a: Taylor) -> Taylor:
     degree, low = a.basis.degree, a.c - a.reach
     series = [np.log(a.c), *(-((-1.0 / a.c) ** k) / k for k in range(1, degree + 1))]
-    return a.applied(series, np.where(low > 0.0, np.abs(low) ** -(degree + 1.0) / (degree + 1), np.inf))
+    return a.compose(series, np.where(low > 0.0, np.abs(low) ** -(degree + 1.0) / (degree + 1), np.inf))
 
 
 def _tanh(a: Taylor) -> Taylor:
@@ -112,7 +111,7 @@ def _tanh(a: Taylor) -> Taylor:
     for k in range(a.basis.degree):
         squared = sum((series[i] * series[k - i] for i in range(k + 1)), np.zeros_like(a.c))
         series.append((float(k == 0) - squared) / (k + 1))
-    return a.applied(series, np.full(a.c.shape, math.tan(1.0)))
+    return a.compose(series, np.full(a.c.shape, math.tan(1.0)))
 
 
 def _arctangent(a: Taylor) -> Taylor:
@@ -122,11 +121,11 @@ def _arctangent(a: Taylor) -> Taylor:
     for k in range(2, degree):
         slope.append(-(2.0 * a.c * slope[k - 1] + slope[k - 2]) / below)
     series = [np.arctan(a.c), *(slope[k] / (k + 1) for k in range(degree))]
-    return a.applied(series, np.full(a.c.shape, 1.0 / (degree + 1)))
+    return a.compose(series, np.full(a.c.shape, 1.0 / (degree + 1)))
 
 
 def _absolute(a: Taylor) -> Taylor:
-    """Return abs(a) where its sign is certain, else the least interval that holds it."""
+    """Return abs(a) where its sign is certain, else the smallest interval that contains it."""
     reach = a.reach
     sign, sure, middle = np.sign(a.c), np.abs(a.c) > reach, 0.5 * (np.abs(a.c) + reach)
     out = np.where(sure, sign * a.a, 0.0)
@@ -136,16 +135,16 @@ def _absolute(a: Taylor) -> Taylor:
 
 def _sign(a: Taylor) -> Taylor:
     sure = np.abs(a.c) > a.reach
-    return constant(np.where(sure, np.sign(a.c), 0.0), a.basis).with_rest(np.where(sure, 0.0, 1.0))
+    return make_constant(np.where(sure, np.sign(a.c), 0.0), a.basis).with_remainder(np.where(sure, 0.0, 1.0))
 
 
 BINARY: dict[int, Callable[[Any, Any], Entry]] = {
     ca.OP_ADD: lambda a, b: a + b,
     ca.OP_SUB: lambda a, b: a - b,
     ca.OP_MUL: lambda a, b: a * b,
-    ca.OP_DIV: _divided,
-    ca.OP_POW: _power,
-    ca.OP_CONSTPOW: _power,
+    ca.OP_DIV: _divide,
+    ca.OP_POW: _raise_to_power,
+    ca.OP_CONSTPOW: _raise_to_power,
 }
 UNARY: dict[int, Callable[[Any], Entry]] = {
     ca.OP_ASSIGN: lambda a: a,
@@ -160,21 +159,22 @@ UNARY: dict[int, Callable[[Any], Entry]] = {
     ca.OP_TANH: _tanh,
     ca.OP_EXP: _exponential,
     ca.OP_LOG: _logarithm,
-    ca.OP_SQRT: lambda a: _power(a, 0.5),
+    ca.OP_SQRT: lambda a: _raise_to_power(a, 0.5),
     ca.OP_ATAN: _arctangent,
 }
 
 
-def matrix(entries: Sequence[Entry], rows: int, count: int, over: Basis) -> Taylor:
+def assemble_matrix(entries: Sequence[Entry], rows: int, count: int, over: Basis) -> Taylor:
     """Return a matrix, shape (count, rows, columns), of entries column by column."""
     columns = len(entries) // rows
-    models = [item if isinstance(item, Taylor) else constant(np.full(count, float(item)), over) for item in entries]
-    whole = stacked(models)
-    shape = (count, columns, rows)
-    return Taylor(over, np.swapaxes(whole.a.reshape(-1, *shape), -1, -2), np.swapaxes(whole.r.reshape(shape), -1, -2))
+    models = [
+        entry if isinstance(entry, Taylor) else make_constant(np.full(count, float(entry)), over) for entry in entries
+    ]
+    flat, shape = stack_models(models), (count, columns, rows)
+    return Taylor(over, np.swapaxes(flat.a.reshape(-1, *shape), -1, -2), np.swapaxes(flat.r.reshape(shape), -1, -2))
 
 
-def halvings(norm: Float[np.ndarray, " b"], reach: float) -> int:
-    """Return how often to halve so that every finite norm is within `reach`."""
+def count_halvings(norm: Float[np.ndarray, " b"], reach: float) -> int:
+    """Return how many halvings bring every finite norm within `reach`."""
     largest = float(np.max(norm, initial=0.0, where=np.isfinite(norm)))
     return max(0, math.ceil(math.log2(largest / reach))) if largest > 0.0 else 0

@@ -1,9 +1,9 @@
-"""Where a plant rests over boxes of its parameters, enclosed.
+"""Enclosures of a plant's equilibria over boxes of its parameters, about which the bounds linearise it.
 
-At the centre of each box by Newton's method, from zero as `seaopt.control.loops.sampled_plant` does; over the box by
-simplified Newton steps on Taylor models, each of which is right to one more degree. That the equations have a solution
-next to that polynomial, and only one, is then shown by Krawczyk's test (Computing 4, 1969; Neumaier, Interval Methods
-for Systems of Equations, 1990, chapter 5).
+At the centre of each box Newton's method solves for the equilibrium, from zero as `seaopt.control.loops.sampled_plant`
+does; over the box simplified Newton steps on Taylor models follow, each of which is right to one more degree. That the
+equations have a solution next to that polynomial, and only one, is then proven by Krawczyk's test (Computing 4, 1969;
+Neumaier, Interval Methods for Systems of Equations, 1990, chapter 5).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from seaopt.errors import ControlError
 from seaopt.plants import Plant, jacobians
 from seaopt.plants.plant import dynamics_function
 from seaopt.records import record
-from seaopt.robustness.bounds.enclosure import Entry, enclosed, matrix
-from seaopt.robustness.bounds.taylor import Basis, Taylor, basis, constant
+from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, enclose
+from seaopt.robustness.bounds.taylor import Basis, Taylor, build_basis, make_constant
 
 NEWTON_STEPS, WIDENINGS = 30, 4
-SLOPES_DEGREE = 2  # of the models in Krawczyk's test
-POINT = basis(0, 0)
+JACOBIAN_DEGREE = 2  # of the models in Krawczyk's test
+POINT_BASIS = build_basis(0, 0)
 
 
 @record(eq=False)
-class _Equations:
-    """A plant at rest: its states but the given one, and its first input, y, such that nothing moves."""
+class _RestEquations:
+    """The equations of rest: all states but the prescribed one, and the first input, y, such that nothing moves."""
 
     plant: Plant
     p: Sequence[Entry]
@@ -36,76 +36,76 @@ class _Equations:
     count: int
     over: Basis
 
-    def at(self, y: Taylor) -> tuple[list[Entry], list[Entry]]:
-        """Return all states and inputs."""
+    def fill(self, y: Taylor) -> tuple[list[Entry], list[Entry]]:
+        """Return all states and inputs, with y in their places."""
         entries = [y[:, k, 0] for k in range(len(self.x))]
-        own = dict(zip(self.loose, entries[:-1], strict=True))
+        solved = dict(zip(self.loose, entries[:-1], strict=True))
         inputs: list[Entry] = [entries[-1], *[0.0] * (len(self.plant.inputs) - 1)]
-        return [own.get(k, item) for k, item in enumerate(self.x)], inputs
+        return [solved.get(k, prescribed) for k, prescribed in enumerate(self.x)], inputs
 
     def rates(self, y: Taylor) -> Taylor:
-        """Return what has to be zero, shape (b, n, 1)."""
-        rates = enclosed(dynamics_function(self.plant), [*self.at(y), self.p])
-        return matrix(rates[0], len(self.x), self.count, self.over)
+        """Return the states' rates, which have to be zero, shape (b, n, 1)."""
+        rates = enclose(dynamics_function(self.plant), [*self.fill(y), self.p])
+        return assemble_matrix(rates[0], len(self.x), self.count, self.over)
 
-    def slopes(self, y: Taylor) -> Taylor:
-        """Return its derivatives, shape (b, n, n)."""
-        found = enclosed(jacobians(self.plant), [*self.at(y), self.p])
-        a, b = (matrix(item, len(self.x), self.count, self.over) for item in found[:2])
+    def jacobian(self, y: Taylor) -> Taylor:
+        """Return the derivatives of the rates with respect to y, shape (b, n, n)."""
+        blocks = enclose(jacobians(self.plant), [*self.fill(y), self.p])[:2]
+        a, b = (assemble_matrix(block, len(self.x), self.count, self.over) for block in blocks)
         columns = list(self.loose)
         parts = ((a.a, b.a), (a.r, b.r))
         return Taylor(
             self.over, *(np.concatenate([left[..., columns], right[..., :1]], axis=-1) for left, right in parts)
         )
 
-    def lower(self, degree: int) -> _Equations:
+    def truncate(self, degree: int) -> _RestEquations:
         """Return the equations on models of a lower degree."""
-        p, x = ([_lower(item, degree) for item in entries] for entries in (self.p, self.x))
-        over = basis(self.over.size, degree)
-        return _Equations(plant=self.plant, p=p, x=x, loose=self.loose, count=self.count, over=over)
+        p, x = ([_truncate(entry, degree) for entry in entries] for entries in (self.p, self.x))
+        over = build_basis(self.over.size, degree)
+        return _RestEquations(plant=self.plant, p=p, x=x, loose=self.loose, count=self.count, over=over)
 
-    def centre(self) -> _Equations:
+    def at_centre(self) -> _RestEquations:
         """Return the equations at the centres of the boxes."""
-        p, x = ([_centre(item) for item in entries] for entries in (self.p, self.x))
-        return _Equations(plant=self.plant, p=p, x=x, loose=self.loose, count=self.count, over=POINT)
+        p, x = ([_take_centre(entry) for entry in entries] for entries in (self.p, self.x))
+        return _RestEquations(plant=self.plant, p=p, x=x, loose=self.loose, count=self.count, over=POINT_BASIS)
 
 
-def at_rest(
-    plant: Plant, p: Sequence[Entry], given: Mapping[str, Entry], count: int, over: Basis
+def enclose_equilibrium(
+    plant: Plant, p: Sequence[Entry], prescribed: Mapping[str, Entry], count: int, over: Basis
 ) -> tuple[list[Entry], list[Entry]]:
     """Return enclosures of the states and inputs at rest; infinite where it is not proven that there is one.
 
     Raises
     ------
     ControlError
-        Two states are given, or the plant cannot rest at the centre of a box.
+        Two states are prescribed, or the plant cannot rest at the centre of a box.
 
     """
     names = list(plant.states)
-    x: list[Entry] = [given.get(name, 0.0) for name in names]
-    fixed = [k for k, item in enumerate(x) if isinstance(item, Taylor) or item != 0.0]
+    x: list[Entry] = [prescribed.get(name, 0.0) for name in names]
+    fixed = [k for k, state in enumerate(x) if isinstance(state, Taylor) or state != 0.0]
     if not fixed:
         return x, [0.0] * len(plant.inputs)
     if len(fixed) > 1:
         raise ControlError(f"{', '.join(names[k] for k in fixed)} are both given; a plant rests at one of them")
     loose = tuple(k for k in range(len(names)) if k not in fixed)
-    equations = _Equations(plant=plant, p=p, x=x, loose=loose, count=count, over=over)
-    middle = equations.centre()
-    centre = _newton(middle, names[fixed[0]])
-    inverse = np.linalg.inv(middle.slopes(constant(centre, POINT)).c)
-    y, one = constant(centre, over), np.eye(1)
+    equations = _RestEquations(plant=plant, p=p, x=x, loose=loose, count=count, over=over)
+    middle = equations.at_centre()
+    centre = _solve_centre(middle, names[fixed[0]])
+    inverse = np.linalg.inv(middle.jacobian(make_constant(centre, POINT_BASIS)).c)
+    y, one = make_constant(centre, over), np.eye(1)
     for _ in range(over.degree + 1):
-        y = y - equations.rates(y).between(inverse, one)
-        y = y.with_rest(np.zeros_like(y.r))
-    return equations.at(_proven(equations, y, inverse))
+        y = y - equations.rates(y).transform(inverse, one)
+        y = y.with_remainder(np.zeros_like(y.r))
+    return equations.fill(_prove(equations, y, inverse))
 
 
-def _newton(equations: _Equations, where: str) -> Float[np.ndarray, "b n 1"]:
+def _solve_centre(equations: _RestEquations, where: str) -> Float[np.ndarray, "b n 1"]:
     y = np.zeros((equations.count, len(equations.x), 1))
     for _ in range(NEWTON_STEPS):
-        now = constant(y, POINT)
+        current = make_constant(y, POINT_BASIS)
         try:
-            step = np.linalg.solve(equations.slopes(now).c, equations.rates(now).c)
+            step = np.linalg.solve(equations.jacobian(current).c, equations.rates(current).c)
         except np.linalg.LinAlgError:
             break
         y = y - step
@@ -114,26 +114,26 @@ def _newton(equations: _Equations, where: str) -> Float[np.ndarray, "b n 1"]:
     raise ControlError(f"plant {equations.plant.name} cannot rest at every {where} of the set")
 
 
-def _proven(equations: _Equations, y: Taylor, inverse: Float[np.ndarray, "b n n"]) -> Taylor:
-    """Return y with a rest that Krawczyk's operator maps into itself; infinite where none was found."""
-    first = equations.rates(y).between(inverse, np.eye(1)).size
+def _prove(equations: _RestEquations, y: Taylor, inverse: Float[np.ndarray, "b n n"]) -> Taylor:
+    """Return y with a remainder that Krawczyk's operator maps into itself; infinite where none is found."""
+    first = equations.rates(y).transform(inverse, np.eye(1)).size
     one = np.eye(inverse.shape[1])
-    low, rough = equations.lower(SLOPES_DEGREE), y.truncated(SLOPES_DEGREE)
-    moved, wide = first, first
+    low, rough = equations.truncate(JACOBIAN_DEGREE), y.truncate(JACOBIAN_DEGREE)
+    image, wide = first, first
     for _ in range(WIDENINGS):
-        wide = 1.2 * moved + 1e-14 * y.size + 1e-20
-        slopes = low.slopes(rough.with_rest(rough.r + wide)).between(inverse, one)
-        off = constant(np.broadcast_to(one, inverse.shape).copy(), slopes.basis) - slopes
-        moved = first + off.size @ wide
-        if np.all(moved <= wide):
+        wide = 1.2 * image + 1e-14 * y.size + 1e-20
+        slopes = low.jacobian(rough.with_remainder(rough.r + wide)).transform(inverse, one)
+        off = make_constant(np.broadcast_to(one, inverse.shape).copy(), slopes.basis) - slopes
+        image = first + off.size @ wide
+        if np.all(image <= wide):
             break
-    shown = np.all(moved <= wide, axis=1, keepdims=True)
-    return y.with_rest(np.where(shown, wide, np.inf))
+    proven = np.all(image <= wide, axis=1, keepdims=True)
+    return y.with_remainder(np.where(proven, wide, np.inf))
 
 
-def _lower(item: Entry, degree: int) -> Entry:
-    return item.truncated(degree) if isinstance(item, Taylor) else item
+def _truncate(entry: Entry, degree: int) -> Entry:
+    return entry.truncate(degree) if isinstance(entry, Taylor) else entry
 
 
-def _centre(item: Entry) -> Entry:
-    return constant(item.c, POINT) if isinstance(item, Taylor) else item
+def _take_centre(entry: Entry) -> Entry:
+    return make_constant(entry.c, POINT_BASIS) if isinstance(entry, Taylor) else entry

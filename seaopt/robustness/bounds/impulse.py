@@ -1,4 +1,4 @@
-r"""The sampled plant over boxes: numerator and denominator of its pulse transfer function as Taylor models.
+r"""Enclosures of the sampled plant over boxes: its impulse transfer function P(z), as Taylor models, for the bounds.
 
 With :math:`F = e^{A T} - I = X \varphi(X)`, :math:`X = A T`, :math:`\varphi(X) = \sum_k X^k / (k + 1)!` and
 :math:`w = z - 1`, the plant is :math:`c\,\mathrm{adj}(wI - F)\,\Gamma / \det(wI - F)`, :math:`\Gamma = T \varphi(X) b`:
@@ -18,18 +18,18 @@ from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, jacobians
 from seaopt.records import record
-from seaopt.robustness.bounds.enclosure import Entry, enclosed, halvings, matrix
-from seaopt.robustness.bounds.equilibrium import at_rest
+from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, count_halvings, enclose
+from seaopt.robustness.bounds.equilibrium import enclose_equilibrium
 from seaopt.robustness.bounds.region import Boxes, Region
-from seaopt.robustness.bounds.taylor import Taylor, basis, constant, kept, stacked
+from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_constant, mask_models, stack_models
 
 REACH, DEGREE = 0.25, 12  # of the series: 0.25^13 / 14! = 2e-19, which is enclosed too
 WORST_BASIS = 1e5  # condition of a modal basis, beyond which Schur's takes its place
-DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 3 of more
+DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 3 beyond
 
 
 @record(eq=False)
-class Pulse:
+class ImpulseTransfer:
     """P(z) = (head + tail / z) / (z^whole denominator), coefficients in ascending powers of w = z - 1.
 
     Parameters
@@ -47,8 +47,10 @@ class Pulse:
     whole: Int[np.ndarray, " b"]
 
 
-def pulse(controller: Controller, plant: Plant, nominal: ParameterSet, within: Region, boxes: Boxes) -> Pulse:
-    """Return the sampled plant, from motor force to the measured output, over boxes.
+def enclose_plant(
+    controller: Controller, plant: Plant, nominal: ParameterSet, within: Region, boxes: Boxes
+) -> ImpulseTransfer:
+    """Return the sampled plant over boxes, from motor force to the measured output.
 
     Raises
     ------
@@ -57,92 +59,97 @@ def pulse(controller: Controller, plant: Plant, nominal: ParameterSet, within: R
 
     """
     degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
-    uncertain = within.enclosed(boxes, degree)
-    count, over = boxes.centre.shape[0], basis(within.size, degree)
+    uncertain = within.enclose(boxes, degree)
+    count, over = boxes.centre.shape[0], build_basis(within.size, degree)
     p: list[Entry] = [
-        uncertain.get(name, within.fixed.get(name, value))  # a range of no width is no uncertainty, but another value
+        uncertain.get(name, within.fixed.get(name, value))  # a range of no width is another value, not an uncertainty
         for name, value in zip(plant.parameters, plant.parameter_values(nominal), strict=True)
     ]
-    at: dict[str, Entry] = {n: item for n, item in (within.fixed | uncertain).items() if n not in plant.parameters}
-    delay = at.pop(DELAY, 0.0)
-    x, u = at_rest(plant, p, at, count, over)
+    conditions: dict[str, Entry] = {
+        name: entry for name, entry in (within.fixed | uncertain).items() if name not in plant.parameters
+    }
+    delay = conditions.pop(DELAY, 0.0)
+    x, u = enclose_equilibrium(plant, p, conditions, count, over)
     n, outputs = len(plant.states), len(plant.outputs)
-    found = enclosed(jacobians(plant), [x, u, p])
+    blocks = enclose(jacobians(plant), [x, u, p])
     row = list(plant.outputs).index(controller.spec.measured)
-    a, b, c, d = (matrix(item, rows, count, over) for item, rows in zip(found, (n, n, outputs, outputs), strict=True))
+    a, b, c, d = (
+        assemble_matrix(block, rows, count, over) for block, rows in zip(blocks, (n, n, outputs, outputs), strict=True)
+    )
     gain = controller.current_per_force_A_per_N
-    return _sampled(
+    return _sample(
         a, b[:, :, :1] * gain, c[:, row : row + 1], d[:, row : row + 1, :1] * gain, controller.sample_time_s, delay
     )
 
 
-def _sampled(a: Taylor, b: Taylor, c: Taylor, d: Taylor, period: float, delay: Entry) -> Pulse:
+def _sample(a: Taylor, b: Taylor, c: Taylor, d: Taylor, period: float, delay: Entry) -> ImpulseTransfer:
+    """Return the plant behind a zero-order hold and a delay, whose part of a sample splits the command in two."""
     count, n = a.c.shape[0], a.c.shape[1]
     over = a.basis
-    left, right = _bases(a.c)
-    a, b, c = a.between(left, right), b.between(left, np.eye(1)), c.between(np.eye(1), right)
-    one = constant(np.broadcast_to(np.eye(n), a.c.shape).copy(), over)
-    x, series = _series(a * period, one)
+    left, right = _compute_bases(a.c)
+    a, b, c = a.transform(left, right), b.transform(left, np.eye(1)), c.transform(np.eye(1), right)
+    one = make_constant(np.broadcast_to(np.eye(n), a.c.shape).copy(), over)
+    x, series = _sum_series(a * period, one)
     f, gamma = x @ series, series @ b * period
-    late = delay if isinstance(delay, Taylor) else constant(np.full(count, delay), over)
+    late = delay if isinstance(delay, Taylor) else make_constant(np.full(count, delay), over)
     least = 1e-9 * period if isinstance(delay, Taylor) else 0.0
     whole = np.floor(late.c / period + 1e-9).astype(int)
-    rest = late - constant(whole * period, over)
-    split = np.any(rest.size > least)
+    fraction = late - make_constant(whole * period, over)
+    split = np.any(fraction.size > least)
     newer = gamma
     if split:
-        left_over = (period - rest)[:, None, None]
-        newer = (_series(a * left_over, one)[1] @ b) * left_over
-    denominator, (head, tail) = _polynomials(f, c, [newer, gamma - newer] if split else [newer, newer * 0.0])
+        remaining = (period - fraction)[:, None, None]
+        newer = (_sum_series(a * remaining, one)[1] @ b) * remaining
+    denominator, (head, tail) = _expand_polynomials(f, c, [newer, gamma - newer] if split else [newer, newer * 0.0])
     through = denominator * d[:, 0]
-    late_through = (rest.c > least)[:, None]  # the output is read before the command changes
-    head, tail = head + kept(through, ~late_through), tail + kept(through, late_through)
-    return Pulse(head=head, tail=tail, denominator=denominator, whole=whole)
+    late_through = (fraction.c > least)[:, None]  # the output is read before the command changes
+    head, tail = head + mask_models(through, ~late_through), tail + mask_models(through, late_through)
+    return ImpulseTransfer(head=head, tail=tail, denominator=denominator, whole=whole)
 
 
-def _series(x: Taylor, one: Taylor) -> tuple[Taylor, Taylor]:
-    """Return x and phi(x), of matrices."""
+def _sum_series(x: Taylor, one: Taylor) -> tuple[Taylor, Taylor]:
+    """Return x and phi(x), for matrices."""
     norm = np.max(np.sum(np.abs(x.c) + x.reach, axis=2), axis=1)
-    halved = halvings(norm, REACH)
-    small = x * 0.5**halved
+    halvings = count_halvings(norm, REACH)
+    small = x * 0.5**halvings
     out = one
     for k in range(DEGREE, 0, -1):
         out = one + small @ out * (1.0 / (k + 1))
-    norm = np.where(np.isfinite(norm), norm * 0.5**halved, np.inf)
+    norm = np.where(np.isfinite(norm), norm * 0.5**halvings, np.inf)
     tail = norm ** (DEGREE + 1) / float(np.prod(np.arange(1.0, DEGREE + 3))) / (1.0 - np.minimum(norm, 0.5))
-    out = out.with_rest(out.r + tail[:, None, None])
-    for _ in range(halved):
+    out = out.with_remainder(out.r + tail[:, None, None])
+    for _ in range(halvings):
         out = out @ (one + small @ out * 0.5)
         small = small * 2.0
     return x, out
 
 
-def _polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Taylor, list[Taylor]]:
+def _expand_polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Taylor, list[Taylor]]:
     """Return det(wI - f) and c adj(wI - f) drive, coefficients ascending along the last axis."""
     count, n = f.c.shape[:2]
     one = np.eye(n)
-    unit = constant(np.ones(count), f.basis)
+    unit = make_constant(np.ones(count), f.basis)
     coefficients, sensed = [unit], [c]
     term: Taylor | None = None  # M_j; the first is the identity
     for j in range(1, n + 1):
         product = f if term is None else f @ term
-        trace = _trace(product) * (-1.0 / j)
+        trace = _take_trace(product) * (-1.0 / j)
         coefficients.append(trace)
         if j < n:
             term = product + trace[:, None, None] * one
             sensed.append(c @ term)
     numerators = [
-        stacked([*((row @ drive)[:, 0, 0] for row in reversed(sensed)), constant(np.zeros(count), f.basis)])
+        stack_models([*((row @ drive)[:, 0, 0] for row in reversed(sensed)), make_constant(np.zeros(count), f.basis)])
         for drive in drives
     ]
-    return stacked(coefficients[::-1]), numerators
+    return stack_models(coefficients[::-1]), numerators
 
 
-def _trace(item: Taylor) -> Taylor:
-    return Taylor(item.basis, *(np.trace(part, axis1=-2, axis2=-1) for part in (item.a, item.r)))
+def _take_trace(model: Taylor) -> Taylor:
+    return Taylor(model.basis, *(np.trace(part, axis1=-2, axis2=-1) for part in (model.a, model.r)))
 
 
-def _bases(a: Float[np.ndarray, "b n n"]) -> tuple[Float[np.ndarray, "b n n"], Float[np.ndarray, "b n n"]]:
+def _compute_bases(a: Float[np.ndarray, "b n n"]) -> tuple[Float[np.ndarray, "b n n"], Float[np.ndarray, "b n n"]]:
     """Return the inverse and the real modal basis of every matrix, or its Schur basis where that is ill conditioned."""
     from scipy.linalg import matrix_balance, schur
 

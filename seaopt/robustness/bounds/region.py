@@ -1,8 +1,8 @@
-r"""The set over which a bound is asked for, as boxes: what of an `Uncertainty` one plant depends on.
+r"""The set of one plant that the bounds hold for, as boxes: the part of an `Uncertainty` that this plant depends on.
 
-The Gaussian part is an ellipsoid, the image :math:`p = \bar p + W y` of a ball; of the parameters that the plant has,
-it is again one, whose axes come from the singular values of their rows of W. Coordinates along it are fractions of its
-half axes, so that it is the unit ball; those of the ranges run from -1 to 1.
+The Gaussian part is an ellipsoid, the image :math:`p = \bar p + W y` of a ball. Its shadow on the parameters that the
+plant has is an ellipsoid again, whose axes come from the singular values of their rows of W. Coordinates along it are
+fractions of its half axes, so that it is the unit ball; those of the ranges run from -1 to 1.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float, Int
 from seaopt.control.loops.sampled_plant import DELAY, conditions, conditions_of
 from seaopt.plants import Plant
 from seaopt.records import record
-from seaopt.robustness.bounds.taylor import Taylor, basis, linear
-from seaopt.robustness.uncertainty.draws import SCREW_MASS, SCREW_MODE, Uncertainty, radius
+from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_linear
+from seaopt.robustness.uncertainty.draws import SCREW_MASS, SCREW_MODE, Uncertainty, confidence_radius
 
-SMALLEST = 1e-12  # half axis, as a fraction of the largest relative one, that is no uncertainty
+SMALLEST_AXIS = 1e-12  # half axis, as a fraction of the largest relative one, below which nothing is uncertain
 
 
 @record(eq=False)
@@ -26,12 +26,12 @@ class Boxes:
     centre: Float[np.ndarray, "b k"]
     radius: Float[np.ndarray, "b k"]
 
-    def rows(self, index: Int[np.ndarray, " r"] | Bool[np.ndarray, " b"] | slice) -> Boxes:
-        """Return some of them."""
+    def take(self, index: Int[np.ndarray, " r"] | Bool[np.ndarray, " b"] | slice) -> Boxes:
+        """Return the boxes at an index."""
         return Boxes(centre=self.centre[index], radius=self.radius[index])
 
-    def halves(self, axis: Int[np.ndarray, " b"]) -> Boxes:
-        """Return the lower halves, each along an axis of its own, then the upper ones."""
+    def halve(self, axis: Int[np.ndarray, " b"]) -> Boxes:
+        """Return the lower halves, each box cut along its own axis, then the upper halves."""
         step = np.zeros_like(self.radius)
         rows = np.arange(axis.size)
         step[rows, axis] = 0.5 * self.radius[rows, axis]
@@ -41,7 +41,7 @@ class Boxes:
 
 @record(eq=False)
 class Region:
-    """The set of one plant.
+    """The set of plants that differ in what is uncertain.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Region:
     low, high
         Physical bounds of those of the Gaussian part, infinite for the others, shape (n,).
     ball : int
-        The first so many coordinates lie in a unit ball, the others between -1 and 1.
+        This many coordinates, the first ones, lie in a unit ball, the others between -1 and 1.
     fixed : mapping of name to value
         Conditions that are not uncertain.
 
@@ -71,11 +71,11 @@ class Region:
         """Number of coordinates."""
         return self.slopes.shape[1]
 
-    def whole(self, sample_time_s: float) -> Boxes:
-        """Return boxes that cover the set, none with a whole number of samples of delay inside it.
+    def cover(self, sample_time_s: float) -> Boxes:
+        """Return boxes that cover the set, none of which has a whole number of samples of delay in its interior.
 
-        Where the output has a part that follows the command at once, the sampled plant jumps there, so that each such
-        delay is also a box of its own, of no width.
+        Where the output has a part that follows the command at once, the sampled plant jumps at such a delay, so that
+        each of them is also a box of its own, of no width.
         """
         size = self.size
         boxes = Boxes(centre=np.zeros((1, size)), radius=np.ones((1, size)))
@@ -94,7 +94,7 @@ class Region:
         return self.cut(Boxes(centre=centre, radius=radius))[0]
 
     def cut(self, boxes: Boxes) -> tuple[Boxes, Bool[np.ndarray, " b"]]:
-        """Return the boxes without what lies beyond a physical bound, those that are left, and which these are."""
+        """Return the boxes cut at the physical bounds, without those outside the set, and which boxes these are."""
         low, high = boxes.centre - boxes.radius, boxes.centre + boxes.radius
         for sign, bound in ((1.0, self.low), (-1.0, -self.high)):
             for row in np.flatnonzero(np.isfinite(bound)):
@@ -109,23 +109,23 @@ class Region:
         kept = np.all(low <= high, axis=1) & (np.sum(nearest**2, axis=1) <= 1.0)
         return Boxes(centre=0.5 * (low + high)[kept], radius=0.5 * (high - low)[kept]), kept
 
-    def enclosed(self, boxes: Boxes, degree: int) -> dict[str, Taylor]:
+    def enclose(self, boxes: Boxes, degree: int) -> dict[str, Taylor]:
         """Return the uncertain parameters and conditions over the boxes, as models of a degree."""
-        over = basis(self.size, degree)
-        centre, slopes = self.at(boxes.centre), self.slopes[:, None] * boxes.radius
-        return {name: linear(centre[name], slopes[row].T, over) for row, name in enumerate(self.names)}
+        over = build_basis(self.size, degree)
+        centre, slopes = self.evaluate(boxes.centre), self.slopes[:, None] * boxes.radius
+        return {name: make_linear(centre[name], slopes[row].T, over) for row, name in enumerate(self.names)}
 
-    def at(self, points: Float[np.ndarray, "b k"]) -> dict[str, Float[np.ndarray, " b"]]:
+    def evaluate(self, points: Float[np.ndarray, "b k"]) -> dict[str, Float[np.ndarray, " b"]]:
         """Return the uncertain parameters and conditions at points."""
         return dict(zip(self.names, (self.centre + points @ self.slopes.T).T, strict=True))
 
-    def into(self, points: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b k"]:
-        """Return points, those outside the ball or the box moved onto its edge."""
+    def project(self, points: Float[np.ndarray, "b k"]) -> Float[np.ndarray, "b k"]:
+        """Return the points, with those outside the ball or the box moved onto its edge."""
         inner = points[:, : self.ball]
         size = np.linalg.norm(inner, axis=1, keepdims=True)
         return np.hstack([inner / np.maximum(size, 1.0), np.clip(points[:, self.ball :], -1.0, 1.0)])
 
-    def inside(self, points: Float[np.ndarray, "b k"]) -> Bool[np.ndarray, " b"]:
+    def contains(self, points: Float[np.ndarray, "b k"]) -> Bool[np.ndarray, " b"]:
         """Tell which points are in the set."""
         values = self.centre + points @ self.slopes.T
         edge = 1.0 + 1e-12
@@ -133,27 +133,27 @@ class Region:
         return near & np.all((values >= self.low) & (values <= self.high), axis=1)
 
 
-def region(plant: Plant, unknown: Uncertainty) -> Region:
-    """Return the set over which a plant is uncertain."""
+def build_region(plant: Plant, unknown: Uncertainty) -> Region:
+    """Return the set of what is uncertain of one plant."""
     extra = conditions((plant,))
     taken = {SCREW_MASS} if SCREW_MODE in unknown.ranges else set[str]()
     gaussian = [k for k, name in enumerate(unknown.names) if name in plant.parameters and name not in taken]
     names = [unknown.names[k] for k in gaussian]
-    rows = unknown.factor()[gaussian] * radius(len(unknown.names))
+    rows = unknown.factor()[gaussian] * confidence_radius(len(unknown.names))
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     left, axes, _ = np.linalg.svd(rows / np.where(size > 0.0, size, 1.0), full_matrices=False)
-    kept = axes > SMALLEST
-    axes = (left * axes)[:, kept] * size
+    uncertain = axes > SMALLEST_AXIS
+    half_axes = (left * axes)[:, uncertain] * size
     ends = {
-        (SCREW_MASS if name == SCREW_MODE else name): _ends(unknown, name, pair)
+        (SCREW_MASS if name == SCREW_MODE else name): _convert_range(unknown, name, pair)
         for name, pair in unknown.ranges.items()
     }
     ends = {name: pair for name, pair in ends.items() if name in plant.parameters or name in extra}
-    given = {name: pair[0] for name, pair in ends.items() if pair[0] == pair[1]}
-    wide = {name: pair for name, pair in ends.items() if name not in given}
-    count, ball = len(names), axes.shape[1]
+    pinned = {name: pair[0] for name, pair in ends.items() if pair[0] == pair[1]}
+    wide = {name: pair for name, pair in ends.items() if name not in pinned}
+    count, ball = len(names), half_axes.shape[1]
     slopes = np.zeros((count + len(wide), ball + len(wide)))
-    slopes[:count, :ball] = axes
+    slopes[:count, :ball] = half_axes
     slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
     middle = [0.5 * (low + high) for low, high in wide.values()]
     nominal = {name: value for name, value in conditions_of(plant, unknown.nominal).items() if name not in ends}
@@ -161,12 +161,12 @@ def region(plant: Plant, unknown: Uncertainty) -> Region:
         names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
         slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
         high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float), ball=ball,
-        fixed=given | nominal,
+        fixed=pinned | nominal,
     )  # fmt: skip
 
 
-def _ends(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[float, float]:
-    """Return a range; of the screw's mode, that of the masses which put it there."""
+def _convert_range(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[float, float]:
+    """Return a range of numbers; for the screw's mode, the range of masses that put it there."""
     if name != SCREW_MODE:
         return float(pair[0]), float(pair[1])
     ends = np.interp(np.array(pair), unknown.screw[0], unknown.screw[1])

@@ -21,7 +21,7 @@ from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.nominal import PlantMargins, plant_margins
 from seaopt.robustness.certificate.simulated import Simulated, simulated
 from seaopt.robustness.uncertainty.draws import Varied
-from seaopt.robustness.uncertainty.worst import Worst, witnessed
+from seaopt.robustness.uncertainty.worst import Worst, measure_worst
 from seaopt.robustness.verification.verification import witness
 
 SCHEMA = "seaopt/robustness/1"
@@ -187,7 +187,7 @@ class Certificate:
         try:
             models = {name: models[name] for name in content["plants"]}
             worst = {
-                name: witnessed(controller, models[name], parameters, item["worst"]["parameters"])
+                name: measure_worst(controller, models[name], parameters, item["worst"]["parameters"])
                 for name, item in content["plants"].items()
             }
             requirements = tuple(Requirement(**_infinite(item)) for item in content["requirements"])

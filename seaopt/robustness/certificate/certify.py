@@ -26,9 +26,9 @@ from seaopt.robustness.certificate.certificate import DESIGN_NAMES, Certificate,
 from seaopt.robustness.certificate.nominal import plant_margins
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, uncertainty
+from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
 from seaopt.robustness.uncertainty.severity import limits, severities
-from seaopt.robustness.uncertainty.worst import ROUNDING, find_worst, witnessed
+from seaopt.robustness.uncertainty.worst import ROUNDING, find_worst, measure_worst
 
 CONFIDENCE = 1.0 - 1e-6
 BLOCK = 50_000
@@ -137,7 +137,7 @@ def certify(
     """
     _check(controller, plants, samples, seed, confidence, max_failure_probability)
     plants, others = _with_design(controller, plants, others or ParameterSet())
-    unknown = uncertainty(parameters, others, ranges or {}, plants)
+    unknown = combine_uncertainty(parameters, others, ranges or {}, plants)
     _check_delay(controller, unknown.ranges)
     nominal = unknown.nominal
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
@@ -153,7 +153,7 @@ def certify(
         brackets = {name: bracket(controller, plant, unknown, worst[name], bounds) for name, plant in plants.items()}
     for name, item in brackets.items():
         if item.parameters:
-            worst[name] = witnessed(controller, plants[name], nominal, item.parameters)
+            worst[name] = measure_worst(controller, plants[name], nominal, item.parameters)
     monte_carlo = MonteCarlo(
         samples=samples, failures=failures.count, seed=seed, confidence=confidence,
         failure_probability_bound=failure_bound(samples, failures.count, confidence),

@@ -9,7 +9,7 @@ from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
-from seaopt.robustness.uncertainty.delay_margin import LONGEST, sampled_delay_margin
+from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 
 SEARCHED = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 
@@ -66,6 +66,6 @@ def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) ->
     assert controller.design is not None
     gap, gap_hz = nu_gap(controller.close(*controller.design), loop)
     period = controller.sample_time_s
-    reach = min(SEARCHED * ((found.delay_s or 0.0) + 2 * period), LONGEST * period)
+    reach = min(SEARCHED * ((found.delay_s or 0.0) + 2 * period), LONGEST_DELAY * period)
     exact = sampled_delay_margin(controller, plant, params, reach) if found.disks else 0.0
     return PlantMargins(margins=found, sampled_delay_s=exact, searched_delay_s=reach, nu_gap=gap, nu_gap_hz=gap_hz)

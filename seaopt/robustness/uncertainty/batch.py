@@ -1,11 +1,11 @@
-r"""Many plants at once: closed-loop eigenvalues and peaks of S and T for every draw, vectorised.
+r"""Closed-loop eigenvalues and peaks of S and T of many plants at once, for Monte Carlo and the worst-case searches.
 
 With the eigenvalues :math:`o_i` of the open loop (plant, delay, controller) and :math:`c_i` of the closed one,
 
 .. math:: S(z) = \frac{1}{1 + d\, d_c} \prod_i \frac{z - o_i}{z - c_i}, \qquad T = 1 - S,
 
 so that no linear system is solved at any frequency and the derivatives along the circle are sums of simple fractions.
-Every draw's grid has points of its own about the poles of its loop. About a peak :math:`1/|S|^2` is close to a
+Every draw has its own grid, with points about the poles of its loop. About a peak :math:`1/|S|^2` is close to a
 parabola in the angle: Newton's method on its derivative, kept between the neighbouring grid points, ends at rounding.
 """
 
@@ -25,17 +25,17 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 
-BLOCK = 8192  # draws linearised at once: bounds the memory
-CHUNK = 512  # draws whose curves are evaluated at once: bounds the cache
-BASE = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 60)])
+DRAW_BLOCK = 8192  # draws linearised at once: bounds the memory
+CURVE_BLOCK = 512  # draws whose curves are evaluated at once: bounds the cache
+BASE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 60)])
 FAN = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # about a pole, in distances of it from the circle
 MAXIMA = 3  # local maxima refined
 NEWTON_STEPS = 40
 
 NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
 
-Progress = Callable[[int], None]
-Peak = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+CountProgress = Callable[[int], None]
+Peaks = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 
 
 @record(eq=False)
@@ -52,7 +52,7 @@ class BatchFigures:
 
 def batch_figures(
     controller: Controller, plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]],
-    progress: Progress | None = None, threads: int = 2, peaks: bool = True,
+    progress: CountProgress | None = None, threads: int = 2, peaks: bool = True,
 ) -> BatchFigures:  # fmt: skip
     """Close `controller` around `plant` at every draw.
 
@@ -63,45 +63,45 @@ def batch_figures(
     plant, nominal
         The plant, and the values of what is not drawn.
     draws : mapping of name to array, shape (n,)
-        Parameters of the plant and conditions (`seaopt.control.loops.sampled_plant`); the others are left
-        out.
+        Parameters of the plant and conditions (`seaopt.control.loops.sampled_plant`); other names are ignored.
     progress : callable, optional
-        Called with the number of draws done, now and then.
+        Called with the number of draws done, after each block.
     threads : int
-        Blocks of draws worked on at once.
+        Blocks of draws computed at once.
     peaks : bool
         Whether Ms and Mt are wanted; if not, they are nan where stable.
 
     """
-    values, extra = columns(plant, nominal, draws)
+    values, extra = expand_draws(plant, nominal, draws)
     count = values.shape[1]
     chain = float(np.max(extra.get(DELAY, np.zeros(1))))
     parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
     with ThreadPoolExecutor(threads) as pool:
-        for start in range(0, count, BLOCK):
-            own = slice(start, min(start + BLOCK, count))
-            at = {name: item[own] for name, item in extra.items()}
-            late = at.get(DELAY, np.zeros(own.stop - own.start)) if chain else np.zeros(own.stop - own.start)
+        for start in range(0, count, DRAW_BLOCK):
+            block = slice(start, min(start + DRAW_BLOCK, count))
+            at = {name: column[block] for name, column in extra.items()}
+            none = np.zeros(block.stop - block.start)
+            delays = at.get(DELAY, none) if chain else none
             continuous = linearised(
-                plant, values[:, own], at, controller.spec.measured, controller.current_per_force_A_per_N
+                plant, values[:, block], at, controller.spec.measured, controller.current_per_force_A_per_N
             )
-            pieces = [slice(k, k + CHUNK) for k in range(0, own.stop - own.start, CHUNK)]
+            pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, none.size, CURVE_BLOCK)]
             parts += pool.map(
-                lambda piece, given=continuous, delay=late: _chunk(
-                    controller, tuple(item[piece] for item in given), delay[piece], peaks
+                lambda piece, matrices=continuous, delay=delays: _close_piece(
+                    controller, tuple(matrix[piece] for matrix in matrices), delay[piece], peaks
                 ),
                 pieces,
             )
             if progress is not None:
-                progress(own.stop)
-    radius, ms, mt = (np.concatenate(items) for items in zip(*parts, strict=True))
+                progress(block.stop)
+    radius, ms, mt = (np.concatenate(column) for column in zip(*parts, strict=True))
     return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
 
 
-def columns(
+def expand_draws(
     plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]]
 ) -> tuple[Float[np.ndarray, "np n"], dict[str, Float[np.ndarray, " n"]]]:
-    """Return a plant's parameters, one column a draw, and its conditions."""
+    """Return a plant's parameters, one column per draw, and its conditions."""
     count = len(next(iter(draws.values()))) if draws else 1
     values = np.repeat(np.array(plant.parameter_values(nominal))[:, None], count, axis=1)
     for row, name in enumerate(plant.parameters):
@@ -118,14 +118,14 @@ def columns(
 
 @record(eq=False)
 class Products:
-    """S of every draw as a product over poles, open and closed."""
+    """S of every draw as a product over poles of the open and the closed loop."""
 
     opened: Complex[np.ndarray, "n k"]
     closed: Complex[np.ndarray, "n k"]
     scale: Float[np.ndarray, " n"]
 
     def sensitivity(self, z: Complex[np.ndarray, "n m"]) -> Complex[np.ndarray, "n m"]:
-        """Return S at points of each row's own."""
+        """Return S of each row at that row's points."""
         above, below = np.ones_like(z), np.ones_like(z)
         for k in range(self.opened.shape[1]):
             above *= z - self.opened[:, k, None]
@@ -143,33 +143,34 @@ class Products:
             second += below**2 - above**2
         return first, second
 
-    def rows(self, index: Int[np.ndarray, " r"]) -> Products:
-        """Return the loops of some rows."""
+    def take(self, index: Int[np.ndarray, " r"]) -> Products:
+        """Return the loops at an index."""
         return Products(opened=self.opened[index], closed=self.closed[index], scale=self.scale[index])
 
 
-def _chunk(
+def _close_piece(
     controller: Controller, continuous: Linear, delay: Float[np.ndarray, " k"], peaks: bool
 ) -> tuple[Float[np.ndarray, " k"], ...]:
+    """Return spectral radius, Ms and Mt of some draws."""
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
     count = d.size
     whole = np.concatenate([a.reshape(count, -1), b, c, d[:, None]], axis=1)
     finite = np.max(np.abs(whole), axis=1) < LARGEST  # not so of nan
-    a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (item.ndim - 1)), item, 0.0) for item in (a, b, c, d))
-    products = closed_products(controller, a, b, c, d)
-    radius = np.where(finite, np.max(np.abs(products.closed), axis=1), np.inf)
+    a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (m.ndim - 1)), m, 0.0) for m in (a, b, c, d))
+    loops = compute_products(controller, a, b, c, d)
+    radius = np.where(finite, np.max(np.abs(loops.closed), axis=1), np.inf)
     ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
     stable = np.flatnonzero(radius < STABLE)
     if stable.size:
-        (ms[stable], _), (mt[stable], _) = find_peaks(products.rows(stable)) if peaks else NO_PEAKS
+        (ms[stable], _), (mt[stable], _) = find_peaks(loops.take(stable)) if peaks else NO_PEAKS
     return radius, ms, mt
 
 
-def closed_products(
+def compute_products(
     controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n x"],
     d: Float[np.ndarray, " n"],
 ) -> Products:  # fmt: skip
-    """Return the eigenvalues of the open and of the closed loop."""
+    """Return S of every plant behind its hold, from the eigenvalues of the open and of the closed loop."""
     ac, bc, cc, dc = law_state_space(controller.reference, controller.measurement)
     count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
     n, m = nx + k, cc.size
@@ -194,19 +195,19 @@ def closed_products(
     return Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
 
 
-def find_peaks(loop: Products) -> tuple[Peak, Peak]:
-    """Return the largest abs(S) and abs(T) of every row, and at which angles they are."""
+def find_peaks(loop: Products) -> tuple[Peaks, Peaks]:
+    """Return the largest abs(S) and abs(T) of every row, each with its angle."""
     angle, distance = np.abs(np.angle(loop.closed)), np.abs(1.0 - np.abs(loop.closed))
-    own = (angle[:, :, None] + distance[:, :, None] * FAN).reshape(angle.shape[0], -1)
-    base = np.broadcast_to(BASE, (angle.shape[0], BASE.size))
-    theta = np.sort(np.clip(np.concatenate([base, own], axis=1), 0.0, np.pi), axis=1)
+    near_poles = (angle[:, :, None] + distance[:, :, None] * FAN).reshape(angle.shape[0], -1)
+    base = np.broadcast_to(BASE_ANGLES, (angle.shape[0], BASE_ANGLES.size))
+    theta = np.sort(np.clip(np.concatenate([base, near_poles], axis=1), 0.0, np.pi), axis=1)
     s = loop.sensitivity(np.exp(1j * theta))
-    return _highest(loop, theta, np.abs(s), False), _highest(loop, theta, np.abs(1.0 - s), True)
+    return _find_highest(loop, theta, np.abs(s), False), _find_highest(loop, theta, np.abs(1.0 - s), True)
 
 
-def _highest(
+def _find_highest(
     loop: Products, theta: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n m"], complement: bool
-) -> Peak:
+) -> Peaks:
     """Return the largest value of each row and its angle: the highest local maxima of its grid, by Newton's method."""
     rows = np.arange(theta.shape[0])
     at = np.argmax(values, axis=1)
@@ -218,39 +219,39 @@ def _highest(
         worth = np.flatnonzero(local[rows, at] > 0.5 * top)
         if not worth.size:
             break
-        # Of a plateau or of doubled points, the neighbours are the same maximum.
+        # Neighbours on a plateau, or at doubled points, are the same maximum.
         for near in (at - 1, at, at + 1):
             local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
-        own, point = loop.rows(worth), at[worth] + 1
-        low, high = _around(theta[worth], point)
-        found, angle = _refined(own, low, theta[worth, point], high, complement)
-        higher = found > top[worth]
-        top[worth[higher]], where[worth[higher]] = found[higher], angle[higher]
+        point = at[worth] + 1
+        low, high = _find_neighbours(theta[worth], point)
+        peak, angle = _refine_peaks(loop.take(worth), low, theta[worth, point], high, complement)
+        higher = peak > top[worth]
+        top[worth[higher]], where[worth[higher]] = peak[higher], angle[higher]
     return top, where
 
 
-def _around(
+def _find_neighbours(
     theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the neighbours of a grid point that do not coincide with it."""
     rows, last = np.arange(point.size), theta.shape[1] - 1
-    here = theta[rows, point]
-    low = np.max(np.where(theta < here[:, None] - 1e-14, theta, 0.0), axis=1)
-    high = np.min(np.where(theta > here[:, None] + 1e-14, theta, np.pi), axis=1)
-    return low, np.where(point < last, high, here)
+    centre = theta[rows, point]
+    low = np.max(np.where(theta < centre[:, None] - 1e-14, theta, 0.0), axis=1)
+    high = np.min(np.where(theta > centre[:, None] + 1e-14, theta, np.pi), axis=1)
+    return low, np.where(point < last, high, centre)
 
 
-def _refined(
+def _refine_peaks(
     loop: Products, low: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"],
     complement: bool,
-) -> Peak:  # fmt: skip
+) -> Peaks:  # fmt: skip
     """Return the curve's value at its maximum between `low` and `high`, and the angle."""
     best, where = np.zeros(x.size), x.copy()
     live = np.arange(x.size)
     low, x, high = low.copy(), x.copy(), high.copy()
     small = 1e-6 * (high - low)
     for _ in range(NEWTON_STEPS):
-        value, g, slope = _slopes(loop.rows(live), x[live], complement)
+        value, g, slope = _differentiate(loop.take(live), x[live], complement)
         higher = value > best[live]
         best[live[higher]], where[live[higher]] = value[higher], x[live[higher]]
         low[live] = np.where(g > 0.0, x[live], low[live])
@@ -269,7 +270,7 @@ def _refined(
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
-def _slopes(
+def _differentiate(
     loop: Products, x: Float[np.ndarray, " n"], complement: bool
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""

@@ -1,4 +1,6 @@
-r"""The smallest extra delay that makes a sampled loop unstable, with the plant sampled with that delay in it.
+r"""The delay margin of a sampled loop, for its margins: the smallest extra delay that makes it unstable.
+
+The plant is sampled with that delay in it.
 
 A delay of :math:`(w + r) T_s`, :math:`0 \le r \le 1`, makes the loop gain :math:`L_r(z) z^{-w}`: the hold's response
 changes with r, whole samples only turn the phase. With the crossovers :math:`\theta_j` of :math:`L_r`, where
@@ -34,22 +36,22 @@ from seaopt.records import record
 from seaopt.units import factor
 
 CELLS = 16  # of a sample
-FINEST = 1e-4  # of a sample: narrower, a crossover that comes and goes is not looked for
-BISECTIONS = 40
-LONGEST = 20_000  # samples: beyond, a delay is no longer one of the loop that was modelled
-TURN = 2.0 * np.pi
+NARROWEST_CELL = 1e-4  # of a sample: a crossover that comes and goes within less is not looked for
+DELAY_BISECTIONS = 40
+LONGEST_DELAY = 20_000  # samples: beyond, a delay is no longer one of the loop that was modelled
+FULL_TURN = 2.0 * np.pi
 
 
 @record(eq=False)
-class _Late:
-    """A loop whose plant is late by a part r of a sample, and what decides on every further whole sample.
+class _DelayedLoop:
+    """A loop whose plant is delayed by a part r of a sample, and what decides on every further whole sample.
 
     Parameters
     ----------
     part : float
         r.
     angles, phases
-        Crossovers, ascending, and the phase left to -1.
+        Crossovers, ascending, and the phase that is left to -1 at each.
     outside : int
         Closed-loop poles not inside the circle.
     loud : bool
@@ -69,22 +71,22 @@ class _Late:
         last = self.angles.size - 1 + int(self.loud)
         return 1 - 2 * ((last - np.arange(self.angles.size)) % 2)
 
-    def like(self, other: _Late) -> bool:
-        """Tell whether the crossovers are the other's, moved."""
+    def matches(self, other: _DelayedLoop) -> bool:
+        """Return whether the crossovers are those of the other, moved."""
         return self.angles.size == other.angles.size and self.loud == other.loud
 
-    def unstable(self, samples: Int[np.ndarray, " w"]) -> Int[np.ndarray, " w"]:
-        """Return how many closed-loop poles are outside with as many further samples."""
-        return self.outside + 2 * (self.passes(samples, self.phases) + 1) @ self.falling + samples * self.loud
+    def count_unstable(self, samples: Int[np.ndarray, " w"]) -> Int[np.ndarray, " w"]:
+        """Return the number of closed-loop poles outside the circle with so many further samples."""
+        return self.outside + 2 * (self.count_passes(samples, self.phases) + 1) @ self.falling + samples * self.loud
 
-    def passes(self, samples: Int[np.ndarray, " w"], phases: Float[np.ndarray, " k"]) -> Int[np.ndarray, "w k"]:
-        """Return how often each crossover has been through -1."""
-        return np.floor((samples[:, None] * self.angles - phases) / TURN).astype(int)
+    def count_passes(self, samples: Int[np.ndarray, " w"], phases: Float[np.ndarray, " k"]) -> Int[np.ndarray, "w k"]:
+        """Return how often each crossover has passed -1."""
+        return np.floor((samples[:, None] * self.angles - phases) / FULL_TURN).astype(int)
 
-    def followed(self, start: _Late) -> Float[np.ndarray, " k"]:
-        """Return the phases as they go on from another's, by less than half a turn."""
+    def follow_phases(self, start: _DelayedLoop) -> Float[np.ndarray, " k"]:
+        """Return the phases continued from those of another loop, by less than half a turn."""
         step = self.phases - start.phases
-        return start.phases + step - TURN * np.round(step / TURN)
+        return start.phases + step - FULL_TURN * np.round(step / FULL_TURN)
 
 
 def sampled_delay_margin(controller: Controller, plant: Plant, params: ParameterSet, reach_s: float) -> float | None:
@@ -95,12 +97,12 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     controller, plant, params
         A loop that is stable; a delay among `params` stays in it.
     reach_s : float
-        How far to look, seconds.
+        The largest delay to try, seconds.
 
     Returns
     -------
     float or None
-        Seconds, zero for an unstable loop; None if no delay up to `reach_s` does.
+        Seconds, zero for an unstable loop; None if no delay up to `reach_s` makes it unstable.
 
     Examples
     --------
@@ -113,78 +115,83 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     """
     period = controller.sample_time_s
 
-    def late(part: float) -> _Late:
-        return _late(controller, plant, params, part)
+    def delay_loop(part: float) -> _DelayedLoop:
+        return _delay_loop(controller, plant, params, part)
 
-    grid = _followable(late)
+    grid = _build_grid(delay_loop)
     samples = np.arange(int(np.ceil(reach_s / period)) + 1)
-    outside = np.array([item.unstable(samples) for item in grid])
+    outside = np.array([loop.count_unstable(samples) for loop in grid])
     if outside[0, 0]:
         return 0.0
-    stepping = np.array([_steps(a, b, samples) for a, b in pairwise(grid)])
+    stepping = np.array([_find_steps(a, b, samples) for a, b in pairwise(grid)])
     events = (outside[:-1] > 0) | (outside[1:] > 0) | stepping
     for w, cell in zip(*np.nonzero(events.T), strict=True):
-        found = _first(late, grid[cell], grid[cell + 1], int(w))
-        if found is not None:
-            delay = (w + found) * period
+        part = _find_first(delay_loop, grid[cell], grid[cell + 1], int(w))
+        if part is not None:
+            delay = (w + part) * period
             return float(delay) if delay <= reach_s else None
     return None
 
 
-def _late(controller: Controller, plant: Plant, params: ParameterSet, part: float) -> _Late:
+def _delay_loop(controller: Controller, plant: Plant, params: ParameterSet, part: float) -> _DelayedLoop:
     before = params[DELAY].value * factor(params[DELAY].unit, "s") if DELAY in params else 0.0
     delay = Parameter(name=DELAY, value=before + part * controller.sample_time_s, unit="s")
     system = controller.close(plant, params.with_parameters(delay)).system()
     angles, phases = crossovers(system)
     nyquist = system.curves(np.array([np.pi]))[0, 0]
-    return _Late(
-        part=part, angles=angles, phases=np.mod(phases, TURN), loud=bool(nyquist.real < 0.5),
+    return _DelayedLoop(
+        part=part, angles=angles, phases=np.mod(phases, FULL_TURN), loud=bool(nyquist.real < 0.5),
         outside=int(np.sum(~(np.abs(system.poles) < STABLE))),
     )  # fmt: skip
 
 
-def _followable(late: Callable[[float], _Late]) -> list[_Late]:
-    """Return loops from no part of a sample to a whole one, between neighbours of which crossovers can be followed."""
-    grid = [late(float(part)) for part in np.linspace(0.0, 1.0, CELLS + 1)]
+def _build_grid(delay_loop: Callable[[float], _DelayedLoop]) -> list[_DelayedLoop]:
+    """Return loops from no part of a sample to a whole one, fine enough to follow every crossover."""
+    grid = [delay_loop(float(part)) for part in np.linspace(0.0, 1.0, CELLS + 1)]
     cell = 0
     while cell < len(grid) - 1:
         first, second = grid[cell], grid[cell + 1]
-        if first.like(second) or second.part - first.part < FINEST:
+        if first.matches(second) or second.part - first.part < NARROWEST_CELL:
             cell += 1
         else:
-            grid.insert(cell + 1, late(0.5 * (first.part + second.part)))
+            grid.insert(cell + 1, delay_loop(0.5 * (first.part + second.part)))
     return grid
 
 
-def _steps(first: _Late, second: _Late, samples: Int[np.ndarray, " w"]) -> Bool[np.ndarray, " w"]:
-    """Tell with how many whole samples a crossover passes -1 between two neighbours."""
-    if not first.like(second):
+def _find_steps(first: _DelayedLoop, second: _DelayedLoop, samples: Int[np.ndarray, " w"]) -> Bool[np.ndarray, " w"]:
+    """Return with which numbers of whole samples a crossover passes -1 between two neighbours."""
+    if not first.matches(second):
         return np.zeros(samples.size, dtype=bool)
-    return np.any(first.passes(samples, first.phases) != second.passes(samples, second.followed(first)), axis=1)
+    passed = second.count_passes(samples, second.follow_phases(first))
+    return np.any(first.count_passes(samples, first.phases) != passed, axis=1)
 
 
-def _first(late: Callable[[float], _Late], low: _Late, high: _Late, w: int) -> float | None:
-    """Return where between two neighbours the loop with w further samples ceases to be stable; None if it does not."""
+def _find_first(
+    delay_loop: Callable[[float], _DelayedLoop], low: _DelayedLoop, high: _DelayedLoop, w: int
+) -> float | None:
+    """Return where between two neighbours the loop with w further samples becomes unstable; None if it does not."""
     samples = np.array([w])
-    if low.unstable(samples)[0]:
+    if low.count_unstable(samples)[0]:
         return low.part
 
-    def bisected(beyond: Callable[[_Late], bool]) -> float:
+    def bisect(beyond: Callable[[_DelayedLoop], bool]) -> float:
         start, end = low.part, high.part
-        for _ in range(BISECTIONS):
+        for _ in range(DELAY_BISECTIONS):
             middle = 0.5 * (start + end)
-            start, end = (start, middle) if beyond(late(middle)) else (middle, end)
+            start, end = (start, middle) if beyond(delay_loop(middle)) else (middle, end)
         return end
 
     ends = [high.part]
-    if low.like(high):
-        before, after = low.passes(samples, low.phases)[0], high.passes(samples, high.followed(low))[0]
-        ends = [
-            bisected(lambda at, j=j: at.like(low) and at.passes(samples, at.followed(low))[0, j] != before[j])
-            for j in np.flatnonzero(before != after)
-        ]
+    if low.matches(high):
+        before = low.count_passes(samples, low.phases)[0]
+        after = high.count_passes(samples, high.follow_phases(low))[0]
+
+        def has_passed(loop: _DelayedLoop, j: int) -> bool:
+            return loop.matches(low) and bool(loop.count_passes(samples, loop.follow_phases(low))[0, j] != before[j])
+
+        ends = [bisect(lambda loop, j=j: has_passed(loop, j)) for j in map(int, np.flatnonzero(before != after))]
         ends = [*sorted(ends), high.part]
     for end, following in pairwise(ends):
-        if late(0.5 * (end + following)).unstable(samples)[0]:
+        if delay_loop(0.5 * (end + following)).count_unstable(samples)[0]:
             return end
-    return bisected(lambda at: bool(at.unstable(samples)[0])) if high.unstable(samples)[0] else None
+    return bisect(lambda loop: bool(loop.count_unstable(samples)[0])) if high.count_unstable(samples)[0] else None

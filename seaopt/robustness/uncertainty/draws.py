@@ -1,4 +1,4 @@
-"""Parameter draws: the fit's joint distribution, truncated to the bounds, and the declared ranges.
+"""What is uncertain of the parameters, and draws of it: the fit's joint distribution and the declared ranges.
 
 A range may name a parameter of a plant, a condition (`seaopt.control.loops.sampled_plant`: an angle such as phi,
 delay_s), or ``screw_mode_hz``: the frequency of the screw's mode, which its effective mass m_n sets, all else being
@@ -23,13 +23,13 @@ from seaopt.records import record
 from seaopt.units import factor
 
 MAX_REJECTION = 200
-LEVEL = 0.999  # of the fit's distribution that the worst case is looked for in
+LEVEL = 0.999  # probability of the part of the fit's distribution in which the worst case is searched
 SCREW_MODE, SCREW_MASS = "screw_mode_hz", "m_n"
 
 
 @record
 class Varied:
-    """One thing that is drawn, SI.
+    """One quantity that is drawn, in SI units.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Varied:
     value : float or None
         Nominal; None where there is none (`screw_mode_hz`).
     std : float or None
-        Of a Gaussian, correlated as in the fit and cut at `low` and `high`; None of a uniform range.
+        Of a Gaussian, correlated as in the fit and cut at `low` and `high`; None for a uniform range.
     low, high : float
 
     """
@@ -63,20 +63,20 @@ class Varied:
 
 @record(eq=False)
 class Uncertainty:
-    """What is not known of the parameters.
+    """What is uncertain of the parameters.
 
     Parameters
     ----------
     nominal : ParameterSet
         Fitted or given values, with bounds.
     names : tuple of str
-        The uncertain ones of the Gaussian part, with `covariance`, shape (n, n).
+        The uncertain parameters of the Gaussian part, with `covariance`, shape (n, n).
     ranges : mapping of name to (low, high)
         Uniform, independent of the rest.
     screw : (frequencies, masses)
-        Which effective mass m_n puts the screw's mode where, ascending in frequency; for a range of screw_mode_hz.
+        Effective masses m_n that put the screw's mode at the frequencies, which ascend; for a range of screw_mode_hz.
     absent : mapping of name to Parameter
-        What a range may name that `nominal` has no value of: the plants' defaults, and conditions.
+        What a range may name and `nominal` has no value of: the plants' defaults, and conditions.
 
     """
 
@@ -95,22 +95,20 @@ class Uncertainty:
     def varied(self) -> tuple[Varied, ...]:
         """Return what is drawn and how, the Gaussian part first."""
         stds, known = np.sqrt(np.diag(self.covariance)), {**self.absent, **self.nominal}
-        found = [
-            Varied(name=name, unit=item.unit, value=item.value, std=float(std), low=item.min, high=item.max)
-            for name, std in zip(self.names, stds, strict=True)
-            for item in (self.nominal[name],)
-        ]
+        varied: list[Varied] = []
+        for name, std in zip(self.names, stds, strict=True):
+            p = self.nominal[name]
+            varied.append(Varied(name=name, unit=p.unit, value=p.value, std=float(std), low=p.min, high=p.max))
         for name, (low, high) in self.ranges.items():
-            item = known.get(name)
-            unit, value = ("Hz", None) if item is None else (item.unit, item.value)
-            found.append(Varied(name=name, unit=unit, value=value, std=None, low=low, high=high))
-        return tuple(found)
+            unit, value = (known[name].unit, known[name].value) if name in known else ("Hz", None)
+            varied.append(Varied(name=name, unit=unit, value=value, std=None, low=low, high=high))
+        return tuple(varied)
 
     def draw(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n k"]:
         """Return `count` draws as coordinates; Gaussian draws outside a bound are drawn again.
 
-        A coordinate of the Gaussian part is in standard deviations along a principal axis of the correlation; one of a
-        range runs from -1 to 1.
+        Coordinates of the Gaussian part are standard deviations along the principal axes of the correlation; those of
+        the ranges run from -1 to 1.
 
         Raises
         ------
@@ -133,15 +131,15 @@ class Uncertainty:
         return np.hstack([kept[:count], rng.uniform(-1.0, 1.0, (count, len(self.ranges)))])
 
     def inside(self, coordinates: Float[np.ndarray, "n k"]) -> Bool[np.ndarray, " n"]:
-        """Tell which points of the Gaussian part lie inside the parameters' bounds."""
+        """Return which points of the Gaussian part lie inside the parameters' bounds."""
         low = np.array([self.nominal[name].min for name in self.names])
         high = np.array([self.nominal[name].max for name in self.names])
-        values = self._gaussian(coordinates)
+        values = self._gaussian_values(coordinates)
         return np.all((values >= low) & (values <= high), axis=1)
 
     def values(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, " n"]]:
         """Return the parameters and conditions at the coordinates, by name."""
-        out = dict(zip(self.names, self._gaussian(coordinates).T, strict=True))
+        out = dict(zip(self.names, self._gaussian_values(coordinates).T, strict=True))
         for (name, (low, high)), t in zip(self.ranges.items(), coordinates[:, len(self.names) :].T, strict=True):
             value = 0.5 * (low + high) + 0.5 * (high - low) * t
             if name == SCREW_MODE:
@@ -163,51 +161,51 @@ class Uncertainty:
                 steps = np.diff(self.screw[1]) / np.diff(self.screw[0])
                 value = 0.5 * (low + high) + slope * coordinates[:, i]
                 slope *= steps[np.clip(np.searchsorted(self.screw[0], value) - 1, 0, steps.size - 1)]
-            own = SCREW_MASS if name == SCREW_MODE else name
-            out[own] = np.zeros((count, width))
-            out[own][:, i] = slope
+            varied = SCREW_MASS if name == SCREW_MODE else name
+            out[varied] = np.zeros((count, width))
+            out[varied][:, i] = slope
         return out
 
     def bounds(
         self, coordinates: Float[np.ndarray, "n k"]
     ) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " n"]]]:
-        """Give each finite bound of the Gaussian part: its outward normal, and each point's distance from it."""
-        values = self._gaussian(coordinates)
+        """Yield each finite bound of the Gaussian part: its outward normal, and each point's distance from it."""
+        values = self._gaussian_values(coordinates)
         for j, (name, row) in enumerate(zip(self.names, self.factor(), strict=True)):
-            item, std = self.nominal[name], float(np.linalg.norm(row))
+            parameter, std = self.nominal[name], float(np.linalg.norm(row))
             if std == 0.0:
                 continue
             normal = np.concatenate([row, np.zeros(len(self.ranges))]) / std
-            if np.isfinite(item.max):
-                yield normal, (item.max - values[:, j]) / std
-            if np.isfinite(item.min):
-                yield -normal, (values[:, j] - item.min) / std
+            if np.isfinite(parameter.max):
+                yield normal, (parameter.max - values[:, j]) / std
+            if np.isfinite(parameter.min):
+                yield -normal, (values[:, j] - parameter.min) / std
 
     def factor(self) -> Float[np.ndarray, "g g"]:
         """Return the covariance's factor, coordinates to parameters: standard deviations times the correlation's root.
 
-        Of the correlation, whose entries are alike: the eigenvalues of a covariance in m, N/m and kg m^2 span so many
-        decades that the small ones would be rounding.
+        The root is taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m
+        and kg m^2 span so many decades that the small ones would be rounding.
         """
         std = np.sqrt(np.diag(self.covariance))
         scale = np.where(std > 0.0, std, 1.0)
         values, vectors = np.linalg.eigh(self.covariance / scale / scale[:, None])
         return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
-    def _gaussian(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
+    def _gaussian_values(self, coordinates: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n g"]:
         mean = np.array(self.nominal.values_of(self.names))
         return mean + coordinates[:, : mean.size] @ self.factor().T
 
 
-def uncertainty(
+def combine_uncertainty(
     source: Fit | ParameterSet,
     others: ParameterSet,
     ranges: Mapping[str, tuple[float, float]],
     plants: Mapping[str, Plant],
 ) -> Uncertainty:
-    """Return what is not known: the fit's covariance (or prior_stds, of a ParameterSet) and the ranges.
+    """Combine a fit's covariance (or a ParameterSet's prior_stds) and the declared ranges into one description.
 
-    `others` has the values of parameters that `source` does not; those with a prior_std are uncertain too.
+    `others` has the values of parameters that `source` lacks; those with a prior_std are uncertain too.
 
     Raises
     ------
@@ -227,31 +225,31 @@ def uncertainty(
                     f"parameter {name} is not identifiable in the fit, so nothing can be certified; "
                     "fix it, give it a prior_std, or give its range"
                 )
-        known_within = [item for item in nominal.values() if item.prior_std is not None and item.name not in names]
-        others = others.subset(name for name in others if name not in nominal).with_parameters(*known_within)
+        with_prior = [p for p in nominal.values() if p.prior_std is not None and p.name not in names]
+        others = others.subset(name for name in others if name not in nominal).with_parameters(*with_prior)
     else:
-        if any(item.std is not None for item in source.values()):
+        if any(p.std is not None for p in source.values()):
             raise ControlError(
                 "the parameters come from a fit, whose covariance they do not carry; give the Fit itself"
             )
         nominal, names, matrix = ParameterSet(), (), np.zeros((0, 0))
         others = others.with_parameters(*source.values())
-    stds = {name: item.prior_std for name, item in others.items() if item.prior_std is not None}
+    stds = {name: p.prior_std for name, p in others.items() if p.prior_std is not None}
     whole = np.zeros((len(names) + len(stds),) * 2)
     whole[: len(names), : len(names)] = matrix
     whole[len(names) :, len(names) :] = np.diag(np.square(list(stds.values())))
-    every = (*names, *stds)
-    used = [i for i, name in enumerate(every) if name not in ranges and name in known and np.isfinite(whole[i, i])]
+    uncertain = (*names, *stds)
+    used = [i for i, name in enumerate(uncertain) if name not in ranges and name in known and np.isfinite(whole[i, i])]
     nominal = nominal.with_parameters(*others.values())
     nominal, scale = _in_plant_units(nominal, plants)
-    factors = np.array([scale.get(name, 1.0) for name in every])
+    factors = np.array([scale.get(name, 1.0) for name in uncertain])
     whole *= factors[:, None] * factors
     _check_inside(ranges, nominal)
     screw = _screw_masses(plants, nominal, ranges[SCREW_MODE]) if SCREW_MODE in ranges else (np.empty(0), np.empty(0))
     return Uncertainty(
-        nominal=nominal, names=tuple(every[i] for i in used), covariance=whole[np.ix_(used, used)],
+        nominal=nominal, names=tuple(uncertain[i] for i in used), covariance=whole[np.ix_(used, used)],
         ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, screw=screw,
-        absent={name: item for plant in plants.values() for name, item in plant.defaults.items()}
+        absent={name: default for plant in plants.values() for name, default in plant.defaults.items()}
         | conditions(tuple(plants.values())),
     )  # fmt: skip
 
@@ -260,10 +258,10 @@ def _in_plant_units(nominal: ParameterSet, plants: Mapping[str, Plant]) -> tuple
     """Return the values in the plants' units, and what each was multiplied by."""
     scale: dict[str, float] = {}
     for plant in plants.values():
-        own = plant.complete(nominal)
-        shared = [name for name in own if name in nominal]
-        scale |= {name: factor(nominal[name].unit, own[name].unit) for name in shared if name not in scale}
-        nominal = nominal.with_parameters(*(own[name] for name in shared))
+        complete = plant.complete(nominal)
+        shared = [name for name in complete if name in nominal]
+        scale |= {name: factor(nominal[name].unit, complete[name].unit) for name in shared if name not in scale}
+        nominal = nominal.with_parameters(*(complete[name] for name in shared))
     return nominal, scale
 
 
@@ -271,21 +269,22 @@ def _check_inside(ranges: Mapping[str, tuple[float, float]], nominal: ParameterS
     """Refuse ranges beyond the given parameters' own bounds, which may be narrower than the plant's."""
     known = dict(nominal)
     for name, (low, high) in ranges.items():
-        item = known.get(name)
-        if item is not None and (low < item.min or high > item.max):
+        parameter = known.get(name)
+        if parameter is not None and (low < parameter.min or high > parameter.max):
+            bounds = f"[{parameter.min:g}, {parameter.max:g}]"
             raise ControlError(
-                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{item.min:g}, {item.max:g}] of the given "
+                f"range of {name} = [{low:g}, {high:g}] leaves the bounds {bounds} of the given "
                 "parameters; keep inside them, or widen them"
             )
 
 
 def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant]) -> None:
-    """Refuse ranges that are empty, leave a parameter's bounds or name nothing.
+    """Check the ranges against the plants.
 
     Raises
     ------
     ControlError
-        As said.
+        A range is empty or not finite, leaves a parameter's bounds, or names nothing that a plant has.
 
     """
     extra = conditions(tuple(plants.values()))
@@ -293,42 +292,42 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
     known = [*parameters, *extra, *([SCREW_MODE] if SCREW_MASS in parameters else [])]
     if not isinstance(ranges, Mapping):
         raise ControlError(f"ranges is a {type(ranges).__name__}; give a mapping of name to (low, high)")
-    for name, given in ranges.items():
+    for name, ends in ranges.items():
         if name not in known:
-            what = 'add parts = ["screw_mode"] to one' if name == SCREW_MODE else suggestion(str(name), known)
-            raise ControlError(f'range of "{name}": no plant has it; {what}')
-        low, high = _ends(name, given)
+            remedy = 'add parts = ["screw_mode"] to one' if name == SCREW_MODE else suggestion(str(name), known)
+            raise ControlError(f'range of "{name}": no plant has it; {remedy}')
+        low, high = _read_ends(name, ends)
         if not (np.isfinite(low) and np.isfinite(high)):
             raise ControlError(f"range of {name} = [{low:g}, {high:g}] is not finite; give [low, high]")
         if not low <= high:
             raise ControlError(f"range of {name} = [{low:g}, {high:g}] is empty; give [low, high]")
-        item = extra.get(name) or parameters.get(name)
-        if item is not None and item.unit == "rad" and name in extra and max(-low, high) > np.pi:
+        parameter = extra.get(name) or parameters.get(name)
+        if parameter is not None and parameter.unit == "rad" and name in extra and max(-low, high) > np.pi:
             raise ControlError(
                 f"range of {name} = [{low:g}, {high:g}] is more than half a turn; angles are in rad, "
                 f"30 deg is {np.radians(30):.4g}"
             )
-        if item is not None and (low < item.min or high > item.max):
+        if parameter is not None and (low < parameter.min or high > parameter.max):
             raise ControlError(
-                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{item.min:g}, {item.max:g}]; "
+                f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{parameter.min:g}, {parameter.max:g}]; "
                 "keep inside them"
             )
     if SCREW_MODE in ranges and SCREW_MASS in ranges:
-        raise ControlError(f"ranges of {SCREW_MODE} and {SCREW_MASS} say the same thing; keep one")
+        raise ControlError(f"ranges of {SCREW_MODE} and {SCREW_MASS} both set the screw's mode; keep one")
 
 
-def _ends(name: str, given: Any) -> tuple[float, float]:
-    """Return low and high of what should be two numbers."""
-    pair = list(given) if isinstance(given, (list, tuple, np.ndarray)) else []
-    if len(pair) != 2 or any(isinstance(item, bool) or not isinstance(item, (int, float, np.number)) for item in pair):
-        raise ControlError(f"range of {name} = {' '.join(repr(given).split())} is not a range; give (low, high)")
+def _read_ends(name: str, value: Any) -> tuple[float, float]:
+    """Return low and high of a value that should be a pair of numbers."""
+    pair = list(value) if isinstance(value, (list, tuple, np.ndarray)) else []
+    if len(pair) != 2 or any(isinstance(end, bool) or not isinstance(end, (int, float, np.number)) for end in pair):
+        raise ControlError(f"range of {name} = {' '.join(repr(value).split())} is not a range; give (low, high)")
     return float(pair[0]), float(pair[1])
 
 
-def placed(
+def place_value(
     plant: Plant, params: ParameterSet, name: str, value: float, plants: Mapping[str, Plant]
 ) -> ParameterSet | None:
-    """Return a plant's parameters with what a range may name at a value; None where the plant does not have it.
+    """Return a plant's parameters with what a range may name set to a value; None where the plant does not have it.
 
     Raises
     ------
@@ -348,19 +347,19 @@ def placed(
 def _screw_masses(
     plants: Mapping[str, Plant], nominal: ParameterSet, wanted: tuple[float, float]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return frequencies of the screw's mode and the masses that give them, ascending in frequency."""
-    plant = next(item for item in plants.values() if SCREW_MASS in item.parameters)
+    """Return frequencies of the screw's mode, ascending, and the masses that give them."""
+    plant = next(plant for plant in plants.values() if SCREW_MASS in plant.parameters)
     complete = plant.complete(nominal)
     masses = complete[SCREW_MASS].value * np.geomspace(20.0, 0.05, 400)
     place = list(plant.states).index("s")
-    found = np.empty(masses.size)
+    frequencies = np.empty(masses.size)
     for k, mass in enumerate(masses):
         values, vectors = np.linalg.eig(state_space(plant, complete.update(**{SCREW_MASS: float(mass)}))[0])
         part = np.abs(vectors[place] * np.linalg.inv(vectors)[:, place]) * (np.imag(values) > 0.0)
-        found[k] = np.abs(values[np.argmax(part)]) / (2 * np.pi)
-    turns = np.flatnonzero(np.diff(found) <= 0.0)
+        frequencies[k] = np.abs(values[np.argmax(part)]) / (2 * np.pi)
+    turns = np.flatnonzero(np.diff(frequencies) <= 0.0)
     start = int(turns[-1]) + 1 if turns.size else 0
-    frequencies, masses = found[start:], masses[start:]
+    frequencies, masses = frequencies[start:], masses[start:]
     if wanted[0] < frequencies[0] or wanted[1] > frequencies[-1]:
         raise ControlError(
             f"range of {SCREW_MODE} = [{wanted[0]:g}, {wanted[1]:g}] is beyond what {SCREW_MASS} alone can do, "
@@ -369,8 +368,8 @@ def _screw_masses(
     return frequencies, masses
 
 
-def radius(dimensions: int) -> float:
-    """Return the radius in standard deviations that holds LEVEL of a Gaussian."""
+def confidence_radius(dimensions: int) -> float:
+    """Return the radius, in standard deviations, of the ball that contains LEVEL of a Gaussian."""
     from scipy.special import gammaincinv
 
     return float(np.sqrt(2.0 * gammaincinv(0.5 * dimensions, LEVEL))) if dimensions else 0.0

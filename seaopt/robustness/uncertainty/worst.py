@@ -1,11 +1,11 @@
-r"""The worst case: the parameters, of all that the fit and the ranges allow, with the largest Ms or spectral radius.
+r"""The worst case from below: the parameters, of all that fit and ranges allow, with the largest Ms or spectral radius.
 
 The set is an ellipsoid of the fit's covariance that holds `LEVEL` of its probability, cut by the physical bounds, times
-the box of the ranges. From the worst draws and vertices of the ranges, those first that are apart, each round takes the
-exact gradient of how much of the limits a point uses (`seaopt.robustness.uncertainty.severity`) and tries points along
+the box of the ranges. The search starts from the worst draws and vertices of the ranges, from distant ones first. Each
+round takes the exact gradient of a point's severity (`seaopt.robustness.uncertainty.severity`) and tries points along
 it, towards the vertex of the set that it points to (Frank, Wolfe, Naval Research Logistics 3, 1956) and about the
-point, all starts of a round in one batch. What it finds is a lower bound on the true worst case: a witness, checked by
-`Worst.verify`, and no proof that there is none worse.
+point, all starts of a round in one batch. The result is a lower bound on the true worst case: a witness, checked by
+`Worst.verify`, and not a proof that there is none worse; `seaopt.robustness.bounds` bounds it from above.
 """
 
 from __future__ import annotations
@@ -24,21 +24,20 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, radius
-from seaopt.robustness.uncertainty.severity import limits, severities, severity_slopes
+from seaopt.robustness.uncertainty.draws import Uncertainty, confidence_radius
+from seaopt.robustness.uncertainty.severity import SeveritySlopes, limits, severities, severity_slopes
 
 STARTS = 8
-CORNERS = 64  # vertices of the ranges looked at
-APART = 0.5  # of half a range, or of the ellipsoid's radius
+CORNERS = 64  # vertices of the ranges evaluated
+APART = 0.5  # least distance of starts: of half a range, or of the ellipsoid's radius
 ROUNDS = 30
 VERTEX_STEPS = np.array([1.0, 0.5, 0.2, 0.05, 0.01])
 GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
 PROBE_STEPS = np.repeat(np.array([0.3, 0.1, 0.03, 0.01]), 3)
 ON_BOUND = 1e-8  # of a physical bound, in standard deviations
-MATCH = 1e-6
+WITNESS_TOLERANCE = 1e-6
 ROUNDING = 1e-6
 
-Slopes = Float[np.ndarray, "s k"]
 Trials = Float[np.ndarray, "s t k"]
 Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
 
@@ -58,8 +57,8 @@ class Witness:
 class Worst(tuple[Plant, ParameterSet]):
     """A plant and the parameters at which it comes nearest to failing, or fails most.
 
-    It is the pair (plant, parameters) that `tune(..., robust_to=...)` takes, with the figures found there. Points are
-    ranked by instability, then by how much of the Ms or Mt limit they use; by Ms where there is no limit.
+    It is the pair (plant, parameters) that `tune(..., robust_to=...)` takes, with the figures there. Points are ranked
+    by instability, then by the fraction of the Ms or Mt limit that they use; by Ms where there is no limit.
     """
 
     witness: Witness
@@ -73,7 +72,7 @@ class Worst(tuple[Plant, ParameterSet]):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What is uncertain of the plant, at its worst."""
+        """The uncertain parameters and conditions, at their worst."""
         return self.witness.parameters
 
     @property
@@ -88,7 +87,7 @@ class Worst(tuple[Plant, ParameterSet]):
 
     @property
     def severity(self) -> float:
-        """The fraction of the limits that is used, or a million and the spectral radius if unstable."""
+        """The fraction of the limits that is used; a million plus the spectral radius if unstable."""
         return self.witness.severity
 
     def figures(self, controller: Controller) -> LoopFigures:
@@ -96,10 +95,10 @@ class Worst(tuple[Plant, ParameterSet]):
         return controller.close(*self).figures()
 
     def verify(self, controller: Controller) -> bool:
-        """Tell whether the loop, closed again, has the figures that the witness states."""
-        again, said = self.figures(controller), self.witness
-        pairs = ((again.ms, said.ms), (again.mt, said.mt), (again.spectral_radius, said.spectral_radius))
-        return all(now == then or abs(now - then) <= MATCH * abs(then) for now, then in pairs)
+        """Return whether the loop, closed again, has the figures that the witness states."""
+        again, stated = self.figures(controller), self.witness
+        pairs = ((again.ms, stated.ms), (again.mt, stated.mt), (again.spectral_radius, stated.spectral_radius))
+        return all(new == old or abs(new - old) <= WITNESS_TOLERANCE * abs(old) for new, old in pairs)
 
     def __repr__(self) -> str:
         where = ", ".join(f"{name} = {value:.5g}" for name, value in self.parameters.items()) or "the nominal values"
@@ -108,65 +107,67 @@ class Worst(tuple[Plant, ParameterSet]):
         )
 
     def _repr_html_(self) -> str:
-        return worst_html(self)
+        rows = [("Ms", f"{figure(self.ms)} at {figure(self.witness.ms_hz, 'Hz')}"), ("Mt", figure(self.mt))]
+        rows += [("spectral radius", f"{self.witness.spectral_radius:.6g}")]
+        return table(("worst case", ""), [*rows, *((name, f"{value:.5g}") for name, value in self.parameters.items())])
 
 
 def find_worst(
     controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"],
     severity: Float[np.ndarray, " n"],
 ) -> Worst:  # fmt: skip
-    """Return the worst point that the draws and a search from the worst of them find.
+    """Return the worst of the draws and of the points that a search from the worst draws reaches.
 
     Parameters
     ----------
     controller, plant, unknown
-        What is closed around what, and over what.
+        The loop's controller and plant, and what is uncertain of the plant.
     drawn, severity
-        Draws as coordinates, and how bad each is; none if nothing is uncertain.
+        Draws as coordinates, and the severity of each; empty if nothing is uncertain.
 
     """
     points, scores = drawn, severity
     if unknown.size:
-        score = _score(controller, plant, unknown)
-        starts = _into_set(unknown, np.vstack([drawn, _corners(unknown)]))
-        found, value = _search(controller, plant, unknown, _spread(unknown, starts, score(starts)), score)
+        score = _make_score(controller, plant, unknown)
+        starts = _project(unknown, np.vstack([drawn, _list_corners(unknown)]))
+        reached, value = _climb(controller, plant, unknown, _choose_starts(unknown, starts, score(starts)), score)
         worst = np.argsort(severity)[::-1][:1]
-        points, scores = np.vstack([drawn[worst], found]), np.concatenate([severity[worst], value])
+        points, scores = np.vstack([drawn[worst], reached]), np.concatenate([severity[worst], value])
     k = int(np.argmax(scores)) if scores.size else 0
     at = unknown.values(points[k : k + 1]) if unknown.size else {}
-    return witnessed(controller, plant, unknown.nominal, {name: float(item[0]) for name, item in at.items()})
+    return measure_worst(controller, plant, unknown.nominal, {name: float(column[0]) for name, column in at.items()})
 
 
-def witnessed(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
-    """Return the worst case at given parameters and conditions, measured one by one."""
+def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
+    """Return the worst case at parameters and conditions, its loop closed on its own and not in a batch."""
     extra = conditions((plant,))
     values = plant.complete(nominal)
-    own = {name: value for name, value in at.items() if name in values}
-    given = {name: value for name, value in at.items() if name in extra}
-    known = conditions_of(plant, nominal) | given
-    values = values.update(**own).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
+    changed = {name: value for name, value in at.items() if name in values}
+    placed = {name: value for name, value in at.items() if name in extra}
+    known = conditions_of(plant, nominal) | placed
+    values = values.update(**changed).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
     figures = controller.close(plant, values).figures()
     single = BatchFigures(
         spectral_radius=np.array([figures.spectral_radius]), ms=np.array([figures.ms]), mt=np.array([figures.mt])
     )
     witness = Witness(
-        parameters=own | given, ms=figures.ms, mt=figures.mt, ms_hz=figures.ms_hz,
+        parameters=changed | placed, ms=figures.ms, mt=figures.mt, ms_hz=figures.ms_hz,
         spectral_radius=figures.spectral_radius, severity=float(severities(controller, single)[0]),
     )  # fmt: skip
     return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))
 
 
-def _score(controller: Controller, plant: Plant, unknown: Uncertainty) -> Score:
-    """Return the function that tells how bad points are, those outside the bounds not at all."""
+def _make_score(controller: Controller, plant: Plant, unknown: Uncertainty) -> Score:
+    """Return the function from points to severities; points outside the bounds score minus infinity."""
 
     def score(points: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " m"]:
-        found = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
-        return np.where(unknown.inside(points), severities(controller, found), -np.inf)
+        figures = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
+        return np.where(unknown.inside(points), severities(controller, figures), -np.inf)
 
     return score
 
 
-def _corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
+def _list_corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
     """Return vertices of the ranges, the Gaussian part at its mean: all of them, or a fixed choice of many."""
     size, rng = len(unknown.ranges), np.random.default_rng(0)
     if 2**size <= CORNERS:
@@ -176,12 +177,12 @@ def _corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
     return np.hstack([np.zeros((len(signs), len(unknown.names))), signs])
 
 
-def _spread(
+def _choose_starts(
     unknown: Uncertainty, points: Float[np.ndarray, "n k"], severity: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "s k"]:
-    """Return the worst points that are apart, then the worst of the others: one valley must not take all starts."""
+    """Return the worst points that are apart, then the worst others: not all starts may lie in one valley."""
     scaled = points.copy()
-    scaled[:, : len(unknown.names)] /= max(radius(len(unknown.names)), 1.0)
+    scaled[:, : len(unknown.names)] /= max(confidence_radius(len(unknown.names)), 1.0)
     order = list(np.argsort(severity)[::-1])
     kept: list[int] = []
     for i in order:
@@ -192,14 +193,14 @@ def _spread(
     return points[kept]
 
 
-def _search(
+def _climb(
     controller: Controller, plant: Plant, unknown: Uncertainty, x: Float[np.ndarray, "s k"], score: Score
 ) -> tuple[Float[np.ndarray, "s k"], Float[np.ndarray, " s"]]:
-    """Climb from every start until none gets worse."""
+    """Climb from every start until none rises further."""
     value, rng = score(x), np.random.default_rng(0)
     for _ in range(ROUNDS):
-        slope = _inward(unknown, x, severity_slopes(controller, plant, unknown, x))
-        trials = _trials(unknown, x, slope, rng)
+        slope = _project_slopes(unknown, x, severity_slopes(controller, plant, unknown, x))
+        trials = _propose_trials(unknown, x, slope, rng)
         scores = score(trials.reshape(-1, x.shape[1])).reshape(trials.shape[:2])
         best = np.argmax(scores, axis=1)
         rows = np.arange(x.shape[0])
@@ -211,7 +212,7 @@ def _search(
     return x, value
 
 
-def _inward(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) -> Slopes:
+def _project_slopes(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: SeveritySlopes) -> SeveritySlopes:
     """Return the slopes without what leads out of a physical bound that a point lies on."""
     slope = slope.copy()
     for normal, room in unknown.bounds(x):
@@ -220,25 +221,27 @@ def _inward(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes) ->
     return slope
 
 
-def _trials(unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: Slopes, rng: np.random.Generator) -> Trials:
+def _propose_trials(
+    unknown: Uncertainty, x: Float[np.ndarray, "s k"], slope: SeveritySlopes, rng: np.random.Generator
+) -> Trials:
     """Return points towards the set's vertex in the slope's direction, along the slope, and at random about x.
 
-    The last for the ridge between two peaks of S, where neither peak's slope leads up.
+    Random points serve the ridge between two peaks of S, where neither peak's slope leads up.
     """
     g = len(unknown.names)
     size = np.linalg.norm(slope, axis=1, keepdims=True)
     unit = slope / np.maximum(size, 1e-300)
     inner = np.linalg.norm(unit[:, :g], axis=1, keepdims=True)
-    vertex = np.hstack([radius(g) * unit[:, :g] / np.maximum(inner, 1e-300), np.sign(unit[:, g:])])
+    vertex = np.hstack([confidence_radius(g) * unit[:, :g] / np.maximum(inner, 1e-300), np.sign(unit[:, g:])])
     towards = x[:, None] + VERTEX_STEPS[:, None] * (vertex - x)[:, None]
     along = x[:, None] + GRADIENT_STEPS[:, None] * unit[:, None]
     about = x[:, None] + PROBE_STEPS[:, None] * rng.normal(size=(x.shape[0], PROBE_STEPS.size, x.shape[1]))
-    whole = np.concatenate([towards, along, about], axis=1)
-    return _cut(unknown, x, _into_set(unknown, whole.reshape(-1, x.shape[1])).reshape(whole.shape))
+    trials = np.concatenate([towards, along, about], axis=1)
+    return _shorten(unknown, x, _project(unknown, trials.reshape(-1, x.shape[1])).reshape(trials.shape))
 
 
-def _cut(unknown: Uncertainty, x: Float[np.ndarray, "s k"], trials: Float[np.ndarray, "s t k"]) -> Trials:
-    """Return the trials, those beyond a physical bound moved back along their way from x."""
+def _shorten(unknown: Uncertainty, x: Float[np.ndarray, "s k"], trials: Trials) -> Trials:
+    """Return the trials, with those beyond a physical bound moved back towards x."""
     share = np.ones(trials.shape[:2])
     for normal, room in unknown.bounds(x):
         way, free = (trials - x[:, None]) @ normal, np.maximum(room - ON_BOUND, 0.0)[:, None]
@@ -247,16 +250,9 @@ def _cut(unknown: Uncertainty, x: Float[np.ndarray, "s k"], trials: Float[np.nda
     return x[:, None] + share[:, :, None] * (trials - x[:, None])
 
 
-def _into_set(unknown: Uncertainty, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Return the points, those outside the ellipsoid or the box moved onto its edge."""
+def _project(unknown: Uncertainty, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Return the points, with those outside the ellipsoid or the box moved onto its edge."""
     g = len(unknown.names)
     size = np.linalg.norm(x[:, :g], axis=1, keepdims=True)
-    return np.hstack([x[:, :g] * np.minimum(1.0, radius(g) / np.maximum(size, 1e-300)), np.clip(x[:, g:], -1.0, 1.0)])
-
-
-def worst_html(found: Worst) -> str:
-    """Return a worst case's figures and its parameters in SI units."""
-    said = found.witness
-    rows = [("Ms", f"{figure(found.ms)} at {figure(said.ms_hz, 'Hz')}"), ("Mt", figure(found.mt))]
-    rows += [("spectral radius", f"{said.spectral_radius:.6g}")]
-    return table(("worst case", ""), [*rows, *((name, f"{value:.5g}") for name, value in found.parameters.items())])
+    share = np.minimum(1.0, confidence_radius(g) / np.maximum(size, 1e-300))
+    return np.hstack([x[:, :g] * share, np.clip(x[:, g:], -1.0, 1.0)])
