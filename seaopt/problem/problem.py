@@ -42,7 +42,7 @@ from seaopt.problem.schema import (
 )
 from seaopt.problem.validation import validated
 from seaopt.records import record
-from seaopt.robustness import placed
+from seaopt.robustness import place_value
 
 
 @record(eq=False)
@@ -129,7 +129,7 @@ class Problem:
             out[name] = (plant, values)
             for parameter, ends in self.ranges.items():
                 for end in ends:
-                    corner = placed(plant, values, parameter, end, self.certified_plants())
+                    corner = place_value(plant, values, parameter, end, self.certified_plants())
                     if corner is not None:
                         out[f"{name}, {parameter} = {end:g}"] = (plant, corner)
         return out

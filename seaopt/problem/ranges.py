@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.robustness import placed
+from seaopt.robustness import place_value
 from seaopt.robustness.uncertainty.draws import SCREW_MASS, SCREW_MODE
 
 
@@ -43,6 +43,6 @@ def range_remarks(
 def _screw_mode_outside(low: float, high: float, plants: Mapping[str, Plant], nominal: ParameterSet) -> bool:
     """Tell whether the nominal m_n is none of those that put the mode into the range: a higher one needs less mass."""
     plant = next(item for item in plants.values() if SCREW_MASS in item.parameters)
-    ends = (placed(plant, nominal, SCREW_MODE, end, plants) for end in (low, high))
+    ends = (place_value(plant, nominal, SCREW_MODE, end, plants) for end in (low, high))
     heavy, light = (item[SCREW_MASS].value for item in ends if item is not None)
     return not light <= plant.complete(nominal)[SCREW_MASS].value <= heavy

@@ -14,7 +14,7 @@ from seaopt.control import Controller, Gains, Notch, Observer, corners, current_
 from seaopt.control.laws.structures import Nominal
 from seaopt.control.tuning.feasibility import sensitivity_possible
 from seaopt.errors import ControlError
-from seaopt.robustness import placed
+from seaopt.robustness import place_value
 
 from .test_loop import independent
 
@@ -138,7 +138,7 @@ def test_draws_and_corners_are_kept(stand, swing, thor):
 @pytest.mark.parametrize("delay_s", [1e-3, 2.4e-3])
 def test_a_plant_that_answers_later_is_kept_too(stand, thor, delay_s):
     """A further delay is a pair of robust_to; the loop's response is recomputed with it as a factor."""
-    late = placed(stand, thor, "delay_s", delay_s, {"stand": stand})
+    late = place_value(stand, thor, "delay_s", delay_s, {"stand": stand})
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.8)
     controller = so.tune(stand, thor, spec, {"late": (stand, late)})
     assert controller.feasible

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
+from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError
@@ -28,7 +29,7 @@ from seaopt.robustness.certificate.requirements import design_requirements, draw
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
 from seaopt.robustness.uncertainty.severity import limits, severities
-from seaopt.robustness.uncertainty.worst import ROUNDING, find_worst, measure_worst
+from seaopt.robustness.uncertainty.worst import find_worst, measure_worst
 
 CONFIDENCE = 1.0 - 1e-6
 BLOCK = 50_000
@@ -236,7 +237,7 @@ def _drawn(
 ) -> tuple[_Failures, dict[str, _Tally]]:  # fmt: skip
     """Draw and measure in blocks: the draws that fail on some plant, and the worst of each plant."""
     tallies = {name: _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0)) for name in plants}
-    ms, mt = (limit * (1.0 + ROUNDING) for limit in limits(controller))
+    ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
     failures, steps = _Failures(), samples * len(plants)
     for start in range(0, samples, BLOCK):
         points = unknown.draw(min(BLOCK, samples - start), rng)

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.laws.limits import MeasuredLoop, PortFigures
+from seaopt.control.laws.limits import LIMIT_ROUNDING, MeasuredLoop, PortFigures
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import Verdict, judge
 from seaopt.control.loops.port import port_of
 from seaopt.parameters import ParameterSet
 from seaopt.robustness.certificate.certificate import MonteCarlo, Requirement
 from seaopt.robustness.uncertainty.severity import UNSTABLE
-from seaopt.robustness.uncertainty.worst import ROUNDING, Worst
+from seaopt.robustness.uncertainty.worst import Worst
 
 REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
@@ -100,7 +100,7 @@ def _worst_requirements(name: str, found: Worst) -> list[Requirement]:
     if not found.limited and found.severity < UNSTABLE:
         return []
     where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
-    met = found.severity <= 1.0 + ROUNDING
+    met = found.severity <= 1.0 + LIMIT_ROUNDING
     used = found.severity if found.severity < UNSTABLE else np.inf
     return [
         Requirement(

@@ -36,7 +36,6 @@ GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
 PROBE_STEPS = np.repeat(np.array([0.3, 0.1, 0.03, 0.01]), 3)
 ON_BOUND = 1e-8  # of a physical bound, in standard deviations
 WITNESS_TOLERANCE = 1e-6
-ROUNDING = 1e-6
 
 Trials = Float[np.ndarray, "s t k"]
 Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
