@@ -4,10 +4,11 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 CACHE  := $(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(CACHE)/matplotlib
+export SEAOPT_CACHE_DIR := $(CURDIR)/$(CACHE)
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test check lint types contract notebooks bench bench-peers fuzz nocompiler clean setup
+.PHONY: demo test slow check lint types contract notebooks bench bench-peers fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -26,11 +27,15 @@ demo: $(READY)
 	$(BIN)/seaopt demo -o out/demo
 
 test: $(READY)
-	$(PYTEST) -n 2 --dist worksteal -q
+	$(PYTEST) -n 2 --dist worksteal -q -m "not slow"
+
+# Statistics over hundreds of fits: coverage of intervals, scatter against stated standard deviations.
+slow: $(READY)
+	$(PYTEST) -n 2 --dist worksteal -q -m slow tests
 
 # The same numbers without a C compiler: the tests that compare both ways, and the simulation and fit tests.
 nocompiler: $(READY)
-	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q $(INTERPRETED)
+	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q -m "not slow" $(INTERPRETED)
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -45,7 +50,7 @@ contract: $(READY)
 notebooks: $(READY)
 	$(PYTEST) --nbmake --nbmake-timeout=300 -q notebooks
 
-check: test nocompiler lint types contract notebooks
+check: test slow nocompiler lint types contract notebooks
 
 bench: $(READY)
 	$(PYTEST) benchmarks -q -s --benchmark-only -p no:xdist -o python_files='bench_*.py' -o filterwarnings=default

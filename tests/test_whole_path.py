@@ -34,6 +34,7 @@ def run(**environment):
     return json.loads(out.stdout)
 
 
+@pytest.mark.slow
 def test_a_compiler_changes_nothing():
     from seaopt.simulation.compiler import find_compiler
 

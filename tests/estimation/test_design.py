@@ -252,6 +252,7 @@ def scatter(plant, truth, excitation, seeds, **log):
     return dict(zip(truth.free_names, np.std(values, axis=0, ddof=1), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [True, False])
 def test_fits_scatter_as_expected_on_the_stand(stand, thor, own):
     """40 seeds: a standard deviation is then known within 11 %; three of those. Design and paper."""
@@ -264,18 +265,29 @@ def test_fits_scatter_as_expected_on_the_stand(stand, thor, own):
         assert value == pytest.approx(covariance.std(name), rel=0.35)
 
 
-def test_the_swing_is_known_better_and_fits_scatter_as_expected(swing, thor):
-    """A nonlinear plant, at most 0.1 rad: I_p and d at least twice as well, scatter over 40 seeds as expected."""
+@pytest.fixture(scope="module")
+def swing_design(swing, thor):
+    """Return the truth and the design for a nonlinear plant, at most 0.1 rad."""
     truth = thor.update(d=2.0).free("I_p", "d")
     limits = Limits(duration_s=10, rate_hz=400, rms=3.5, peaks={"phi": 0.1})
-    found = design_experiment(swing, truth, limits, sigma=NOISE)
-    ratio = found.against(PAPER_SWING).ratio
+    return truth, design_experiment(swing, truth, limits, sigma=NOISE)
+
+
+def test_the_swing_is_known_twice_as_well(swing, swing_design):
+    truth, best = swing_design
+    ratio = best.against(PAPER_SWING).ratio
     assert ratio["I_p"] > 2 and ratio["d"] > 2
-    log = so.virtual_log(swing, truth, found.excitation, duration_s=10, rate_hz=400, seed=0)
+    log = so.virtual_log(swing, truth, best.excitation, duration_s=10, rate_hz=400, seed=0)
     assert np.max(np.abs(log["phi"])) <= 0.1 * (1 + 1e-6)
-    spread = scatter(swing, truth, found.excitation, range(100, 140), duration_s=10, rate_hz=400)
+
+
+@pytest.mark.slow
+def test_fits_scatter_as_expected_on_the_swing(swing, swing_design):
+    """Over 40 seeds, as on the stand."""
+    truth, best = swing_design
+    spread = scatter(swing, truth, best.excitation, range(100, 140), duration_s=10, rate_hz=400)
     for name, value in spread.items():
-        assert value == pytest.approx(found.std[name], rel=0.35)
+        assert value == pytest.approx(best.std[name], rel=0.35)
 
 
 def test_friction_needs_more_than_the_linear_plant(stand, thor):

@@ -49,6 +49,7 @@ def test_the_bound_is_that_of_two_independent_ar1_series(a, b):
     assert found.bound * np.sqrt(n) / 2.5758293 == pytest.approx(np.sqrt((1 + a * b) / (1 - a * b)), rel=0.05)
 
 
+@pytest.mark.slow
 def test_chance_is_outside_the_bound_as_often_as_it_says():
     """1 % of the lags; 1 % or less of the series by Bonferroni's p. A standard error is 0.14 and 0.5 %."""
     rng, outside, small = np.random.default_rng(7), 0.0, 0

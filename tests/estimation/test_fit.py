@@ -107,6 +107,7 @@ def test_misra1a_values_and_standard_errors_are_nists():
         assert fit.white_covariance.std(name) * residual_dof == pytest.approx(error, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth(stand, thor):
     """95 % intervals of J, b_r, eta over 60 seeds (180 intervals)."""
     inside = 0
@@ -122,6 +123,7 @@ def test_intervals_cover_the_truth(stand, thor):
     assert 0.89 <= inside / 180 <= 0.99
 
 
+@pytest.mark.slow
 def test_coloured_residuals_widen_the_intervals(stand, thor):
     """Noise with a correlation time of 0.1 s: the stated std matches the scatter of the estimates over seeds."""
     found, stated = [], []
@@ -153,6 +155,7 @@ def scatter(stand, thor, spoil, seeds, **options):
     return np.std(found, axis=0) / np.mean(stated, axis=0)
 
 
+@pytest.mark.slow
 def test_noise_common_to_both_load_cells_widens_the_intervals(stand, thor):
     """Output by output, the stated std would be 1/sqrt(2) of the scatter."""
 
@@ -163,6 +166,7 @@ def test_noise_common_to_both_load_cells_widens_the_intervals(stand, thor):
     np.testing.assert_allclose(scatter(stand, thor, common, 60), 1.0, atol=0.25)
 
 
+@pytest.mark.slow
 def test_hubers_intervals_mean_what_they_say(stand, thor):
     def outliers(rng, f1, f2):
         hit = rng.random(f1.size) < 0.05
@@ -366,6 +370,7 @@ def test_a_unit_that_a_parameter_can_absorb_is_asked_about(stand, short_log, tho
     assert any("1000 times below its start of 1: check the units" in note for note in fit.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [40, 100])
 def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples):
     """Windows of one log: what a fit takes out of few residuals may not narrow their intervals."""

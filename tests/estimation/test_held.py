@@ -49,6 +49,7 @@ def test_a_regression_has_the_textbooks_multiplier():
     assert found.p == pytest.approx(chi2.sf(found.chi2, 1), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_coloured_residuals_raise_no_false_alarm():
     """5 % of right values are beyond the 5 % point; a test for white residuals calls half of them wrong."""
     rng, n, beyond, white = np.random.default_rng(4), 1500, 0, 0

@@ -238,6 +238,7 @@ def test_slow_drift_is_taken_out(stand, thor):
     assert without.outputs["log"]["F1"].rms_residual > 8
 
 
+@pytest.mark.slow
 def test_soft_l1_shrugs_off_outliers_and_states_its_scatter(stand, thor):
     found, stated = [], []
     for seed in range(40):

@@ -49,6 +49,7 @@ def test_other_systems_are_found_too(form):
     np.testing.assert_allclose(found.values[:3], form, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_stated_std_is_the_scatter_where_noise_rules():
     rng = np.random.default_rng(2)
     z = []
