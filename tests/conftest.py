@@ -120,3 +120,9 @@ def stand_log(stand, thor) -> so.Log:
 def short_log(stand, thor) -> so.Log:
     sensors = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}, offset={"F1": 3.0})
     return so.virtual_log(stand, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=12, sensors=sensors)
+
+
+@pytest.fixture
+def without_drawing(monkeypatch):
+    """Let reports write empty figures: drawing takes most of their time."""
+    monkeypatch.setattr("seaopt.reporting.report.rendered", lambda figure, kind: b"<svg></svg>")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants.plant import Plant, state_space
 from seaopt.records import record
@@ -68,8 +68,7 @@ class Modes:
             lines.append(f"  {output}/{source}: static gain {self.dc_gain[output, source]:.5g}, zeros at {shown} Hz")
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def modes(

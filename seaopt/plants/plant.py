@@ -8,7 +8,6 @@ mapping from state (output) names to expressions. They are called once, when the
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from types import SimpleNamespace
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
+from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
 from seaopt.records import record
@@ -224,8 +224,7 @@ class Plant:
             f"  outputs     {listed(self.outputs)}\n  parameters  {listed(self.parameters)}"
         )
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 @memo

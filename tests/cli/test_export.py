@@ -3,71 +3,30 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import pytest
 
-from seaopt.cli import main
 
-PROBLEM = """
-schema = 1
-[plant.stand]
-kind = "high_impedance"
-[controller]
-plant = "stand"
-measured = "F1"
-bandwidth_hz = 30
-max_noise_gain = 25
-current_limit_A = 9.0
-"""
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("export")
-    (path / "knee.toml").write_text(PROBLEM, encoding="utf-8")
-    tuned = [sys.executable, "-W", "error", "-m", "seaopt.cli", "tune", "knee.toml", "-o", "results"]
-    done = subprocess.run(tuned, capture_output=True, text=True, check=False, cwd=path)
-    assert done.returncode == 0, done.stderr
-    return path
-
-
-@pytest.fixture
-def seaopt(folder, monkeypatch, capsys):
-    """Return what runs the command in the folder: its exit code, stdout and stderr."""
-    monkeypatch.chdir(folder)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["seaopt", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return int(end.value.code or 0), *capsys.readouterr()
-
-    return run
-
-
-def test_it_writes_the_law_and_the_gains(folder, seaopt):
-    code, out, _ = seaopt("export", "results", "--c", "firmware/knee", "--name", "knee", "--precision", "float")
-    assert code == 0
+def test_it_writes_the_law_and_the_gains(folder, done, seaopt):
+    out = seaopt("export", done.results, "--c", "firmware/knee", "--name", "knee", "--precision", "float")
+    assert out.returncode == 0
     names = {"knee.h", "knee.c", "knee_gains.h", "knee_gains.m"}
     assert {path.name for path in (folder / "firmware" / "knee").iterdir()} == names
     header = (folder / "firmware" / "knee" / "knee.h").read_text(encoding="utf-8")
     assert "typedef float knee_real;" in header
     assert "#define KNEE_CURRENT_LIMIT_A 9.0f" in header
-    assert all(name in out for name in names)
+    assert all(name in out.stdout for name in names)
 
 
-def test_json_names_the_files(folder, seaopt):
-    _, out, _ = seaopt("export", "results", "--c", "named", "--current-limit", "3", "--json")
-    content = json.loads(out)
+def test_json_names_the_files(folder, done, seaopt):
+    content = json.loads(seaopt("export", done.results, "--c", "named", "--current-limit", "3", "--json").stdout)
     assert (content["schema"], content["feasible"]) == ("seaopt/export/1", True)
     assert "CURRENT_LIMIT_A 3.0" in (folder / content["files"][0]).read_text(encoding="utf-8")
 
 
-def one_line(done):
-    assert done[0] == 2
-    (line,) = done[2].strip().splitlines()
+def one_line(out):
+    assert out.returncode == 2
+    (line,) = out.stderr.strip().splitlines()
     assert line.startswith("seaopt: ")
     return line
 
@@ -76,20 +35,21 @@ def one_line(done):
     ("arguments", "words"),
     [
         (("nowhere", "--c", "out"), "give the folder of results"),
-        (("knee.toml", "--c", "out"), "give the folder of results"),
-        (("results", "--c", "knee.toml"), "is a file; give a folder"),
+        (("short.toml", "--c", "out"), "give the folder of results"),
+        (("results", "--c", "short.toml"), "is a file; give a folder"),
         (("results", "--c", "out", "--precision", "half"), 'use "double" or "float"'),
         (("results", "--c", "out", "--name", "7"), "cannot begin a name in C"),
         (("results", "--c", "out", "--current-limit", "0"), "is not positive"),
     ],
 )
-def test_bad_input_is_one_line_and_exits_2(folder, seaopt, arguments, words):
+def test_bad_input_is_one_line_and_exits_2(folder, done, seaopt, arguments, words):
+    arguments = (done.results if name == "results" else name for name in arguments)
     assert words in one_line(seaopt("export", *arguments))
     assert not (folder / "out").exists()
 
 
-def test_without_a_target_it_is_a_usage_error(seaopt):
-    assert seaopt("export", "results")[0] == 2
+def test_without_a_target_it_is_a_usage_error(done, seaopt):
+    assert seaopt("export", done.results).returncode == 2
 
 
 @pytest.mark.parametrize(
@@ -102,18 +62,18 @@ def test_without_a_target_it_is_a_usage_error(seaopt):
         ("{", "", "not valid JSON"),
     ],
 )
-def test_a_stale_or_broken_controller_is_refused(folder, seaopt, tmp_path, old, new, words):
-    text = (folder / "results" / "controller.json").read_text(encoding="utf-8").replace(old, new, 1)
+def test_a_stale_or_broken_controller_is_refused(done, seaopt, tmp_path, old, new, words):
+    text = (done.results / "controller.json").read_text(encoding="utf-8").replace(old, new, 1)
     (tmp_path / "controller.json").write_text(text, encoding="utf-8")
     assert words in one_line(seaopt("export", tmp_path, "--c", tmp_path / "out"))
 
 
-def test_an_infeasible_controller_is_written_only_when_asked_and_exits_1(folder, seaopt, tmp_path):
-    content = json.loads((folder / "results" / "controller.json").read_text(encoding="utf-8"))
+def test_an_infeasible_controller_is_written_only_when_asked_and_exits_1(done, seaopt, tmp_path):
+    content = json.loads((done.results / "controller.json").read_text(encoding="utf-8"))
     content |= {"feasible": False, "active_constraints": ["max_noise_gain"]}
     (tmp_path / "controller.json").write_text(json.dumps(content), encoding="utf-8")
     assert "misses max_noise_gain" in one_line(seaopt("export", tmp_path, "--c", tmp_path / "out"))
-    code, out, _ = seaopt("export", tmp_path, "--c", tmp_path / "out", "--allow-infeasible")
-    assert code == 1
-    assert "not met: max_noise_gain" in out
+    out = seaopt("export", tmp_path, "--c", tmp_path / "out", "--allow-infeasible")
+    assert out.returncode == 1
+    assert "not met: max_noise_gain" in out.stdout
     assert len(list((tmp_path / "out").iterdir())) == 4

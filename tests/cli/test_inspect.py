@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +32,7 @@ def folder(tmp_path_factory, stand, thor):
 
 @pytest.fixture
 def inspect(folder, monkeypatch, capsys):
-    """Return a call of what the command does; `seaopt` below is the command itself."""
+    """Return a call of what the command does; `seaopt` is the command itself."""
 
     def run(name, *, out=None, **options):
         monkeypatch.chdir(folder)
@@ -44,15 +42,8 @@ def inspect(folder, monkeypatch, capsys):
     return run
 
 
-def seaopt(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-m", "seaopt.cli", "inspect", *arguments],
-        capture_output=True, text=True, check=False, cwd=cwd,
-    )  # fmt: skip
-
-
-def test_faults_are_said_and_the_exit_code_is_0(folder):
-    done = seaopt("bad.csv", cwd=folder)
+def test_faults_are_said_and_the_exit_code_is_0(seaopt):
+    done = seaopt("inspect", "bad.csv")
     assert (done.returncode, done.stderr) == (0, "")
     for words in (
         "3900 samples", "1 gap, 100 samples lost", "F2 lacks 30 samples", "F1 is flat at its largest value, 300 N",
@@ -61,23 +52,23 @@ def test_faults_are_said_and_the_exit_code_is_0(folder):
         assert words in done.stdout
 
 
-def test_json_stands_alone_on_stdout(folder):
+def test_json_stands_alone_on_stdout(seaopt):
     arguments = ["--time", "time [s]", "--channel", "cur=I", "--unit", "cur=mA", "--input", "cur", "--json"]
-    done = seaopt("bare.csv", *arguments, cwd=folder)
+    done = seaopt("inspect", "bare.csv", *arguments)
     content = json.loads(done.stdout)
     assert done.returncode == 0 and content["schema"] == "seaopt/quality/1"
     assert content["inputs"] == ["cur"] and list(content["channels"]) == ["cur"]
     assert content["channels"]["cur"]["unit"] == "A"
 
 
-def test_the_columns_alone_are_listed(folder):
-    done = seaopt("bare.csv", "--list", cwd=folder)
+def test_the_columns_alone_are_listed(seaopt):
+    done = seaopt("inspect", "bare.csv", "--list")
     assert done.returncode == 0 and done.stdout.startswith("bare.csv: CSV")
     assert "time [s]" in done.stdout
 
 
-def test_bad_input_exits_2(folder):
-    done = seaopt("nothing.csv", cwd=folder)
+def test_bad_input_exits_2(seaopt):
+    done = seaopt("inspect", "nothing.csv")
     assert (done.returncode, done.stdout) == (2, "")
     assert "no such file" in done.stderr and done.stderr.count("\n") == 1
 

@@ -41,7 +41,7 @@ def write(tmp_path):
     return _write
 
 
-def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsys):
+def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsys, without_drawing):
     path = write(BENCH + "[robustness]\nparameters = { f_c = [0.0, 0.01] }\n")
     run(path, tmp_path / "out")
     told = " ".join(capsys.readouterr().err.split())
@@ -133,7 +133,7 @@ def test_a_result_counts_what_it_depends_on(write, tmp_path, text, old, new, cha
     assert moved == changed.split()
 
 
-def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, capsys):
+def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, capsys, without_simulation):
     """Without experiments, so that nothing is fitted; a certificate of an old controller is refused too."""
     text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
     folder = tmp_path / "out"

@@ -6,7 +6,7 @@ import pytest
 import seaopt as so
 
 
-def test_text_from_problems_is_escaped(stand, thor, tmp_path):
+def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
     controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     told: list[tuple[str, int, int]] = []
     title = "<script>alert(1)</script>"
@@ -17,7 +17,7 @@ def test_text_from_problems_is_escaped(stand, thor, tmp_path):
     assert "&lt;script&gt;" in text
 
 
-def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path):
+def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path, without_drawing):
     with pytest.raises(so.SeaoptError, match="no result"):
         so.write_report([], tmp_path / "r.html")
     controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
@@ -26,7 +26,7 @@ def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_page_says_how_the_papers_form_compares_with_the_fit(stand, stand_log, thor, tmp_path):
+def test_the_page_says_how_the_papers_form_compares_with_the_fit(stand, stand_log, thor, tmp_path, without_drawing):
     fit = so.fit([so.Experiment(plant=stand, log=stand_log, name="chirp", outputs=("F1",))], thor.free("J", "b_r"))
     page = so.write_report([fit], tmp_path / "r.html").read_text(encoding="utf-8")
     (said,) = [line for line in page.splitlines() if "Read as (16) with k known, F1/I gives" in line]
@@ -48,7 +48,7 @@ def test_a_log_with_gaps_and_missing_samples_is_drawn(stand, short_log, thor, tm
     assert (tmp_path / "figures" / "time_gappy.png").stat().st_size > 5000
 
 
-def test_a_fit_has_diagnostics_and_a_ranking_says_why(stand, short_log, thor, tmp_path):
+def test_a_fit_has_diagnostics_and_a_ranking_says_why(stand, short_log, thor, tmp_path, without_drawing):
     fits = {
         drive: so.fit(
             [so.Experiment(plant=so.plants.high_impedance(drive=drive), log=short_log, name="chirp", outputs=("F2",))],
@@ -66,7 +66,7 @@ def test_a_fit_has_diagnostics_and_a_ranking_says_why(stand, short_log, thor, tm
     assert "Which model" in alone and "Parameters" not in alone
 
 
-def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path):
+def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path, without_drawing):
     """They need residuals and the problem, which fit.json does not hold."""
     bench = so.Experiment(plant=stand, log=short_log, name="chirp", outputs=("F1",))
     read = so.Fit.from_dict(so.fit([bench], thor.free("J")).to_dict(), (bench,))
@@ -74,7 +74,7 @@ def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path):
     assert "Measured against model" in page and "Diagnostics" not in page
 
 
-def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, tmp_path):
+def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, tmp_path, without_drawing):
     limit = 0.6 * np.max(np.abs(short_log["F1"]))
     experiment = so.Experiment(plant=stand, log=short_log, outputs=("F1",), saturation={"F1": (-limit, limit)})
     fit = so.fit([experiment], thor.free("J", "b_r"))

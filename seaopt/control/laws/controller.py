@@ -15,7 +15,7 @@ from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import resting_on
-from seaopt.markup import figure, items, paragraph, table
+from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -264,29 +264,29 @@ class Controller:
         ]
         told = [] if self.feasible else [self.explanation]
         return (
-            paragraph(head) + table(("gain", "", "as current"), gains)
-            + table(("on the design plant", "achieved", "asked"), self._achieved_rows())
-            + items([*told, *(line.strip() for line in self._force_lines())])
+            html_paragraph(head) + html_table(("gain", "", "as current"), gains)
+            + html_table(("on the design plant", "achieved", "asked"), self._achieved_rows())
+            + html_list([*told, *(line.strip() for line in self._force_lines())])
         )  # fmt: skip
 
     def _achieved_rows(self) -> list[tuple[str, str, str]]:
         a, s = self.achieved, self.spec
         band, delay = a.tracking_band_hz, a.delay_margin_s
         return [
-            ("bandwidth", figure(a.bandwidth_hz, "Hz"), f"{s.bandwidth_hz:g} Hz"),
+            ("bandwidth", format_figure(a.bandwidth_hz, "Hz"), f"{s.bandwidth_hz:g} Hz"),
             ("tracking band", "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", ""),
             (
-                "sensitivity bandwidth", figure(a.sensitivity_bandwidth_hz, "Hz"),
+                "sensitivity bandwidth", format_figure(a.sensitivity_bandwidth_hz, "Hz"),
                 f"at least {s.sensitivity_bandwidth_limit_hz:g} Hz",
             ),
-            ("Ms", figure(a.ms), _limited("at most", s.max_sensitivity)),
-            ("Mt", figure(a.mt), _limited("at most", s.max_complementary)),
-            ("reference peak", figure(a.reference_peak), _limited("at most", s.max_reference_peak)),
-            ("noise gain", figure(a.noise_gain, "N/N"), _limited("at most", s.max_noise_gain)),
-            ("disk margin", figure(a.disk_margin), _limited("at least", s.min_disk_margin)),
-            ("gain margin", figure(a.gain_margin_db, "dB"), ""),
-            ("phase margin", figure(a.phase_margin_deg, "deg"), ""),
-            ("delay margin", figure(None if delay is None else 1e3 * delay, "ms"), ""),
+            ("Ms", format_figure(a.ms), _limited("at most", s.max_sensitivity)),
+            ("Mt", format_figure(a.mt), _limited("at most", s.max_complementary)),
+            ("reference peak", format_figure(a.reference_peak), _limited("at most", s.max_reference_peak)),
+            ("noise gain", format_figure(a.noise_gain, "N/N"), _limited("at most", s.max_noise_gain)),
+            ("disk margin", format_figure(a.disk_margin), _limited("at least", s.min_disk_margin)),
+            ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
+            ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
+            ("delay margin", format_figure(None if delay is None else 1e3 * delay, "ms"), ""),
         ]  # fmt: skip
 
 

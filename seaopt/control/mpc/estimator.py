@@ -17,7 +17,6 @@ Every matrix is public: a step is two products of small matrices, as easily writ
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 
 import numpy as np
@@ -28,6 +27,7 @@ from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.estimation.problem.correlation import autocorrelation, ljung_box
+from seaopt.formatting import html_text
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -248,8 +248,7 @@ class Estimator:
         head = f"Estimator of {self.plant.name} from {', '.join(self.outputs)} at {1 / self.sample_time_s:g} Hz{delay}"
         return "\n".join([head, *rows])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def estimator(

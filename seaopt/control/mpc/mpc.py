@@ -17,7 +17,6 @@ and the step says so.
 
 from __future__ import annotations
 
-import html
 import time
 from typing import Any
 
@@ -35,6 +34,7 @@ from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.tuning.tuner import current_per_force
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.records import record
@@ -287,8 +287,7 @@ class ForceMPC:
             f"{self.prediction.knots.size} free currents"
         )
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceMPC:

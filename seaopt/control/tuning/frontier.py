@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -13,6 +12,7 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task, solve
 from seaopt.errors import ControlError
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -88,8 +88,7 @@ class Frontier:
             )
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def sweep(

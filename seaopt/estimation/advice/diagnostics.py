@@ -6,7 +6,6 @@ were held fixed, and `advice` for what is said.
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import asdict, field
 from typing import Any
@@ -21,6 +20,7 @@ from seaopt.estimation.problem.residual_statistics import Errors, leftover
 from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.uncertainty.leverage import Leverage, leverage
+from seaopt.formatting import html_text
 from seaopt.records import record
 from seaopt.units import unit_after
 
@@ -97,8 +97,7 @@ class Diagnostics:
         lines.append(f"  AIC {self.aic:.6g}, BIC {self.bic:.6g}")
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def _output_dict(item: OutputDiagnostics) -> dict[str, Any]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
 from seaopt.estimation.advice.forecasts import Percent
 from seaopt.estimation.result.fit_result import Fit
+from seaopt.formatting import html_text
 from seaopt.records import record
 
 
@@ -134,5 +134,4 @@ class Ranking:
             )
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text

@@ -10,7 +10,6 @@ A design is as good as its guess: design, measure, fit, and design again.
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import field, replace
 from typing import Literal
@@ -32,6 +31,7 @@ from seaopt.estimation.experiment_design.excitation_search import (
 )
 from seaopt.estimation.experiment_design.information import Bench, make_bench
 from seaopt.estimation.result.covariance import Covariance
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -136,8 +136,7 @@ class Design:
         lines += [f"  {name}: peak {value:.4g}{_of(allowed[name])}" for name, value in self.peaks.items()]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def _of(limit: float | None) -> str:

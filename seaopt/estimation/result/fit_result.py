@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Mapping
 from dataclasses import field
@@ -18,6 +17,7 @@ from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import Derived, Nuisance, OutputFit, Prediction
 from seaopt.estimation.result.identifiability import Identifiability
+from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.records import record
 from seaopt.simulation import Clock, Point, make_model, run_passes
@@ -246,8 +246,7 @@ class Fit:
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def _fields(item: Any) -> dict[str, Any]:

@@ -19,7 +19,6 @@ are made, and a log of a minute takes a second), or a refit of model output minu
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -36,6 +35,7 @@ from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.covariance import Covariance, robust_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
+from seaopt.formatting import html_text
 from seaopt.records import record
 from seaopt.units import unit_after
 
@@ -109,8 +109,7 @@ class Bootstrap:
             )
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False, block: int | None = None) -> Bootstrap:

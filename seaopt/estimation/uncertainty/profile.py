@@ -16,7 +16,6 @@ Pauli, Racugno and Ventura, Statistica Sinica 21, 2011, for adjusting the magnit
 
 from __future__ import annotations
 
-import html
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from seaopt.estimation.problem.normal_equations import inverse, solved
 from seaopt.estimation.result.covariance import robust_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
+from seaopt.formatting import html_text
 from seaopt.records import record
 from seaopt.units import unit_after
 
@@ -108,8 +108,7 @@ class Profile:
         ]
         return "\n".join(lines + ([f"  {self.message}"] if self.message else []))
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, coloured: bool = True) -> Profile:

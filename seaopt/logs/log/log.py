@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterator, Mapping
 from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
+from seaopt.formatting import html_text
 from seaopt.logs.log import decimation, frames, resampling
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.clock import GAP, JITTER_LIMIT, sample_rate_hz, split_at_gaps
@@ -370,8 +370,7 @@ class Log:
             lines.append(f"  {count} gap{'s' if count > 1 else ''}: {first}{', ...' if count > 3 else ''}")
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def _steps(time: Float[np.ndarray, " n"]) -> Iterator[Float[np.ndarray, " _"]]:

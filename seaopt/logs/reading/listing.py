@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import html
 from pathlib import Path
 
+from seaopt.formatting import html_text
 from seaopt.logs.formats import Field, open_source
 from seaopt.records import record
 
@@ -42,8 +42,7 @@ class Contents:
         lines += [f"... and {len(self.fields) - MAX_ROWS} more"] if len(self.fields) > MAX_ROWS else []
         return "\n".join([*lines, *self.notes])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def contents(path: str | Path) -> Contents:

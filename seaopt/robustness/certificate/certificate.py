@@ -13,7 +13,7 @@ from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import resting_on
-from seaopt.markup import figure, items, paragraph, table
+from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -356,39 +356,41 @@ _PLANT_HEAD = (
 
 def certificate_html(found: Certificate) -> str:
     """Return the plants, the draws, every requirement with what decides it, and what was simulated."""
-    verdict = paragraph(f"Certificate: {'passed' if found.passed else 'FAILED'}")
-    plants = table(_PLANT_HEAD, [_plant_row(found, name) for name in found.plants])
-    required = table(
+    verdict = html_paragraph(f"Certificate: {'passed' if found.passed else 'FAILED'}")
+    plants = html_table(_PLANT_HEAD, [_plant_row(found, name) for name in found.plants])
+    required = html_table(
         ("requirement", "where", "value", "limit", "met"),
         [
             (
                 item.name,
                 item.where,
-                figure(item.value),
-                f"{item.sense} {figure(item.limit)}",
+                format_figure(item.value),
+                f"{item.sense} {format_figure(item.limit)}",
                 "yes" if item.met else "NO",
             )
             for item in sorted(found.requirements, key=lambda item: item.met)
         ],
     )
-    varied = paragraph(f"varied: {'; '.join(map(str, found.varied))}") if found.varied else ""
-    simulated = items(found.simulated.lines()) if found.simulated is not None else ""
-    return verdict + items(found.notes) + plants + varied + draws_html(found.monte_carlo) + required + simulated
+    varied = html_paragraph(f"varied: {'; '.join(map(str, found.varied))}") if found.varied else ""
+    simulated = html_list(found.simulated.lines()) if found.simulated is not None else ""
+    return verdict + html_list(found.notes) + plants + varied + draws_html(found.monte_carlo) + required + simulated
 
 
 def draws_html(found: MonteCarlo) -> str:
     """Return the numbers of draws and failures, and the bound."""
     shown = [(field.name.replace("_", " "), getattr(found, field.name)) for field in fields(found)]
-    return table(("draws", ""), [(name, f"{value:.7g}") for name, value in shown if isinstance(value, (int, float))])
+    return html_table(
+        ("draws", ""), [(name, f"{value:.7g}") for name, value in shown if isinstance(value, (int, float))]
+    )
 
 
 def _plant_row(found: Certificate, name: str) -> tuple[str, ...]:
     item, worst, margins = found.plants[name], found.worst[name], found.margins[name]
     band, late = item.tracking_band_hz, margins.sampled_delay_s
     return (
-        name, "yes" if item.stable else "NO", figure(item.ms), figure(item.mt), figure(worst.ms), figure(worst.mt),
-        figure(item.gain_margin_db, "dB"), figure(item.phase_margin_deg, "deg"),
-        figure(None if late is None else 1e3 * late, "ms"), figure(item.disk_margin),
+        name, "yes" if item.stable else "NO", *map(format_figure, (item.ms, item.mt, worst.ms, worst.mt)),
+        format_figure(item.gain_margin_db, "dB"), format_figure(item.phase_margin_deg, "deg"),
+        format_figure(None if late is None else 1e3 * late, "ms"), format_figure(item.disk_margin),
         "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", _where(worst.parameters),
     )  # fmt: skip
 

@@ -12,7 +12,6 @@ that the one which passes holds at `confidence`.
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
@@ -21,6 +20,7 @@ import numpy as np
 from seaopt.control import Controller, ControllerSpec, tune
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -108,8 +108,7 @@ class JointTuning:
         lines += [f"  {_row(item)}" for item in self.rounds]
         return "\n".join([*lines, *([f"  {self.explanation}"] if self.explanation else [])])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def tune_certified(

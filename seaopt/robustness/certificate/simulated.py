@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -14,6 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -92,8 +92,7 @@ class Simulated:
         left_out = [f"No {what}: {reason}" for what, reason in self.left_out.items()]
         return "\n".join([*(repr(item) for item in found if item is not None), *left_out])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def simulated(

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.loops.sampled_plant import conditions, conditions_of
-from seaopt.markup import figure, table
+from seaopt.formatting import format_figure, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -106,9 +106,10 @@ class Worst(tuple[Plant, ParameterSet]):
         )
 
     def _repr_html_(self) -> str:
-        rows = [("Ms", f"{figure(self.ms)} at {figure(self.witness.ms_hz, 'Hz')}"), ("Mt", figure(self.mt))]
-        rows += [("spectral radius", f"{self.witness.spectral_radius:.6g}")]
-        return table(("worst case", ""), [*rows, *((name, f"{value:.5g}") for name, value in self.parameters.items())])
+        ms = f"{format_figure(self.ms)} at {format_figure(self.witness.ms_hz, 'Hz')}"
+        rows = [("Ms", ms), ("Mt", format_figure(self.mt)), ("spectral radius", f"{self.witness.spectral_radius:.6g}")]
+        rows += [(name, f"{value:.5g}") for name, value in self.parameters.items()]
+        return html_table(("worst case", ""), rows)
 
 
 def find_worst(

@@ -11,7 +11,6 @@ sampling are left out); this map does not, so that the two can part near the Nyq
 
 from __future__ import annotations
 
-import html
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +21,7 @@ from jaxtyping import Bool, Float
 from seaopt.control import Controller
 from seaopt.control.loops.loop import GROWING
 from seaopt.errors import ControlError
+from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -125,8 +125,7 @@ class StabilityMap:
         )
         return "\n".join([*lines, f"  link 2 fixed: {'stable' if self.fixed_stable else 'NOT STABLE'}"])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def against_environment(plant: Plant) -> Plant:

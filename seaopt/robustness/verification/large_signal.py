@@ -12,7 +12,6 @@ the controller.
 
 from __future__ import annotations
 
-import html
 import math
 from typing import Any
 
@@ -23,6 +22,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -82,8 +82,7 @@ class LargeSignal:
             lines.append(f"  {amplitude:.4g} N: {shown}{from_hz}")
         return "\n".join(lines)
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def large_signal(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -11,6 +10,7 @@ from typing import Any
 from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.impacts import is_pair
@@ -129,8 +129,7 @@ class Verification:
         speed = ", ".join(f"{name} {value:.0f}" for name, value in self.real_time_factor.items())
         return "\n".join([*lines, f"  seconds simulated in a second: {speed}; seed {self.seed}"])
 
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(repr(self))}</pre>"
+    _repr_html_ = html_text
 
 
 def verify(

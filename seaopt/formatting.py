@@ -1,0 +1,174 @@
+"""Numbers, units and tables as people read them, in text, in HTML and in notebooks.
+
+Every `__repr__`, `_repr_html_`, the report and the command line write what they have in common with these, so that a
+missing number, an infinite one and a range look the same everywhere.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+MISSING = "–"
+
+
+def format_number(value: Any, digits: int = 4, missing: str = MISSING) -> str:
+    """Return a number in few digits, "yes" or "no" for a flag, and `missing` where there is none.
+
+    Examples
+    --------
+    >>> format_number(1.23456), format_number(True), format_number(None), format_number(float("inf"))
+    ('1.235', 'yes', '–', '∞')
+
+    """
+    if value is None or np.isnan(value) or value == -np.inf:
+        return missing
+    if isinstance(value, (bool, np.bool_)):
+        return "yes" if value else "no"
+    return "∞" if value == np.inf else f"{value:.{digits}g}"
+
+
+def format_figure(value: Any, unit: str = "", digits: int = 4, missing: str = MISSING) -> str:
+    """Return a number with its unit.
+
+    Examples
+    --------
+    >>> format_figure(1.23456, "Hz"), format_figure(None, "Hz"), format_figure(7)
+    ('1.235 Hz', '–', '7')
+
+    """
+    number = format_number(value, digits, missing)
+    return number if number == missing else f"{number} {unit}".rstrip()
+
+
+def format_band(ends: tuple[float, float] | None, unit: str = "", missing: str = "none") -> str:
+    """Return a range with its unit, three digits of its low end and four of its high end.
+
+    Examples
+    --------
+    >>> format_band((0.5, 30.123), "Hz"), format_band(None, "Hz")
+    ('0.5 to 30.12 Hz', 'none')
+
+    """
+    return missing if ends is None else f"{format_number(ends[0], 3)} to {format_figure(ends[1], unit)}"
+
+
+def format_values(values: Mapping[str, float], digits: int = 4, missing: str = MISSING) -> str:
+    """Return names and their values.
+
+    Examples
+    --------
+    >>> format_values({"I_p": 0.3, "eta": 0.95}), format_values({}, missing="nominal")
+    ('I_p = 0.3, eta = 0.95', 'nominal')
+
+    """
+    return ", ".join(f"{name} = {format_number(value, digits)}" for name, value in values.items()) or missing
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return a count with its noun.
+
+    Examples
+    --------
+    >>> format_count(1, "sample"), format_count(3, "gap")
+    ('1 sample', '3 gaps')
+
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def join_words(words: Sequence[str]) -> str:
+    """Return an enumeration.
+
+    Examples
+    --------
+    >>> join_words(["a"]), join_words(["a", "b", "c"])
+    ('a', 'a, b and c')
+
+    """
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def format_table(rows: Iterable[Sequence[str]], head: Sequence[str] | None = None, align: str = "") -> list[str]:
+    """Return the lines of a table in aligned columns.
+
+    Parameters
+    ----------
+    rows : sequences of str
+        All of the same length.
+    head : sequence of str, optional
+        Titles of the columns.
+    align : str
+        "<" or ">" for each column; those without one are left aligned.
+
+    Examples
+    --------
+    >>> for line in format_table([("stand", "1.6"), ("swing", "1.45")], ("plant", "Ms"), "<>"):
+    ...     print(line)
+    plant    Ms
+    stand   1.6
+    swing  1.45
+
+    """
+    cells = [*([head] if head is not None else []), *rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    sides = align.ljust(len(widths), "<")
+    lines = (zip(row, sides, widths, strict=True) for row in cells)
+    return [
+        "  ".join(cell.rjust(width) if side == ">" else cell.ljust(width) for cell, side, width in line).rstrip()
+        for line in lines
+    ]
+
+
+def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of texts, its first row as head.
+
+    Examples
+    --------
+    >>> html_table(["name"], [["Ms < 1.6"]])
+    '<table><thead><tr><th>name</th></tr></thead><tbody><tr><td>Ms &lt; 1.6</td></tr></tbody></table>'
+
+    """
+    top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def html_paragraph(text: str) -> str:
+    """Return a paragraph.
+
+    Examples
+    --------
+    >>> html_paragraph("a & b")
+    '<p>a &amp; b</p>'
+
+    """
+    return f"<p>{html.escape(text)}</p>"
+
+
+def html_list(texts: Iterable[str]) -> str:
+    """Return a list, or nothing where there is nothing to list.
+
+    Examples
+    --------
+    >>> html_list(["a"]), html_list([])
+    ('<ul><li>a</li></ul>', '')
+
+    """
+    lines = "".join(f"<li>{html.escape(text)}</li>" for text in texts)
+    return f"<ul>{lines}</ul>" if lines else ""
+
+
+def html_text(result: object) -> str:
+    """Return what a result prints, for notebooks; a class whose text is a table takes it as its `_repr_html_`.
+
+    Examples
+    --------
+    >>> html_text({"a": 1})
+    '<pre>{&#x27;a&#x27;: 1}</pre>'
+
+    """
+    return f"<pre>{html.escape(repr(result))}</pre>"
