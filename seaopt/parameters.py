@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from seaopt.errors import ParameterError, suggestion
+from seaopt.formatting import format_table, html_table
 from seaopt.records import record
 from seaopt.units import factor, unit_after
 
@@ -202,12 +202,7 @@ class ParameterSet(Mapping[str, Parameter]):
         return rows
 
     def __repr__(self) -> str:
-        rows = self._rows()
-        widths = [max((len(row[i]) for row in rows), default=0) for i in range(5)]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-        return "\n".join(lines) if lines else "ParameterSet()"
+        return "\n".join(format_table(self._rows())) or "ParameterSet()"
 
     def _repr_html_(self) -> str:
-        rows = (f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in self._rows())
-        head = "".join(f"<th>{cell}</th>" for cell in ("name", "value", "std", "unit", ""))
-        return f"<table><tr>{head}</tr>{''.join(rows)}</table>"
+        return html_table(("name", "value", "std", "unit", ""), self._rows())

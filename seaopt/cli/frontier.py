@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 
 from rich.console import Console
-from rich.table import Table
 
 from seaopt.control import Frontier
 from seaopt.errors import ControlError
 
-MOST = 200
-HEAD = ("Hz", "met", "noise", "Ms", "worst", "disturb.", "|S|<-3dB", "phase", "force")
-NOTE = (
-    "noise: peak of |F_m/noise on the force|, N/N; Ms: of the worst plant; disturb.: integral of |S| over ln f from "
-    "0.1 Hz to the bandwidth, worst plant; |S|<-3dB: up to here; phase: margin; force: largest reference at that "
+MAX_BANDWIDTHS = 200
+FRONTIER_NOTE = (
+    "noise gain: peak of |F_m/noise on the force|, N/N; Ms: of the worst plant; disturbance: integral of |S| over ln f "
+    "from 0.1 Hz to the bandwidth, worst plant; |S| < -3 dB: up to here; force limit: largest reference at that "
     "frequency before the current saturates"
 )
 
@@ -40,27 +38,14 @@ def bandwidths(text: str) -> tuple[float, ...]:
     if not (0.0 < low <= high < math.inf and 0.0 < step < math.inf):
         raise ControlError(f"--sweep {text}: is not ascending; give 0 < LOW <= HIGH and a positive STEP")
     count = math.floor((high - low) / step * (1 + 1e-12) + 1e-9) + 1
-    if count > MOST:
-        raise ControlError(f"--sweep {text}: asks for {count} bandwidths; give a larger STEP, for {MOST} at most")
+    if count > MAX_BANDWIDTHS:
+        raise ControlError(
+            f"--sweep {text}: asks for {count} bandwidths; give a larger STEP, for {MAX_BANDWIDTHS} at most"
+        )
     return tuple(low + k * step for k in range(count))
 
 
-def show_frontier(frontier: Frontier, console: Console) -> None:
-    """Print a row a bandwidth, and below what blocks the rows that are not met."""
-    table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
-    for title in HEAD:
-        table.add_column(title, justify="left" if title in ("met", "worst") else "right", no_wrap=True)
-    for row in frontier.rows:
-        phase = "–" if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f}°"
-        force = "–" if row.force_limit_N is None else f"{row.force_limit_N:.4g} N"
-        table.add_row(
-            f"{row.bandwidth_hz:g}", "[green]yes[/]" if row.feasible else "[red]no[/]", f"{row.noise_gain:.4g}",
-            f"{row.ms:.4g}", row.ms_plant, f"{row.disturbance:.4g}", f"{row.sensitivity_bandwidth_hz:.3g} Hz", phase,
-            force,
-        )  # fmt: skip
-    console.print(table)
-    console.print(NOTE, style="dim", highlight=False, markup=False)
-    for row in frontier.rows:
-        if not row.feasible:
-            blocked = " and ".join(row.blocked_by)
-            console.print(f"{row.bandwidth_hz:g} Hz is blocked by {blocked}", highlight=False, markup=False)
+def print_frontier(frontier: Frontier, console: Console) -> None:
+    """Print a row per bandwidth, and what its columns mean."""
+    console.print(repr(frontier), highlight=False, markup=False)
+    console.print(FRONTIER_NOTE, style="dim", highlight=False, markup=False)

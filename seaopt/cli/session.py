@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from seaopt.cli.frontier import show_frontier
+from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, made_from
 from seaopt.cli.responses import responses
 from seaopt.control import Controller, sweep, tune
@@ -375,7 +375,7 @@ class Session:
             elif stage == "frf":
                 self.results[stage].show(console)
             elif stage == "sweep":
-                show_frontier(self.results[stage], console)
+                print_frontier(self.results[stage], console)
             elif stage in ("fit", "tune", "certify"):
                 if stage == "tune" and "joint" in self.results:
                     console.print(repr(self.results["joint"]), highlight=False, markup=False)

@@ -53,6 +53,7 @@ def test_certify_simulates_and_looks_at_the_port(done):
 def test_a_simulation_that_fails_exits_1_with_its_witness(folder, seaopt, design):
     """A load cell that stops at 20 N never shows the force that is asked for."""
     text = design.replace("noise_std = { F1 = 2.0 }", "saturation = { F1 = 20.0 }").replace('["swing"]', "[]")
+    text = text.replace("I_p = [0.2, 0.6]", "eta = [0.9, 1.0]")
     (folder / "clipped.toml").write_text(text, encoding="utf-8")
     assert seaopt("tune", "clipped.toml").returncode == 0
     out = seaopt("certify", "clipped.toml")

@@ -27,7 +27,7 @@ from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.estimation.problem.correlation import autocorrelation, ljung_box
-from seaopt.formatting import html_text
+from seaopt.formatting import format_count, format_table, html_text
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -240,13 +240,10 @@ class Estimator:
         return np.column_stack(input_samples(self.plant, log)), y
 
     def __repr__(self) -> str:
-        rows = [
-            f"  {name:<12} ± {std:.3g} {unit}" for (name, std), unit in zip(self.std.items(), self.units, strict=True)
-        ]
-        plural = "" if self.delay_samples == 1 else "s"
-        delay = f", delay of {self.delay_samples} sample{plural}" if self.delay_samples else ""
+        rows = [(name, f"± {std:.3g} {unit}") for (name, std), unit in zip(self.std.items(), self.units, strict=True)]
+        delay = f", delay of {format_count(self.delay_samples, 'sample')}" if self.delay_samples else ""
         head = f"Estimator of {self.plant.name} from {', '.join(self.outputs)} at {1 / self.sample_time_s:g} Hz{delay}"
-        return "\n".join([head, *rows])
+        return "\n  ".join([head, *format_table(rows)])
 
     _repr_html_ = html_text
 

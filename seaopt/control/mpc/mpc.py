@@ -34,7 +34,7 @@ from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.tuning.tuner import current_per_force
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
-from seaopt.formatting import html_text
+from seaopt.formatting import format_count, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.records import record
@@ -281,7 +281,7 @@ class ForceMPC:
         limits = f"{s.current_limit_A:g} A" + ("" if slew is None else f", {slew:g} A/s")
         return (
             f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
-            f"delay of {s.delay_samples} sample{'' if s.delay_samples == 1 else 's'}\n"
+            f"delay of {format_count(s.delay_samples, 'sample')}\n"
             f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} N\n"
             f"  bandwidth {s.bandwidth_hz:g} Hz without limits; horizon {1e3 * s.horizon_s:g} ms, "
             f"{self.prediction.knots.size} free currents"

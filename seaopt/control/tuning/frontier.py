@@ -12,7 +12,7 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task, solve
 from seaopt.errors import ControlError
-from seaopt.formatting import html_text
+from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -78,15 +78,8 @@ class Frontier:
         }
 
     def __repr__(self) -> str:
-        lines = ["  Hz    met   noise gain    Ms    disturbance  phase margin  force limit"]
-        for row in self.rows:
-            phase = "none" if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg"
-            force = "none" if row.force_limit_N is None else f"{row.force_limit_N:.4g} N"
-            lines.append(
-                f"{row.bandwidth_hz:5g}  {'yes' if row.feasible else 'no':4} {row.noise_gain:10.4g}  {row.ms:6.3f}"
-                f"  {row.disturbance:9.4g}    {phase:>10}  {force:>12}  {' and '.join(row.blocked_by)}".rstrip()
-            )
-        return "\n".join(lines)
+        head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin", "force limit")
+        return "\n".join(format_table(map(_cells, self.rows), (*head, "blocked by"), "><>><>>>>"))
 
     _repr_html_ = html_text
 
@@ -140,6 +133,21 @@ def sweep(
         controllers.append(controller)
         warm = (x,)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
+
+
+def _cells(row: FrontierRow) -> list[str]:
+    """Return a row of the table."""
+    return [
+        f"{row.bandwidth_hz:g}",
+        "yes" if row.feasible else "no",
+        *(format_number(value) for value in (row.noise_gain, row.ms)),
+        row.ms_plant,
+        format_number(row.disturbance),
+        format_figure(row.sensitivity_bandwidth_hz, "Hz", 3),
+        MISSING if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg",
+        format_figure(row.force_limit_N, "N"),
+        " and ".join(row.blocked_by),
+    ]
 
 
 def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Controller) -> FrontierRow:

@@ -8,7 +8,7 @@ from typing import Any
 
 from seaopt.estimation.advice.forecasts import Percent
 from seaopt.estimation.result.fit_result import Fit
-from seaopt.formatting import html_text
+from seaopt.formatting import format_table, html_text
 from seaopt.records import record
 
 
@@ -116,22 +116,19 @@ class Ranking:
         }  # fmt: skip
 
     def __repr__(self) -> str:
-        lines = [f"Ranking: {self.sentences[0]}"]
-        lines += [f"  {sentence}" for sentence in self.sentences[1:]]
+        head = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]")
+        rows = format_table((self._cells(row) for row in self.rows), head, "<>>>>")
+        return "\n  ".join([f"Ranking: {self.sentences[0]}", *self.sentences[1:], *rows])
+
+    def _cells(self, row: Ranked) -> list[str]:
+        """Return a row of the table; the criteria are counted from those of the best fit."""
         first = self.rows[0]
-        lines.append(
-            f"  {'':24} {'effective BIC':>14} {'BIC':>12} {'AIC':>12} {'unknowns':>9}  free run (held out) [%]"
+        percents = ", ".join(
+            f"{name}.{output} {p.used:.2f}" + ("" if p.held_out is None else f" ({p.held_out:.2f})")
+            for name, outputs in row.free_run.items()
+            for output, p in outputs.items()
         )
-        for row in self.rows:
-            percents = ", ".join(
-                f"{name}.{output} {p.used:.2f}" + ("" if p.held_out is None else f" ({p.held_out:.2f})")
-                for name, outputs in row.free_run.items()
-                for output, p in outputs.items()
-            )
-            away = [row.effective_bic - first.effective_bic, row.bic - first.bic, row.aic - first.aic]
-            lines.append(
-                f"  {row.name:24} {away[0]:>+14.6g} {away[1]:>+12.6g} {away[2]:>+12.6g} {row.unknowns:>9}  {percents}"
-            )
-        return "\n".join(lines)
+        away = (row.effective_bic - first.effective_bic, row.bic - first.bic, row.aic - first.aic)
+        return [row.name, *(f"{value:+.6g}" for value in away), str(row.unknowns), percents]
 
     _repr_html_ = html_text

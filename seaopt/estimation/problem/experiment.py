@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import EstimationError, suggestion
+from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.parameters import Parameter
@@ -26,10 +27,6 @@ MAX_DRIFT = 5
 SHORTEST = 4  # samples of a shot
 Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 @record(eq=False, repr=False)
@@ -207,14 +204,14 @@ class Experiment:
         if self.gaps not in ("split", "error"):
             raise EstimationError(f'experiment {self.name}: gaps = "{self.gaps}" is not known; use "split" or "error"')
         if self.gaps == "error" and len(self.stretches) > 1:
-            count = _counted(len(self.stretches) - 1, "gap")
+            count = format_count(len(self.stretches) - 1, "gap")
             raise EstimationError(
                 f'experiment {self.name}: the log has {count} and gaps = "error"; '
                 'use gaps = "split", or slice_s to choose a stretch'
             )
 
     def __repr__(self) -> str:
-        count = _counted(len(self.stretches), "segment")
+        count = format_count(len(self.stretches), "segment")
         return f"Experiment {self.name}: {self.plant.name}, {', '.join(self.outputs)} from {self.log.source} ({count})"
 
     @property
@@ -225,8 +222,8 @@ class Experiment:
         if log.gaps:
             alone = len(log) - sum(piece.stop - piece.start for piece in pieces)
             notes.append(
-                f"{_counted(len(log.gaps), 'gap')} split the log into {_counted(len(pieces), 'segment')}"
-                + (f", {_counted(alone, 'sample')} alone between gaps left out" if alone else "")
+                f"{format_count(len(log.gaps), 'gap')} split the log into {format_count(len(pieces), 'segment')}"
+                + (f", {format_count(alone, 'sample')} alone between gaps left out" if alone else "")
             )
         for name in self.outputs:
             missing = int(np.count_nonzero(~np.isfinite(log[name])))

@@ -5,7 +5,6 @@ It reads a `Log`, or a `Table` as a file holds it, whose time may repeat or run 
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, pairwise
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError, suggestion
+from seaopt.formatting import format_table, html_list, html_paragraph, html_table
 from seaopt.logs.quality.channel import ChannelQuality, assess_channel, keep_runs_while_others_move
 from seaopt.logs.quality.clock import ClockQuality, assess_clock
 from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
@@ -122,23 +122,15 @@ class Quality:
     def __repr__(self) -> str:
         lines = [f"Quality of {self.source}: {self.summary}"]
         lines += [f"  {note}" for note in self.notes]
-        lines += [
-            f"  {row}"
-            for row in _align([CHANNEL_HEAD, *(format_channel(channel) for channel in self.channels.values())])
-        ]
+        lines += [f"  {row}" for row in format_table(map(format_channel, self.channels.values()), CHANNEL_HEAD)]
         lines += [f"  {finding.severity}: {finding.sentence}" for finding in self.findings]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        head = "".join(f"<th>{html.escape(cell)}</th>" for cell in CHANNEL_HEAD)
-        rows = [format_channel(channel) for channel in self.channels.values()]
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        findings = "".join(
-            f"<li><b>{finding.severity}</b>: {html.escape(finding.sentence)}</li>" for finding in self.findings
-        )
         return (
-            f"<p>{html.escape(self.source)}: {html.escape(self.summary)}</p>"
-            f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table><ul>{findings}</ul>"
+            html_paragraph(f"{self.source}: {self.summary}")
+            + html_table(CHANNEL_HEAD, map(format_channel, self.channels.values()))
+            + html_list(f"{finding.severity}: {finding.sentence}" for finding in self.findings)
         )
 
 
@@ -281,11 +273,6 @@ def describe_jitter(clock: ClockQuality) -> str:
         return "no jitter"
     text = f"jitter {clock.jitter_rms / clock.period:.2%} rms, {clock.jitter_max / clock.period:.2%} at most"
     return text + (f" (timestamps rounded to {clock.rounding:.3g} s)" if clock.rounded_only else "")
-
-
-def _align(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def _fields(data: Any) -> dict[str, Any]:

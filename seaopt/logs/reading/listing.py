@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from seaopt.formatting import html_text
+from seaopt.formatting import format_table, html_text
 from seaopt.logs.formats import Field, open_source
 from seaopt.records import record
 
@@ -32,13 +32,9 @@ class Contents:
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
-        rows = [("column", "kind", "samples", "unit", "clock")]
-        rows += [_format_row(field) for field in self.fields[:MAX_ROWS]]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        rows = [_format_row(field) for field in self.fields[:MAX_ROWS]]
         lines = [f"{self.path}: {self.format}, {len(self.fields)} columns"]
-        lines += [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-        ]
+        lines += format_table(rows, ("column", "kind", "samples", "unit", "clock"))
         lines += [f"... and {len(self.fields) - MAX_ROWS} more"] if len(self.fields) > MAX_ROWS else []
         return "\n".join([*lines, *self.notes])
 

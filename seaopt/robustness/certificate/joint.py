@@ -20,7 +20,7 @@ import numpy as np
 from seaopt.control import Controller, ControllerSpec, tune
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
-from seaopt.formatting import html_text
+from seaopt.formatting import format_count, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -100,13 +100,13 @@ class JointTuning:
     @property
     def summary(self) -> str:
         """Whether it is certified, and in how many rounds."""
-        count = f"{len(self.rounds)} round{'' if len(self.rounds) == 1 else 's'}"
+        count = format_count(len(self.rounds), "round")
         return f"certified in {count}" if self.status == "certified" else f"NOT certified ({self.status}, {count})"
 
     def __repr__(self) -> str:
-        lines = [f"Joint tuning: {self.summary}", "  round  plants  failures  worst case, of its limit"]
-        lines += [f"  {_row(item)}" for item in self.rounds]
-        return "\n".join([*lines, *([f"  {self.explanation}"] if self.explanation else [])])
+        table = format_table(map(_cells, self.rounds), ("round", "plants", "failures", "worst case, of its limit"))
+        explanation = [self.explanation] if self.explanation else []
+        return "\n  ".join([f"Joint tuning: {self.summary}", *table, *explanation])
 
     _repr_html_ = html_text
 
@@ -245,10 +245,11 @@ def _place(worst: Worst) -> str:
     return ", ".join(f"{name} = {value:.4g}" for name, value in worst.parameters.items()) or "nominal"
 
 
-def _row(item: Round) -> str:
-    head = f"{item.number:<5}  {item.plants:<6}"
-    if item.certificate is None:
-        return f"{head}  limits not met on these plants"
-    name, worst = max(item.certificate.worst.items(), key=lambda pair: pair[1].severity)
+def _cells(entry: Round) -> tuple[str, str, str, str]:
+    """Return a row of the table of rounds."""
+    if entry.certificate is None:
+        return str(entry.number), str(entry.plants), "–", "limits not met on these plants"
+    name, worst = max(entry.certificate.worst.items(), key=lambda pair: pair[1].severity)
     size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
-    return f"{head}  {item.certificate.monte_carlo.failures:<8}  {size} on {name} at {_place(worst)}"
+    failures = str(entry.certificate.monte_carlo.failures)
+    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {_place(worst)}"

@@ -10,7 +10,7 @@ from typing import Any
 from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.errors import ControlError, suggestion
-from seaopt.formatting import html_text
+from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.impacts import is_pair
@@ -268,18 +268,14 @@ def _table(found: Verification) -> list[str]:
         "plant", "scenario", "size", "", "force N", "current A", "angle deg", "energy J", "at limit", "ends off N",
         "allowed N", "draw",
     )  # fmt: skip
-    cells: list[tuple[str, ...]] = [head]
+    cells: list[tuple[str, ...]] = []
     for row in found.worst():
         angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)
         scenario = found.scenario(row)
         cells.append((
             row.plant, row.scenario, scenario.size, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
-            f"{row.peak_current_A:.3g}", _shown(angle), _shown(row.peak_energy_J), f"{100 * row.saturated:.3g} %",
-            _shown(row.final_error_N), _shown(scenario.final_error), row.draw,
+            *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),
+            f"{100 * row.saturated:.3g} %", format_number(row.final_error_N, 3, ""),
+            format_number(scenario.final_error, 3, ""), row.draw,
         ))  # fmt: skip
-    widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
-    return ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
-
-
-def _shown(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
+    return format_table(cells, head)
