@@ -16,9 +16,15 @@ from seaopt.cli import main
 from seaopt.robustness import Certificate
 
 DEMO = so.demo_path().read_text(encoding="utf-8")
-SHORT = DEMO.replace("duration_s = 164", "duration_s = 20").replace("duration_s = 60", "duration_s = 6").replace(
-    "samples = 1375", "samples = 60"
-)  # fmt: skip
+SHORTER = {
+    "duration_s = 164": "duration_s = 20",
+    "duration_s = 60, rate_hz = 400, noise_std = { F1 = 2.0, F2": "duration_s = 6, rate_hz = 400, noise_std = { F1",
+    "samples = 1375": "samples = 60",
+}
+SHORT = DEMO
+for _long, _short in SHORTER.items():
+    assert _long in SHORT
+    SHORT = SHORT.replace(_long, _short)
 
 
 def run_process(*arguments, cwd):
@@ -33,6 +39,12 @@ def run_process(*arguments, cwd):
 def short() -> str:
     """Return a problem file's text: the demo's on short logs, with few draws."""
     return SHORT
+
+
+@pytest.fixture(scope="session")
+def stand_alone(short) -> str:
+    """Return the same problem with the first experiment alone."""
+    return short[: short.rindex("[[experiment]]")] + short[short.index("[fit]") :]
 
 
 @pytest.fixture(scope="session")

@@ -64,7 +64,7 @@ def test_a_simulation_that_fails_exits_1_with_its_witness(folder, seaopt, design
 
 
 def test_retune_tunes_until_certified(folder, seaopt, design, without_drawing, without_simulation):
-    ranges = "I_p = [0.2, 0.6], eta = [0.9, 1.0], delay_s = [0.0, 2e-4]"
+    ranges = "I_p = [0.2, 0.6], delay_s = [0.0, 4e-4]"
     text = design.replace("I_p = [0.2, 0.6]", ranges) + "retune = 4\nbounds = true\n"
     (folder / "retune.toml").write_text(text.replace('robust_to = ["swing"]', ""), encoding="utf-8")
     out = seaopt("run", "retune.toml", "-o", "retune")
@@ -127,8 +127,8 @@ def test_a_controller_of_another_fit_is_not_exported(copied, seaopt):
 OPEN = ("[plant.stand]", "K_tau = { value = 0.0255, free = true }\n[plant.stand]", 1)  # only eta K_tau is seen
 
 
-def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, short, without_drawing):
-    (folder / "open.toml").write_text(short.replace(*OPEN), encoding="utf-8")
+def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, stand_alone, without_drawing):
+    (folder / "open.toml").write_text(stand_alone.replace(*OPEN), encoding="utf-8")
     out = seaopt("run", "open.toml", "-o", "open")
     assert out.returncode == 1
     assert "enter only together" in out.stdout
@@ -138,10 +138,10 @@ def test_an_unidentifiable_fit_exits_1_with_a_report(folder, seaopt, short, with
 
 
 def test_values_that_the_fit_does_not_identify_are_named_wherever_they_are_used(
-    folder, seaopt, short, without_simulation
+    folder, seaopt, stand_alone, without_simulation
 ):
     ranges = "I_p = [0.2, 0.6], K_tau = [0.024, 0.027], eta = [0.9, 1.0]"
-    text = short.replace(*OPEN).replace("I_p = [0.2, 0.6]", ranges)
+    text = stand_alone.replace(*OPEN).replace("I_p = [0.2, 0.6]", ranges)
     (folder / "ranged.toml").write_text(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.8"), "utf-8")
     assert seaopt("fit", "ranged.toml").returncode == 1
     for stage, file in (("tune", "controller.json"), ("certify", "robustness.json")):
@@ -240,15 +240,16 @@ def test_frf_shows_and_writes_what_the_logs_say_in_frequency(copied, seaopt):
     assert len(pair["frequency_hz"]) == len(pair["coherence"]) == len(pair["real"]) == len(pair["imag"])
 
 
-def test_frf_of_shorter_stretches_without_a_fit(folder, seaopt, short, without_drawing):
-    out = seaopt("frf", "short.toml", "-o", "alone", "--json", "--stretch", "2.5")
+def test_frf_of_shorter_stretches_without_a_fit(folder, seaopt, stand_alone, without_drawing):
+    (folder / "alone.toml").write_text(stand_alone, encoding="utf-8")
+    out = seaopt("frf", "alone.toml", "-o", "alone", "--json", "--stretch", "2.5")
     alone = json.loads(out.stdout)["experiments"]["chirp"]["pairs"][0]
     assert alone["frequency_hz"][0] == pytest.approx(0.4)
     assert alone["fitted_misfit"] is None
 
 
-def test_frf_of_a_log_that_says_nothing_exits_1(folder, seaopt, short, without_drawing):
-    drowned = short.replace("noise_std = { F1 = 2.0, F2 = 2.0 }", "noise_std = { F1 = 1e6, F2 = 1e6 }")
+def test_frf_of_a_log_that_says_nothing_exits_1(folder, seaopt, stand_alone, without_drawing):
+    drowned = stand_alone.replace("noise_std = { F1 = 2.0, F2 = 2.0 }", "noise_std = { F1 = 1e6, F2 = 1e6 }")
     (folder / "drowned.toml").write_text(drowned, encoding="utf-8")
     out = seaopt("frf", "drowned.toml", "-o", "drowned")
     assert out.returncode == 1, out.stderr
