@@ -1,4 +1,4 @@
-"""Bounds from above: never below any draw, near the worst case bounds, and nothing proven that is not so."""
+"""Bounds from above: never below any draw, near the worst case found, and nothing proven that is not so."""
 
 from __future__ import annotations
 

@@ -21,14 +21,13 @@ from seaopt.robustness.verification.scenarios import Phase, Scenario, default_sc
 from seaopt.robustness.verification.verification import verify
 from tests.control.test_closed_loop import swing_by_hand
 
-SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 STEP = Scenario(name="step", phases=(Phase(duration_s=0.12, force_N=30.0), Phase(duration_s=0.28)))
 TS = 1e-3
 
 
 @pytest.fixture(scope="module")
-def controller(stand, swing, thor):
-    return so.tune(stand, thor, SPEC, robust_to={"swing": swing})
+def controller(limited_controller):
+    return limited_controller
 
 
 @pytest.fixture(scope="module")
@@ -200,14 +199,14 @@ def test_the_fall_is_dop853s_and_its_energy_is_the_work_done(controller, swing, 
 
 def test_every_scenario_of_a_draw_that_rests_at_an_angle(controller, stand, swing, thor):
     drawn = [at(thor.update(I_p=i), phi=phi, delay_s=0.2e-3) for i, phi in ((0.2, 0.6), (0.6, -0.6))]
-    found = verify(controller, {"stand": stand, "swing": swing}, thor, draws={"swing": drawn})
-    assert found.passed, found
-    rows = [row for row in found.rows if row.draw == "1"]
+    verification = verify(controller, {"swing": swing}, thor, draws={"swing": drawn}, partners={"swing": stand})
+    assert verification.passed, verification
+    rows = [row for row in verification.rows if row.draw == "1"]
     assert len(rows) == 7
     assert rows[0].parameters == {"I_p": 0.2, "phi": 0.6, "delay_s": 0.2e-3}
     for row in rows:
         first = math.radians(120) if row.scenario.startswith("fall") else 0.6
-        assert found.replay(row).outputs["phi"][0, 0] == pytest.approx(first) or row.scenario == "contact"
+        assert verification.replay(row).outputs["phi"][0, 0] == pytest.approx(first) or row.scenario == "contact"
 
 
 def test_a_link_is_held_and_let_go_at_the_drawn_angle(controller, stand, swing, thor):
@@ -223,29 +222,30 @@ def test_a_loop_that_is_unstable_at_the_angle_alone_fails_there(controller, swin
     """Beyond 90 degrees a constant force holds the pendulum on top of its swing: stable nowhere."""
     drawn = at(thor, phi=2.0)
     assert not controller.close(swing, drawn).figures().stable
-    found = verify(controller, {"swing": swing}, thor, draws={"swing": [drawn]})
-    steps = {row.draw: row for row in found.rows if row.scenario == "small step"}
+    verification = verify(controller, {"swing": swing}, thor, draws={"swing": [drawn]}, scenarios=[STEP])
+    steps = {row.draw: row for row in verification.rows}
     assert steps["nominal"].passed and not steps["1"].passed
     assert steps["1"].reason.startswith("unstable: the linear loop's spectral radius is ")
 
 
 def test_what_the_motor_cannot_hold_is_named(controller, swing, thor):
-    found = verify(controller, {"swing": swing}, thor, draws={"swing": [at(thor, phi=1.51)]})
-    failed = [row for row in found.failures if row.scenario == "small step"]
+    verification = verify(controller, {"swing": swing}, thor, draws={"swing": [at(thor, phi=1.51)]}, scenarios=[STEP])
     current = abs(resting_by_hand(thor, 1.51)[2])
     assert current > 9.0
-    assert f"to rest at phi = 1.51 takes {-current:.4g} A, above the limit of 9 A; narrow its range" in failed[0].reason
-    assert all(row.draw == "1" for row in found.failures)
+    assert (
+        f"to rest at phi = 1.51 takes {-current:.4g} A, above the limit of 9 A; narrow its range"
+        in verification.failures[0].reason
+    )
+    assert [row.draw for row in verification.failures] == ["1"]
 
 
 def test_the_certificates_worst_draw_is_played_there(controller, swing, thor):
     ranges = {"I_p": (0.2, 0.5), "phi": (0.3, 0.8), "delay_s": (0.0, 2e-4)}
-    certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50).with_simulation()
-    verification = certificate.simulated.verification
-    row = next(row for row in verification.rows if (row.plant, row.draw, row.scenario) == ("swing", "1", "small step"))
-    worst = certificate.worst["swing"].parameters
-    assert row.parameters == pytest.approx(worst)
-    again = verification.replay(row)
+    _, drawn = certified = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50).worst["swing"]
+    worst = certified.parameters
+    verification = verify(controller, {"swing": swing}, thor, draws={"swing": [drawn]}, scenarios=[STEP])
+    assert verification.rows[1].parameters == pytest.approx(worst)
+    again = verification.replay(verification.rows[1])
     values = thor.update(I_p=worst["I_p"])
     assert again.outputs["F1"][0, 0] == pytest.approx(resting_by_hand(values, worst["phi"])[1])
 
@@ -275,8 +275,7 @@ def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(contro
     )
     force = np.abs(loop.plant.response(f[k : k + 1]))[0] * needed * motor
     kick = Scenario(name="kick", phases=(Phase(duration_s=0.1, force_N=200.0), Phase(duration_s=3.0)))
-    found = verify(wild, {"swing": swing}, thor, scenarios=[kick], draws={"swing": [drawn]})
-    row = found.rows[1]
+    row = verify(wild, {"swing": swing}, thor, scenarios=[kick], draws={"swing": [drawn]}).rows[1]
     assert "sustains itself" in row.reason
     assert row.limit_cycle_hz == pytest.approx(f[k], rel=0.015)
     assert row.limit_cycle_N == pytest.approx(force, rel=0.05)

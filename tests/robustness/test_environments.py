@@ -15,9 +15,8 @@ from seaopt.robustness.verification.environments import against_environment, cou
 
 
 @pytest.fixture(scope="module")
-def controller(stand, swing, thor):
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25)
-    return so.tune(stand, thor, spec, robust_to={"swing": swing})
+def controller(limited_controller):
+    return limited_controller
 
 
 @pytest.fixture(scope="module")

@@ -15,18 +15,17 @@ from seaopt.control import Gains
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError
 from seaopt.robustness.verification.large_signal import large_signal
-from seaopt.robustness.verification.oscillation import oscillation
+from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Stage, play
-from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, step_limit
+from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, left_out, step_limit
 from seaopt.robustness.verification.verification import verify
 
-SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 CELL = so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})
 
 
 @pytest.fixture(scope="module")
-def controller(stand, swing, thor):
-    return so.tune(stand, thor, SPEC, robust_to={"swing": swing})
+def controller(limited_controller):
+    return limited_controller
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +113,8 @@ def test_a_limit_cycle_is_found_where_the_describing_function_says(controller, s
     force = np.abs(loop.plant.response(f[at : at + 1]))[0] * needed * motor
 
     kick = Scenario(name="kick", phases=(Phase(duration_s=0.1, force_N=200.0), Phase(duration_s=3.0)))
-    found = verify(wild, {"stand": stand}, thor, scenarios=[kick])
-    (row,) = found.rows
+    verification = verify(wild, {"stand": stand}, thor, scenarios=[kick])
+    (row,) = verification.rows
     assert not row.passed
     assert "sustains itself" in row.reason
     assert row.limit_cycle_hz == pytest.approx(f[at], rel=0.015)
@@ -123,20 +122,20 @@ def test_a_limit_cycle_is_found_where_the_describing_function_says(controller, s
 
 
 def test_an_unstable_loop_without_limit_grows_and_is_named(controller, stand, thor):
-    wild = with_law(replace(controller, spec=replace(SPEC, current_limit_A=None)), k_p=45.0, k_d=0.45)
-    found = verify(wild, {"stand": stand}, thor.update(b_r=2e-4))
-    assert not found.passed
-    assert all("grows" in row.reason or "numbers" in row.reason for row in found.rows)
-    assert "FAILED stand" in repr(found)
+    wild = with_law(replace(controller, spec=replace(controller.spec, current_limit_A=None)), k_p=45.0, k_d=0.45)
+    verification = verify(wild, {"stand": stand}, thor.update(b_r=2e-4))
+    assert not verification.passed
+    assert all("grows" in row.reason or "numbers" in row.reason for row in verification.rows)
+    assert "FAILED stand" in repr(verification)
 
 
 def test_a_draw_may_bring_a_delay(controller, stand, thor):
     """Beyond the delay margin the loop does not settle; within it it does."""
     margin = controller.achieved.delay_margin_s
     late = [thor.with_parameters(so.Parameter(name="delay_s", value=share * margin, unit="s")) for share in (0.5, 1.15)]
-    found = verify(controller, {"stand": stand}, thor, draws={"stand": late})
-    assert [row.passed for row in found.rows if row.scenario == "small step"] == [True, True, False]
-    assert found.failures[0].parameters == {"delay_s": 1.15 * margin}
+    verification = verify(controller, {"stand": stand}, thor, draws={"stand": late})
+    assert [row.passed for row in verification.rows if row.scenario == "small step"] == [True, True, False]
+    assert verification.failures[0].parameters == {"delay_s": 1.15 * margin}
 
 
 def test_limits_are_named_with_the_draw(controller, swing, thor):
@@ -144,10 +143,12 @@ def test_limits_are_named_with_the_draw(controller, swing, thor):
         name="knock", phases=(Phase(duration_s=0.05), Phase(duration_s=1.0, impulse_Ns=1.0)), max_force_N=10.0,
         max_angle_rad=1e-4,
     )  # fmt: skip
-    found = verify(controller, {"swing": swing}, thor, scenarios=[scenario], draws={"swing": [thor.update(m=5.0)]})
-    assert len(found.failures) == 2
-    assert "F1 reaches" in found.failures[1].reason and "the angle reaches" in found.failures[1].reason
-    assert "m = 5" in repr(found)
+    verification = verify(
+        controller, {"swing": swing}, thor, scenarios=[scenario], draws={"swing": [thor.update(m=5.0)]}
+    )
+    assert len(verification.failures) == 2
+    assert "F1 reaches" in verification.failures[1].reason and "the angle reaches" in verification.failures[1].reason
+    assert "m = 5" in repr(verification)
 
 
 def test_a_payload_arrives(controller, swing, thor):
@@ -163,9 +164,11 @@ def test_a_payload_arrives(controller, swing, thor):
 
 def test_what_cannot_be_played_is_said(controller, stand, swing, thor):
     contact = Scenario(name="contact", phases=(Phase(duration_s=0.1, held=True), Phase(duration_s=0.5)))
-    found = verify(replace(controller, design=None), {"swing": swing}, thor, scenarios=[contact])
-    assert not found.passed
-    assert found.skipped == (("contact", "swing", "there is no plant with the same actuator and its link fixed"),)
+    verification = verify(replace(controller, design=None), {"swing": swing}, thor, scenarios=[contact])
+    assert not verification.passed
+    assert verification.skipped == (
+        ("contact", "swing", "there is no plant with the same actuator and its link fixed"),
+    )
     assert verify(controller, {"swing": swing}, thor, scenarios=[contact], partners={"swing": stand}).rows
     blow = Scenario(name="blow", phases=(Phase(duration_s=0.1, impulse_Ns=1.0),))
     with pytest.raises(ControlError, match="cannot be played"):
@@ -193,11 +196,11 @@ def test_bad_input(controller, thor, attempt, words):
 
 def test_what_a_missing_current_limit_leaves_out_is_said(controller, stand, swing, thor):
     free = replace(controller, spec=replace(controller.spec, current_limit_A=None))
-    found = verify(free, {"stand": stand, "swing": swing}, thor)
-    reason = "nothing saturates without current_limit_A"
-    expected = (("saturating doublet", "stand"), ("saturating hold", "stand"), ("saturating doublet", "swing"))
-    assert tuple(item[:2] for item in found.skipped) == expected
-    assert f"not played: saturating hold on stand, {reason}" in repr(found)
+    verification = verify(free, {"stand": stand}, thor)
+    assert [skipped[:2] for skipped in verification.skipped] == [(name, "stand") for name in left_out(free, stand)]
+    assert left_out(free, stand) == ("saturating doublet", "saturating hold")
+    assert left_out(free, swing) == ("saturating doublet",)
+    assert "saturating hold on stand, nothing saturates without current_limit_A" in repr(verification)
 
 
 def test_a_trace_is_printed_short(verification):
@@ -215,47 +218,47 @@ def test_scenarios_of_other_plants(controller, thor):
         assert {"impact", "payload", "contact"} <= set(names)
         assert payload in names["payload"].phases[1].scale
         chosen = [names["impact"], names["contact"]]
-        found = verify(controller, {"plant": plant}, thor, scenarios=chosen, partners={"plant": held})
-        assert [row.scenario for row in found.rows] == ["impact", "contact"]
+        verification = verify(controller, {"plant": plant}, thor, scenarios=chosen, partners={"plant": held})
+        assert [row.scenario for row in verification.rows] == ["impact", "contact"]
 
 
 def test_noise_is_no_limit_cycle_and_ringing_neither():
     rng = np.random.default_rng(0)
     t = np.arange(2000) * 1e-3
     coloured = np.convolve(rng.normal(size=2000), np.exp(-np.arange(60) / 10), mode="same")
-    assert oscillation(coloured, 1e-3, floor=0.1, lowest_hz=5.0) is None
-    ringing = oscillation(np.exp(-3 * t) * np.sin(2 * np.pi * 31 * t), 1e-3, floor=1e-3, lowest_hz=5.0)
+    assert find_oscillation(coloured, 1e-3, floor=0.1, lowest_hz=5.0) is None
+    ringing = find_oscillation(np.exp(-3 * t) * np.sin(2 * np.pi * 31 * t), 1e-3, floor=1e-3, lowest_hz=5.0)
     assert ringing is None or not (ringing.sustained or ringing.growing)
-    growing = oscillation(np.exp(2 * t) * np.sin(2 * np.pi * 31 * t), 1e-3, floor=1e-3, lowest_hz=5.0)
+    growing = find_oscillation(np.exp(2 * t) * np.sin(2 * np.pi * 31 * t), 1e-3, floor=1e-3, lowest_hz=5.0)
     assert growing is not None and growing.growing
     swaying = 50 * np.sin(2 * np.pi * 0.9 * t + 1) + 0.5 * np.sin(2 * np.pi * 47.3 * t)
-    hidden = oscillation(swaying, 1e-3, floor=0.1, lowest_hz=4.0)
+    hidden = find_oscillation(swaying, 1e-3, floor=0.1, lowest_hz=4.0)
     assert hidden is not None and hidden.sustained
     assert hidden.frequency_hz == pytest.approx(47.3, abs=0.1)
     assert hidden.amplitude == pytest.approx(0.5, rel=0.02)
 
 
 def test_the_sweep_is_linear_below_the_saturation_map_and_not_above(controller, stand, thor):
-    found = large_signal(controller, stand, thor)
-    linear = np.abs(controller.close(stand, thor).tracking(found.frequency_hz))
-    above = found.amplitude_N[:, None] > found.onset_N
-    clear = np.abs(found.amplitude_N[:, None] / found.onset_N - 1) > 0.01
-    np.testing.assert_array_equal(found.saturated[clear], above[clear])
-    size = np.abs(found.gain)
+    sweep = large_signal(controller, stand, thor)
+    linear = np.abs(controller.close(stand, thor).tracking(sweep.frequency_hz))
+    above = sweep.amplitude_N[:, None] > sweep.onset_N
+    clear = np.abs(sweep.amplitude_N[:, None] / sweep.onset_N - 1) > 0.01
+    np.testing.assert_array_equal(sweep.saturated[clear], above[clear])
+    size = np.abs(sweep.gain)
     np.testing.assert_allclose(size[~above], np.broadcast_to(linear, size.shape)[~above], rtol=2e-3)
-    far = found.amplitude_N[:, None] > 1.5 * found.onset_N
+    far = sweep.amplitude_N[:, None] > 1.5 * sweep.onset_N
     assert np.all(size[far] < np.broadcast_to(linear, size.shape)[far])
-    assert found.bandwidth_hz[0] == pytest.approx(30.0, rel=0.01)
-    assert found.bandwidth_hz[0] > found.bandwidth_hz[3] > found.bandwidth_hz[4]
+    assert sweep.bandwidth_hz[0] == pytest.approx(30.0, rel=0.01)
+    assert sweep.bandwidth_hz[0] > sweep.bandwidth_hz[3] > sweep.bandwidth_hz[4]
 
 
 def test_far_above_the_limit_the_current_is_a_square_wave(controller, stand, thor):
     """4/pi of the motor force at its limit, through the plant: what is left of any controller."""
-    found = large_signal(controller, stand, thor, amplitudes_N=(2e4,), frequencies_hz=(40.0,))
-    f = found.frequency_hz
+    sweep = large_signal(controller, stand, thor, amplitudes_N=(2e4,), frequencies_hz=(40.0,))
+    f = sweep.frequency_hz
     plant = np.abs(controller.plant(stand, thor).response(f))[0]
     expected = 4 / np.pi * 9.0 / controller.current_per_force_A_per_N * plant
-    assert np.abs(found.gain[0, 0]) * 2e4 == pytest.approx(expected, rel=0.02)
+    assert np.abs(sweep.gain[0, 0]) * 2e4 == pytest.approx(expected, rel=0.02)
 
 
 def test_a_chirp_needs_its_phase(controller, stand, thor):

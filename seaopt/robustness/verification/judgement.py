@@ -36,7 +36,7 @@ from seaopt.control.running.sampled_loop import largest_current
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.robustness.verification.linear import LinearView, linear_view
-from seaopt.robustness.verification.oscillation import oscillation
+from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Stage, Trace
 from seaopt.robustness.verification.scenarios import Scenario, moves
 
@@ -229,7 +229,7 @@ def _ringing(
         floor = _floor(stage, trace, run)
         if not view.instability:
             floor = max(floor, LINE * view.force_std(lowest))
-        seen = oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
+        seen = find_oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
         if seen is not None and (seen.sustained or seen.growing):
             found.figures.update(limit_cycle_N=seen.amplitude, limit_cycle_hz=seen.frequency_hz)
             what = "sustains itself" if seen.sustained else f"grows {seen.growth:.3g} times"

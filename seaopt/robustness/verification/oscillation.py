@@ -1,4 +1,4 @@
-"""Tell an oscillation that sustains itself from noise, from ringing that dies out and from one that grows."""
+"""The oscillation in a window of a signal, for verification: one that sustains itself or grows, not noise or ringing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from seaopt.records import record
 
-COHERENT = 0.5  # of the power above lowest_hz, that one line must explain
+LINE_SHARE = 0.5  # of the power above lowest_hz: the least that one spectral line must explain
 STEADY = 1.3  # largest ratio of the amplitudes of the two halves
 
 
@@ -19,9 +19,9 @@ class Oscillation:
     ----------
     frequency_hz : float
     amplitude : float
-        Of the window's second half, in the signal's unit.
+        In the window's second half, in the signal's unit.
     growth : float
-        Over that of the first half.
+        Ratio of that to the amplitude in the first half.
 
     """
 
@@ -31,62 +31,63 @@ class Oscillation:
 
     @property
     def sustained(self) -> bool:
-        """It neither grows nor dies out."""
+        """Whether it neither grows nor dies out."""
         return 1.0 / STEADY <= self.growth <= STEADY
 
     @property
     def growing(self) -> bool:
-        """It grows."""
+        """Whether it grows."""
         return self.growth > STEADY
 
 
-def oscillation(
+def find_oscillation(
     signal: Float[np.ndarray, " n"], sample_time_s: float, *, floor: float, lowest_hz: float
 ) -> Oscillation | None:
-    """Return the oscillation that stands out of a window, or None.
+    """Return the oscillation that stands out in a window, or None.
 
     It stands out if its amplitude is above `floor`, in both halves or only in the second, and if it explains at least
-    half of the power above `lowest_hz`: noise filtered by a loop does not.
+    half of the power above `lowest_hz`; noise filtered by a loop does not.
 
     Parameters
     ----------
     signal : array, shape (n,)
-        Under constant conditions.
+        A window under constant conditions.
     sample_time_s : float
         Seconds.
     floor : float
-        What noise and quantisation alone make, in the signal's unit.
+        The amplitude that noise and quantisation alone make, in the signal's unit.
     lowest_hz : float
-        Slower movement is taken out: at least two periods should fit into half of the window.
+        Slower movement is removed; at least two periods of this frequency should fit into half of the window.
 
     Examples
     --------
     >>> import numpy as np
     >>> t = np.arange(2000) * 1e-3
-    >>> found = oscillation(3.0 * np.sin(2 * np.pi * 41.7 * t), 1e-3, floor=0.1, lowest_hz=5.0)
-    >>> round(found.frequency_hz, 1), round(found.amplitude, 2), found.sustained
+    >>> line = find_oscillation(3.0 * np.sin(2 * np.pi * 41.7 * t), 1e-3, floor=0.1, lowest_hz=5.0)
+    >>> round(line.frequency_hz, 1), round(line.amplitude, 2), line.sustained
     (41.7, 3.0, True)
-    >>> oscillation(3.0 * np.sin(2 * np.pi * 41.7 * t) * np.exp(-2 * t), 1e-3, floor=0.1, lowest_hz=5.0).sustained
+    >>> fading = 3.0 * np.sin(2 * np.pi * 41.7 * t) * np.exp(-2 * t)
+    >>> find_oscillation(fading, 1e-3, floor=0.1, lowest_hz=5.0).sustained
     False
 
     """
     size = float(np.max(np.abs(signal)))
     if not size:
         return None
-    fast = _above(signal / size, sample_time_s, lowest_hz)  # of an unstable loop the squares would overflow
+    fast = _remove_slow(signal / size, sample_time_s, lowest_hz)  # an unstable loop's squares would overflow
     n = fast.size
-    f = _frequency(fast, sample_time_s)
+    f = _find_frequency(fast, sample_time_s)
     time = sample_time_s * np.arange(n)
     halves = (slice(0, n // 2), slice(n // 2, n))
-    first, last = (_amplitude(fast[part], time[part], f) for part in halves)
+    first, last = (_fit_amplitude(fast[part], time[part], f) for part in halves)
     power = 2.0 * float(np.mean(fast[halves[1]] ** 2))
-    if last <= floor / size or last**2 < COHERENT * power:
+    if last <= floor / size or last**2 < LINE_SHARE * power:
         return None
     return Oscillation(frequency_hz=f, amplitude=size * last, growth=last / max(first, 1e-300))
 
 
-def _above(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:
-    """Take out what is slower: the least-squares fit of cosines of a half-window's multiples (and a line) up to it."""
+def _remove_slow(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:
+    """Return the signal less the least-squares fit of a line and of the window's slow cosines."""
     n = signal.size
     time = np.linspace(-1.0, 1.0, n)
     harmonics = np.arange(1, max(int(2 * n * sample_time_s * lowest_hz), 0) + 1)
@@ -95,8 +96,8 @@ def _above(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: flo
     return signal - basis @ np.linalg.lstsq(basis, signal, rcond=None)[0]
 
 
-def _frequency(signal: Float[np.ndarray, " n"], sample_time_s: float) -> float:
-    """Return the frequency of the largest line, between the bins by the parabola through their logarithms."""
+def _find_frequency(signal: Float[np.ndarray, " n"], sample_time_s: float) -> float:
+    """Return the frequency of the largest line, refined between the bins by a parabola through their logarithms."""
     n = signal.size
     spectrum = np.abs(np.fft.rfft(signal * np.hanning(n)))
     k = int(np.clip(np.argmax(spectrum), 1, spectrum.size - 2))
@@ -106,6 +107,6 @@ def _frequency(signal: Float[np.ndarray, " n"], sample_time_s: float) -> float:
     return float((k + np.clip(shift, -0.5, 0.5)) / (n * sample_time_s))
 
 
-def _amplitude(signal: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], f: float) -> float:
+def _fit_amplitude(signal: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"], f: float) -> float:
     basis = np.column_stack([np.cos(2 * np.pi * f * time), np.sin(2 * np.pi * f * time)])
     return float(np.hypot(*np.linalg.lstsq(basis, signal, rcond=None)[0]))
