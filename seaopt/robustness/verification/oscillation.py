@@ -1,4 +1,4 @@
-"""The oscillation in a window of a signal, for verification: one that sustains itself or grows, not noise or ringing."""
+"""The oscillation in a window of a signal, for verification: one that sustains itself or grows, not noise."""
 
 from __future__ import annotations
 
