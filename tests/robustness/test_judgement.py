@@ -58,7 +58,7 @@ def test_a_load_is_no_bound_on_what_is_known(controller, stand, swing, thor):
 def test_noise_on_a_healthy_loop_is_no_fault(controller, stand, swing, thor):
     """60 Hz, and a load cell of 2 N and of 20 N, more than half of the small step; a benchmark counts more seeds."""
     healthy = so.tune(stand, thor, replace(controller.spec, bandwidth_hz=60), robust_to={"swing": swing})
-    for std, plant, seeds in ((2.0, stand, 1), (2.0, swing, 1), (20.0, stand, 3), (20.0, swing, 1)):
+    for std, plant, seeds in ((2.0, stand, 1), (20.0, stand, 2), (20.0, swing, 1)):
         scenarios = [chosen(healthy, plant, name) for name in ("small step", "chirp")]
         for seed in range(seeds):
             cell = so.Sensors(noise_std={"F1": std})
@@ -132,13 +132,12 @@ def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand
     plant = so.plants.high_impedance(parts=["stribeck"])
     params = plant.complete(thor).update(f_c=100.0, v_s=1e-5, f_s=300.0, v_st=3e-4)
     assert hunter.close(plant, params).figures().stable
-    slow = Scenario(name="hold", phases=(Phase(duration_s=0.2), Phase(duration_s=10.5, force_N=50.0)))
-    verification = verify(hunter, {"stand": plant}, params, scenarios=[slow, chosen(hunter, plant, "small step")])
-    force = verification.replay(verification.rows[0]).outputs["F1"][0, -8192:]
+    hold = Scenario(name="hold", phases=(Phase(duration_s=0.2), Phase(duration_s=9.5, force_N=50.0)))
+    force = play(Stage(controller=hunter, plant=plant), hold, [params]).outputs["F1"][0, -8192:]
     spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(8192))) / 2048.0
     top = int(np.argmax(spectrum))
     assert spectrum[top] > 30.0 and 3.0 < top / 8.192 < 6.0
-    for row in verification.rows:
-        assert "sustains itself" in row.reason
-        assert row.limit_cycle_hz == pytest.approx(top / 8.192, abs=0.15)
-        assert row.limit_cycle_N == pytest.approx(spectrum[top], rel=0.1)
+    (row,) = verify(hunter, {"stand": plant}, params, scenarios=[chosen(hunter, plant, "small step")]).rows
+    assert "sustains itself" in row.reason
+    assert row.limit_cycle_hz == pytest.approx(top / 8.192, abs=0.15)
+    assert row.limit_cycle_N == pytest.approx(spectrum[top], rel=0.1)
