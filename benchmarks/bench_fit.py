@@ -29,7 +29,7 @@ import numpy as np
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING
 from seaopt.simulation import Clock, Point, Segment, make_model, run_passes, transition
-from seaopt.simulation.compiler import FLAGS, NATIVE, find_compiler
+from seaopt.simulation.native import FLAGS, NATIVE, find_compiler
 
 FREE = ("J", "b_r", "eta")
 ROUNDS = 40

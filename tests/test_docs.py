@@ -12,7 +12,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control.deploy.export import export
-from seaopt.simulation.compiler import find_compiler
+from seaopt.simulation.native import find_compiler
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 

@@ -36,7 +36,7 @@ def run(**environment):
 
 @pytest.mark.slow
 def test_a_compiler_changes_nothing():
-    from seaopt.simulation.compiler import find_compiler
+    from seaopt.simulation.native import find_compiler
 
     if find_compiler() is None:
         pytest.skip("no C compiler to compare with")

@@ -1,8 +1,8 @@
 """Discretisation, integrators and compiled kernels: a plant and a log in, outputs and sensitivities out."""
 
-from seaopt.simulation.compiled import threads
 from seaopt.simulation.discretisation import Clock, Hold, transition
 from seaopt.simulation.model import Model, depends_on_time, linearised, make_model
+from seaopt.simulation.native import threads
 from seaopt.simulation.passes import Layout, Pass, Point, RobustLoss, Segment, Weights, layout_of
 from seaopt.simulation.run import double_sum, run_passes, stream
 from seaopt.simulation.simulate import simulate

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import re
-import threading
-from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 from importlib.resources import files
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -17,16 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import SimulationError
-from seaopt.simulation.compiler import load_library
 from seaopt.simulation.discretisation import transition
-from seaopt.simulation.integrator import Rates, rate_functions
+from seaopt.simulation.integrator import rate_functions
 from seaopt.simulation.model import Model
+from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
 PARALLEL = 20_000  # samples below which a second thread does not pay
 FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
 LOSSES = ("square", "huber", "soft_l1")
-THREADS = "seaopt-pass"
 
 
 @lru_cache(maxsize=32)
@@ -71,30 +65,16 @@ def kernel_source(model: Model, layout: Layout, delayed: bool) -> str:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     else:
         rates = rate_functions(model)
-        both = (rates.rate, rates.output)
-        constants |= {
-            "SZ_W": max(f.sz_w() for f in both), "SZ_ARG": max(f.sz_arg() for f in both),
-            "SZ_RES": max(f.sz_res() for f in both),
-        }  # fmt: skip
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
         chains = (_chain("rate", rates.rate_pattern, model.nx), _chain("output", rates.output_pattern, model.ny))
-        generated = "\n".join((_generated(rates), *chains))
-    defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
-    return "\n".join((defines, _text("layout.h"), generated, _text("pass.c")))
+        generated = "\n".join((generate_code(rates.rate, rates.output), *chains))
+    return "\n".join((define_constants(constants), _text("layout.h"), generated, _text("pass.c")))
 
 
 @lru_cache(maxsize=2)
 def _text(name: str) -> str:
     return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
-
-
-def _generated(rates: Rates) -> str:
-    """Return CasADi's code of rate and output, made static for the compiler to inline."""
-    generator = ca.CodeGenerator("kernel")
-    generator.add(rates.rate)
-    generator.add(rates.output)
-    return re.sub(r"CASADI_SYMBOL_EXPORT int (seaopt_(?:rate|output))\(", r"static inline int \1(", generator.dump())
 
 
 def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
@@ -112,16 +92,14 @@ def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]
     return "\n".join([*lines, "}"])
 
 
-def kernel(model: Model, layout: Layout, delayed: bool) -> Any:
-    """Return the compiled library of a model's passes, or None where there is no compiler."""
+def load_passes(model: Model, layout: Layout, delayed: bool) -> Kernel | None:
+    """Return the compiled passes of a model, or None where there is no compiler."""
     key = f"kernel {layout} {delayed}"
     if key not in model.functions:
-        library = load_library(kernel_source(model, layout, delayed))
-        if library is not None:
-            library.seaopt_passes.argtypes = [ctypes.c_void_p, ctypes.c_long]
-            library.seaopt_passes.restype = ctypes.c_int
-            library.carry_size.restype = ctypes.c_long
-        model.functions[key] = library
+        kernel = load_kernel(kernel_source(model, layout, delayed), "seaopt_passes")
+        if kernel is not None:
+            kernel.library.carry_size.restype = ctypes.c_long
+        model.functions[key] = kernel
     return model.functions[key]
 
 
@@ -183,9 +161,9 @@ class Program:
     """The passes of one segment at one point, ready to run."""
 
     def __init__(
-        self, model: Model, segment: Segment, point: Point, weights: Weights, layout: Layout, library: Any
+        self, model: Model, segment: Segment, point: Point, weights: Weights, layout: Layout, kernel: Kernel
     ) -> None:
-        self.model, self.segment, self.layout, self.library = model, segment, layout, library
+        self.model, self.segment, self.layout, self.kernel = model, segment, layout, kernel
         self.memory = memory = _Memory()
         data = _linear_data(model, point, layout) if model.linear else _settings(model, point)
         ny = model.ny
@@ -215,8 +193,8 @@ class Program:
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
         """Return the program, or None where there is no compiler."""
         layout = layout_of(model.nx, model.ny, model.np, point)
-        library = kernel(model, layout, _delayed(model, point))
-        return None if library is None else cls(model, segment, point, weights, layout, library)
+        kernel = load_passes(model, layout, _delayed(model, point))
+        return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
 
     def _correction(self, point: Point) -> int:
         if point.correction is None:
@@ -267,17 +245,17 @@ class Program:
         arguments = np.repeat(self.base, shots)
         arguments["from"], arguments["to"], arguments["shown"] = edges[:-1] - warm, edges[1:], rows
         arguments["start"], arguments["warm"] = edges[:-1] - warm if resume is None else 0, warm
-        arguments["x0"] = start.ctypes.data + start.strides[0] * np.arange(shots)
+        arguments["x0"] = row_addresses(start)
         filled = {"rho": result.loss, "count": result.count, "last": result.last}
         for name, array in (filled | {"gram": result.gram} if sums else filled).items():
-            arguments[name] = array.ctypes.data + array.strides[0] * np.arange(shots)
+            arguments[name] = row_addresses(array)
         for name in ("outputs", "columns", "states"):
             kept = getattr(result, name)
             if kept is not None:
                 arguments[name] = kept.ctypes.data + kept.strides[0] * (edges[:-1] - first)
         if resume is not None:
             arguments["carry"] = resume.ctypes.data
-        self._call(arguments, n, (result, start, resume))
+        self.kernel.run(arguments, (self.memory, result, start, resume), parallel=n >= PARALLEL)
         return result
 
     def double_sum(
@@ -299,8 +277,9 @@ class Program:
         arguments["warm"], arguments["lags"], arguments["parts"] = warm, len(r) - 1, width // 4
         arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
         for name, array in {"x0": starts, "ring": ring, "form": form}.items():
-            arguments[name] = array.ctypes.data + array.strides[0] * np.arange(len(warm))
-        self._call(arguments, self.segment.n, (padded, halved, starts, ring, form))
+            arguments[name] = row_addresses(array)
+        buffers = (self.memory, padded, halved, starts, ring, form)
+        self.kernel.run(arguments, buffers, parallel=self.segment.n >= PARALLEL)
         total = np.sum(form, axis=0)
         return (total + total.T)[:p, :p]
 
@@ -311,47 +290,4 @@ class Program:
 
     def carry(self) -> Float[np.ndarray, " m"]:
         """Return room for what a stretch hands from one call to the next."""
-        return np.zeros(int(self.library.carry_size()))
-
-    def _call(self, arguments: Any, n: int, used: tuple[Any, ...]) -> None:
-        """Run the shots, in threads where there are enough samples: ctypes lets go of the interpreter's lock.
-
-        An interrupt must not free what a thread still writes to: its job holds on to what is `used`, and is waited for.
-        """
-        count, call = len(arguments), self.library.seaopt_passes
-        if count < 2 or n < PARALLEL or threading.current_thread().name.startswith(THREADS):
-            call(arguments.ctypes.data, count)
-            return
-        bounds = np.linspace(0, count, workers() + 1).astype(int)
-        size = arguments.dtype.itemsize
-        spans = [(arguments.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds) if b > a]
-        kept = (arguments, used, self)
-        jobs = [threads().submit(_holding, kept, call, *span) for span in spans[1:]]
-        try:
-            call(*spans[0])
-        finally:
-            wait(jobs)
-        for job in jobs:
-            job.result()
-
-
-def _holding(kept: tuple[Any, ...], call: Any, *arguments: int) -> None:
-    """Call with addresses whose memory `kept` owns."""
-    call(*arguments)
-    del kept
-
-
-def workers() -> int:
-    """Return how many threads passes may use: the cores of this process, at most 8."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, 8)
-
-
-@lru_cache(maxsize=1)
-def _threads_of(process: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers(), thread_name_prefix=f"{THREADS}-{process}")
-
-
-def threads() -> ThreadPoolExecutor:
-    """Return the pool of this process, made anew after a fork."""
-    return _threads_of(os.getpid())
+        return np.zeros(int(self.kernel.library.carry_size()))

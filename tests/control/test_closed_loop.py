@@ -13,7 +13,7 @@ from seaopt.control.laws.realisation import realise
 from seaopt.control.running.closed_loop import LoopState, SampledLoop, run_loop
 from seaopt.control.running.force_run import close_loop
 from seaopt.errors import SimulationError
-from seaopt.simulation import compiler
+from seaopt.simulation import native
 
 TS = 1e-3
 LAW = {  # k_p = 3, k_i = 2, k_d = 0.03, T_f = 1 ms and unit feedforward, written out: (1 - q)(1 - q/2)
@@ -31,9 +31,9 @@ def law(limit=9.0, **changes):
 @pytest.fixture
 def no_compiler(monkeypatch):
     monkeypatch.setenv("SEAOPT_COMPILER", "none")
-    compiler.load_library.cache_clear()
+    native.load_library.cache_clear()
     yield
-    compiler.load_library.cache_clear()
+    native.load_library.cache_clear()
 
 
 def swing_by_hand(params):
@@ -153,10 +153,10 @@ def test_the_interpreter_gives_the_compiled_numbers(thor, no_compiler):
     runs = []
     for compiled in (False, True):
         if compiled:
-            compiler.load_library.cache_clear()
+            native.load_library.cache_clear()
             with pytest.MonkeyPatch.context() as patch:
                 patch.delenv("SEAOPT_COMPILER")
-                if compiler.find_compiler() is None:
+                if native.find_compiler() is None:
                     pytest.skip("no compiler here")
                 runs.append(_noisy(so.plants.moving_output(), thor))
         else:

@@ -19,7 +19,7 @@ from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from seaopt.simulation.compiler import find_compiler
+from seaopt.simulation.native import find_compiler
 
 STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
 TS = 1e-3

@@ -413,7 +413,7 @@ def test_a_bad_fit_is_said_readably(stand, short_log, thor):
 
 def test_it_is_quick(stand, stand_log, thor):
     """Not a benchmark: an upper bound far above what is measured, to catch an accidental loop in Python."""
-    from seaopt.simulation.compiler import find_compiler
+    from seaopt.simulation.native import find_compiler
 
     if find_compiler() is None:
         pytest.skip("no C compiler")

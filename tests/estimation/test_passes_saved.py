@@ -14,8 +14,8 @@ from seaopt.estimation.problem.residuals import Evaluation
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, make_model, run_passes
 from seaopt.simulation.compiled import PARALLEL, Program
-from seaopt.simulation.compiler import find_compiler
 from seaopt.simulation.interpreted import interpreted_passes
+from seaopt.simulation.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 RATE = 400.0

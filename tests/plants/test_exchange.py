@@ -11,7 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.errors import PlantError
 from seaopt.plants import export_fmu, modes, to_control
-from seaopt.simulation.compiler import find_compiler
+from seaopt.simulation.native import find_compiler
 
 
 def test_python_control_simulates_the_same(swing, thor):

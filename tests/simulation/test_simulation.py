@@ -16,8 +16,8 @@ import seaopt as so
 from seaopt.errors import LogError, SimulationError
 from seaopt.simulation import Clock, Layout, Point, Segment, Weights, layout_of, make_model, run_passes, stream
 from seaopt.simulation.compiled import Program
-from seaopt.simulation.compiler import find_compiler
 from seaopt.simulation.interpreted import interpreted_passes
+from seaopt.simulation.native import find_compiler
 
 RATE = 400.0
 
@@ -304,18 +304,3 @@ def test_other_parameter_values_need_no_other_code(swing, thor):
 def test_too_many_filter_sections_are_refused():
     with pytest.raises(SimulationError, match="9 filter sections"):
         Weights(sections=np.zeros((9, 5)), settle=0, knee=np.ones(1))
-
-
-def test_the_kernel_folder_is_private(tmp_path, monkeypatch):
-    from seaopt.simulation.compiler import cache_folder
-
-    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "cache"))
-    folder = cache_folder()
-    assert folder is not None
-    assert folder.stat().st_mode & 0o777 == 0o700
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    (tmp_path / "linked").mkdir()
-    (tmp_path / "linked" / "kernels").symlink_to(elsewhere)
-    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "linked"))
-    assert cache_folder() is None

@@ -1,6 +1,6 @@
 /* Sampled closed loops, sample by sample, one run after the other.
 
-   Built with constants and CasADi's functions in front (see seaopt/control/closed_loop.py):
+   Built with constants and CasADi's functions in front (see seaopt/control/running/loop_kernel.py):
    seaopt_sample: (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y), sensor, law and delay at one sample;
    seaopt_advance: (t, x, peak, u, p, h) -> (x+, peak+), one Runge-Kutta step. */
 #include <math.h>

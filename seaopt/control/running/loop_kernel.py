@@ -7,12 +7,9 @@ structure. The two ways give the same numbers to rounding, of which a quantiser 
 
 from __future__ import annotations
 
-import ctypes
 import math
-import re
 from collections.abc import Callable
 from importlib.resources import files
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -23,8 +20,7 @@ from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
-from seaopt.simulation.compiled import threads, workers
-from seaopt.simulation.compiler import load_library
+from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 
 CHUNK = 250  # samples that the virtual machine chains in one call
 EXPANDED = 8  # coarse steps up to which a sample is one flat list of operations there
@@ -157,37 +153,26 @@ def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:
     kernels = _kernels(loop.plant)
     if structure not in kernels:
         sample, advance = _sample_function(loop), _advance_function(loop)
-        library = load_library(_source(loop, sample, advance))
-        if library is not None:
-            library.seaopt_loops.argtypes, library.seaopt_loops.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
-        kernels[structure] = (sample, advance, library, {})
-    sample, advance, library, chains = kernels[structure]
+        native = load_kernel(_source(loop, sample, advance), "seaopt_loops")
+        kernels[structure] = (sample, advance, native, {})
+    sample, advance, native, chains = kernels[structure]
     constants = _constants(loop)
 
     def execute(job: Job, substeps: int) -> Trace:
-        if library is not None:
-            return _compiled(loop, job, substeps, constants, library)
+        if native is not None:
+            return _compiled(loop, job, substeps, constants, native)
         return _interpreted(loop, job, substeps, constants, sample, advance, chains)
 
     return execute
 
 
-def _source(loop: SampledLoop, sample: Any, advance: Any) -> str:
-    both = (sample, advance)
+def _source(loop: SampledLoop, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
         "NX": len(loop.plant.states), "NU": len(loop.plant.inputs), "NE": len(loop.plant.inputs) - 1,
         "NY": len(loop.watched), "NZ": loop.law.c.size + loop.waiting,
-        "SZ_W": max(f.sz_w() for f in both), "SZ_ARG": max(f.sz_arg() for f in both),
-        "SZ_RES": max(f.sz_res() for f in both), "SZ_IW": max(f.sz_iw() for f in both),
     }  # fmt: skip
-    generator = ca.CodeGenerator("closed_loop")
-    for function in both:
-        generator.add(function)
-    code = re.sub(r"CASADI_SYMBOL_EXPORT int (seaopt_(?:sample|advance))\(", r"static inline int \1(", generator.dump())
-    defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
-    return "\n".join(
-        (defines, code, files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8"))
-    )
+    template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
+    return "\n".join((define_constants(constants), generate_code(sample, advance), template))
 
 
 def _empty(loop: SampledLoop, job: Job) -> Trace:
@@ -213,7 +198,7 @@ _ARGUMENTS = np.dtype(
 )
 
 
-def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], library: Any) -> Trace:
+def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], native: Kernel) -> Trace:
     trace = _empty(loop, job)
     runs, n = job.reference.shape
     arguments = np.zeros(runs, dtype=_ARGUMENTS)
@@ -224,19 +209,9 @@ def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, "
         name: getattr(trace, name) for name in ("x", "z", "peak", "error", "size", "y", "applied", "states")
     }
     for name, array in rows.items():
-        arguments[name] = array.ctypes.data + array.strides[0] * np.arange(runs)
+        arguments[name] = row_addresses(array)
     arguments["c"], arguments["e"] = c.ctypes.data, job.external.ctypes.data
-    bounds = np.linspace(0, runs, min(runs, workers()) + 1).astype(int)
-    size = arguments.dtype.itemsize
-    if len(bounds) == 2:
-        library.seaopt_loops(arguments.ctypes.data, runs)
-        return trace
-    jobs = [
-        threads().submit(library.seaopt_loops, arguments.ctypes.data + int(a) * size, int(b - a))
-        for a, b in pairwise(bounds)
-    ]
-    for done in jobs:
-        done.result()
+    native.run(arguments, (job, c, trace))
     return trace
 
 

@@ -1,0 +1,246 @@
+"""Compile, load and call native code: the kernels of log passes and of closed loops, where there is a C compiler.
+
+A kernel is one C function ``int f(const jobs *, long count)`` that does independent jobs one after the other.
+`load_kernel` compiles it once per user and source; `Kernel.run` shares the jobs among threads.
+
+The shared libraries live in a folder of the user's own (mode 0700, refused if anyone else can write to it) under
+the hash of their source, flags and compiler. ``SEAOPT_COMPILER`` names a compiler, or "none" to use none;
+``SEAOPT_CACHE_DIR`` names the folder.
+
+Threads write to arrays by address, which nothing but this module keeps alive. An interrupt (Ctrl-C) reaches the main
+thread alone, while the others still write: `Kernel.run` raises it when they have ended, and each thread holds on to the
+arrays of its jobs, so that no memory is freed under it whatever becomes of the caller.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Int, Shaped
+
+from seaopt.records import record
+
+THREAD_NAME = "seaopt-native"
+FLAGS = ("-O3", "-std=gnu99", "-fPIC", "-shared", "-fno-math-errno", "-fvisibility=hidden")
+NATIVE = (
+    "-march=native",
+    "-mprefer-vector-width=256",
+    "-mno-avx512f",
+)
+
+
+def find_compiler() -> list[str] | None:
+    """Return the command of a C compiler, or None: SEAOPT_COMPILER, cc, gcc, clang, or the ziglang package."""
+    wanted = os.environ.get("SEAOPT_COMPILER", "")
+    if wanted.lower() == "none" or os.name == "nt":
+        return None
+    for name in (wanted,) if wanted else ("cc", "gcc", "clang"):
+        path = shutil.which(name)
+        if path:
+            return [path]
+    try:
+        import ziglang  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    return [sys.executable, "-m", "ziglang", "cc"] if ziglang.__file__ else None
+
+
+def cache_folder() -> Path | None:
+    """Return the user's kernel folder, made with mode 0700; None where it is not safe to load code from."""
+    from platformdirs import user_cache_path
+
+    base = os.environ.get("SEAOPT_CACHE_DIR")
+    folder = (Path(base) if base else user_cache_path("seaopt")) / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.chmod(0o700)
+    except OSError:
+        return None
+    return folder if _is_private(folder) else None
+
+
+def _is_private(path: Path) -> bool:
+    """Tell whether a file or folder, not a link, is the user's own and nobody else can write to it."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return False
+    only_users = status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return only_users and not stat.S_ISLNK(status.st_mode)
+
+
+@lru_cache(maxsize=64)
+def load_library(source: str) -> ctypes.CDLL | None:
+    """Return the shared library of a C source, compiled or from the cache; None without compiler or folder."""
+    compiler, folder = find_compiler(), cache_folder()
+    if compiler is None or folder is None:
+        return None
+    key = hashlib.sha256("\0".join((source, *FLAGS, *compiler, sys.platform, _processor())).encode()).hexdigest()
+    library = folder / f"{key}.so"
+    if not library.exists() and not _compile(compiler, source, library):
+        return None
+    if not _is_private(library):
+        return None
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError:  # built for another machine that shares this folder
+        pass
+    try:
+        return ctypes.CDLL(str(library)) if _compile(compiler, source, library) else None
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=1)
+def _processor() -> str:
+    """Return what tells processors with other instructions apart: several machines may share a home folder."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
+
+
+def _compile(compiler: list[str], source: str, library: Path) -> bool:
+    return any(_run_compiler([*compiler, *FLAGS, *extra], source, library) for extra in (NATIVE, ()))
+
+
+def _run_compiler(command: list[str], source: str, library: Path) -> bool:
+    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+        code, built = Path(folder) / "kernel.c", Path(folder) / "kernel.so"
+        code.write_text(source, encoding="utf-8")
+        arguments = [*command, str(code), "-o", str(built), "-lm"]
+        try:
+            process = subprocess.run(arguments, capture_output=True, timeout=120, check=False)  # noqa: S603
+        except (OSError, subprocess.SubprocessError):
+            return False
+        if process.returncode or not built.exists():
+            return False
+        built.chmod(0o700)
+        built.replace(library)
+    return True
+
+
+def define_constants(constants: Mapping[str, int]) -> str:
+    """Return the preprocessor's lines that define constants."""
+    return "".join(f"#define {name} {value}\n" for name, value in constants.items())
+
+
+def generate_code(*functions: ca.Function) -> str:
+    """Return CasADi's C code of functions, static for the compiler to inline; SZ_ARG to SZ_W are the room they need."""
+    generator = ca.CodeGenerator("kernel")
+    for function in functions:
+        generator.add(function)
+    names = "|".join(function.name() for function in functions)
+    code = re.sub(rf"CASADI_SYMBOL_EXPORT int ({names})\(", r"static inline int \1(", generator.dump())
+    sizes = {"ARG": ca.Function.sz_arg, "RES": ca.Function.sz_res, "IW": ca.Function.sz_iw, "W": ca.Function.sz_w}
+    return define_constants({f"SZ_{name}": max(map(size, functions)) for name, size in sizes.items()}) + code
+
+
+@record(eq=False)
+class Kernel:
+    """A compiled function ``int f(const jobs *, long count)``, and the library it is from."""
+
+    function: Any
+    library: ctypes.CDLL
+
+    def run(self, jobs: Shaped[np.ndarray, " jobs"], buffers: object, *, parallel: bool = True) -> None:
+        """Do all jobs, in threads of their own if `parallel`; ctypes lets go of the interpreter's lock.
+
+        Parameters
+        ----------
+        jobs : structured array
+            One row per job, laid out as the C structure; pointers are whole numbers.
+        buffers : object
+            Whatever owns the memory that the jobs point to.
+        parallel : bool
+            Whether the jobs are long enough for threads to pay.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            Once no thread works on these jobs any more.
+
+        """
+        inside = threading.current_thread().name.startswith(
+            THREAD_NAME
+        )  # waiting for its own pool, it could wait forever
+        parts = min(max(len(jobs), 1), workers()) if parallel and not inside else 1
+        bounds, size = np.linspace(0, len(jobs), parts + 1).astype(int), jobs.dtype.itemsize
+        spans = [(jobs.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds)]
+        owners = (jobs, buffers)
+        others: list[Future[None]] = []
+        try:
+            for span in spans[1:]:
+                others.append(threads().submit(_call, self.function, *span, owners))
+            self.function(*spans[0])
+        finally:
+            _join(others)
+        for other in others:
+            other.result()
+
+
+def _call(function: Any, address: int, count: int, owners: object) -> None:
+    """Call a native function; until it returns, this call holds on to the `owners` of its memory."""
+    function(address, count)
+
+
+def _join(futures: list[Future[None]]) -> None:
+    """Wait for all; interrupts meanwhile are one, raised at the end."""
+    interrupt: KeyboardInterrupt | None = None
+    while not all(future.done() for future in futures):
+        try:
+            wait(futures)
+        except KeyboardInterrupt as error:
+            interrupt = error
+    if interrupt is not None:
+        raise interrupt
+
+
+def load_kernel(source: str, name: str) -> Kernel | None:
+    """Return the function `name` of a C source as a kernel; None where there is no compiler."""
+    library = load_library(source)
+    if library is None:
+        return None
+    function = getattr(library, name)
+    function.argtypes, function.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
+    return Kernel(function=function, library=library)
+
+
+def row_addresses(array: Shaped[np.ndarray, "rows ..."]) -> Int[np.ndarray, " rows"]:
+    """Return the address of each row of an array."""
+    return array.ctypes.data + array.strides[0] * np.arange(len(array))
+
+
+def workers() -> int:
+    """Return how many threads native code may use: the cores of this process, at most 8."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, 8)
+
+
+@lru_cache(maxsize=1)
+def _threads_of(process: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers(), thread_name_prefix=f"{THREAD_NAME}-{process}")
+
+
+def threads() -> ThreadPoolExecutor:
+    """Return the pool of this process, made anew after a fork."""
+    return _threads_of(os.getpid())

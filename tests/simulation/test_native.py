@@ -1,0 +1,145 @@
+"""Native code: who may write to its folder, and what an interrupt (Ctrl-C) does while threads write to memory."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import weakref
+
+import numpy as np
+import pytest
+
+from seaopt.simulation import native
+
+needs_compiler = pytest.mark.skipif(native.find_compiler() is None, reason="no C compiler")
+
+SLOW = r"""
+#define _POSIX_C_SOURCE 200809L
+#include <time.h>
+typedef struct { double wait_s; double *result; } job;
+__attribute__((visibility("default"))) int slow(const job *jobs, long count) {
+    for (long i = 0; i < count; i++) {
+        struct timespec wait = {0, (long)(1e9 * jobs[i].wait_s)};
+        nanosleep(&wait, 0);
+        *jobs[i].result += 1.0;
+    }
+    return 0;
+}
+"""
+
+# Loops run on and on; every interrupt must come out as KeyboardInterrupt, and leave the process fit for the next run.
+LOOPS = """
+import os
+import time
+os.sched_getaffinity = lambda process: {0, 1}  # two threads on any machine
+import numpy as np
+import seaopt as so
+from seaopt.control import TransferFunction
+from seaopt.control.laws.realisation import realise
+from seaopt.control.running.closed_loop import SampledLoop, run_loop
+
+den = np.array([1.0, -1.5, 0.5])
+law = realise(
+    TransferFunction(num=np.array([19.001, -35.9995, 16.9995]), den=den),
+    TransferFunction(num=np.array([18.001, -34.4995, 16.4995]), den=den),
+    sample_time_s=1e-3, current_per_force_A_per_N=1 / 240.3318, current_limit_A=9.0,
+)
+loop = SampledLoop(plant=so.plants.moving_output(), law=law, measured="F1", delay_samples=1)
+params = [so.plants.thor().update(I_p=value) for value in np.linspace(0.2, 0.6, 16)]
+expected = run_loop(loop, params, np.full(500, 80.0)).outputs["F1"]
+interrupts = 0
+for _ in range(ROUNDS):
+    deadline = time.monotonic() + 5.0  # an interrupt while CasADi converts an array is lost
+    try:
+        print("running", flush=True)
+        while time.monotonic() < deadline:
+            run_loop(loop, params, np.full(4000, 80.0))
+    except KeyboardInterrupt:
+        interrupts += 1
+    np.testing.assert_array_equal(run_loop(loop, params, np.full(500, 80.0)).outputs["F1"], expected)
+print(interrupts)
+"""
+DELAYS_S = (0.0, 0.03, 0.1, 0.2, 0.3)
+
+
+@needs_compiler
+def test_an_interrupted_closed_loop_ends_cleanly():
+    """Ctrl-C came out of the wait for the threads, whose memory was then freed: a segmentation fault each time."""
+    source = LOOPS.replace("ROUNDS", str(len(DELAYS_S)))
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536"}  # who writes to freed memory dies of it at once
+    with subprocess.Popen([sys.executable, "-c", source], env=environment, **options) as process:
+        assert process.stdout is not None
+        for delay_s in DELAYS_S:
+            if process.stdout.readline() != b"running\n":
+                break
+            time.sleep(delay_s)
+            process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors.decode()
+    assert int(output) > len(DELAYS_S) // 2
+
+
+@pytest.fixture
+def slow_jobs(monkeypatch):
+    """Return a kernel that waits, jobs for two threads, and where they count."""
+    monkeypatch.setattr(native, "workers", lambda: 2)
+    native._threads_of.cache_clear()
+    kernel = native.load_kernel(SLOW, "slow")
+    assert kernel is not None
+    results = np.zeros(2)
+    jobs = np.zeros(2, dtype=[("wait_s", float), ("result", np.uint64)])
+    jobs["result"] = native.row_addresses(results)
+    yield kernel, jobs, results
+    native._threads_of.cache_clear()
+
+
+@needs_compiler
+@pytest.mark.parametrize("interrupts", [1, 3])
+def test_an_interrupt_waits_for_the_threads(slow_jobs, interrupts, monkeypatch):
+    kernel, jobs, results = slow_jobs
+    jobs["wait_s"] = 0.0, 0.3
+    left, wait = [None] * interrupts, native.wait
+
+    def interrupted_wait(futures):
+        if left:
+            left.pop()
+            raise KeyboardInterrupt
+        return wait(futures)
+
+    monkeypatch.setattr(native, "wait", interrupted_wait)
+    with pytest.raises(KeyboardInterrupt):
+        kernel.run(jobs, results)
+    np.testing.assert_array_equal(results, 1.0)
+
+
+@needs_compiler
+def test_a_thread_keeps_its_memory(slow_jobs, monkeypatch):
+    """Even where nobody waits for it."""
+    kernel, jobs, results = slow_jobs
+    jobs["wait_s"] = 0.0, 0.3
+    monkeypatch.setattr(native, "_join", lambda futures: None)
+    waiting = []
+    monkeypatch.setattr(native.Future, "result", lambda future, timeout=None: waiting.append(future))
+    kernel.run(jobs, results)
+    memory = weakref.ref(results)
+    del jobs, results, slow_jobs
+    assert not waiting[0].done()
+    assert memory() is not None
+    native.wait(waiting)
+
+
+def test_the_kernel_folder_is_private(tmp_path, monkeypatch):
+    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "cache"))
+    folder = native.cache_folder()
+    assert folder is not None
+    assert folder.stat().st_mode & 0o777 == 0o700
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "kernels").symlink_to(elsewhere)
+    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "linked"))
+    assert native.cache_folder() is None
