@@ -29,7 +29,7 @@ import seaopt as so
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "twomass" / "MultisineTypeA.mat"
 BAND_HZ = (11.0, 250.0)
-PERIOD, PERIODS = 2500, 20  # samples in a period of the multisine, and periods
+PERIOD = 2500  # samples in a period of the multisine
 RATE_HZ = 2500.0
 SETTLED = 2  # periods, of a second each, after which the response repeats
 UNITS = {
@@ -106,7 +106,7 @@ def fit_soft(linear: so.Fit) -> so.Fit:
 
 def spectra(values: np.ndarray) -> np.ndarray:
     """Return the spectrum of each settled period in the band, free of what drifts from one period to the next."""
-    rows = values.reshape(PERIODS, PERIOD)
+    rows = values.reshape(-1, PERIOD)
     ends = np.append(values[::PERIOD], 2 * values[-1] - values[-2])
     line = ends[:-1, None] + np.diff(ends)[:, None] * np.arange(PERIOD) / PERIOD
     bins = slice(int(BAND_HZ[0]), int(BAND_HZ[1]) + 1)  # a period is a second: bins are Hz
@@ -141,7 +141,7 @@ def balance(log: so.Log, band_hz: tuple[float, float], *extra: str) -> tuple[flo
         spectrum = np.fft.rfft(values) * (2j * np.pi * frequency) ** order
         return np.fft.irfft(np.where(frequency > 400.0, 0.0, spectrum), PERIOD)
 
-    motor, load = (log[name].reshape(PERIODS, PERIOD)[SETTLED:].mean(axis=0) for name in ("theta_m", "theta_l"))
+    motor, load = (log[name].reshape(-1, PERIOD)[SETTLED:].mean(axis=0) for name in ("theta_m", "theta_l"))
     twist = motor - load - np.mean(motor - load)
     rate, speed = derivative(twist, 1), derivative(load, 1)
     terms = [twist, rate, speed]

@@ -12,6 +12,8 @@ import os
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Literal
@@ -79,19 +81,54 @@ jaxtyping.install_import_hook("seaopt", "seaopt_type_checker.check")
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402
+from tests import simulated_logs  # noqa: E402
 
 settings.register_profile("seaopt", deadline=None, max_examples=25, derandomize=True)
 settings.load_profile("seaopt")
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+NO_DATA = f"measured logs are not at {DATA}"
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Return the folder of measured logs, or skip."""
     if not DATA.is_dir():
-        pytest.skip(f"measured logs are not at {DATA}")
+        pytest.skip(NO_DATA)
     return DATA
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory) -> Callable[[str], Path]:
+    """Return a function that gives a folder of simulated logs, laid out as the one of measured logs of its name."""
+    root = tmp_path_factory.mktemp("simulated")
+
+    @cache
+    def write(name: str) -> Path:
+        getattr(simulated_logs, f"write_{name}")(root / name)
+        return root / name
+
+    return write
+
+
+@pytest.fixture(params=["measured", "simulated"])
+def recorded(request, simulated) -> Callable[[str], Path]:
+    """Return a function that gives a folder of logs: measured, skipped where there is none, and then simulated."""
+    if request.param == "simulated":
+        return simulated
+    data = request.getfixturevalue("data")
+    return lambda name: data / name
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many tests were left out for want of the measured logs."""
+    count = sum(NO_DATA in str(report.longrepr) for report in terminalreporter.stats.get("skipped", []))
+    if count:
+        terminalreporter.write_line(
+            f"{count} test{'s' if count > 1 else ''} on measured logs left out: ../shared/data is not there "
+            "(the same kinds of log were simulated)",
+            yellow=True,
+        )
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The scripts in problems/, on the real logs and against the paper's printed numbers."""
+"""The scripts in problems/: on measured logs, on simulated ones of known parameters, and against the paper."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.signal import butter, sosfiltfilt
+
+from tests.simulated_logs import DRIVE, LINK, PENDULUM, SERVO, write_twomass
 
 PROBLEMS = Path(__file__).resolve().parents[1] / "problems"
 
@@ -27,7 +29,7 @@ def script(name):
 def measured(data, *parts):
     path = data.joinpath(*parts)
     if not path.exists():
-        pytest.skip(f"{path} is absent")
+        pytest.skip(f"measured logs are not at {path}")
     return path
 
 
@@ -136,6 +138,57 @@ def test_xl330_on_trajectories_not_fitted(data):
     assert errors[1][0] < 0.6 * errors[0][0]
     assert errors[1][1] < 40
     xl330.check(loaded.parameters)
+
+
+def test_a_simulated_drive_gives_its_soft_coupling(tmp_path):
+    """As the measured one: the linear drive's misfit repeats, the load's balance names its cause."""
+    twomass = script("twomass")
+    write_twomass(tmp_path / "log", periods=6)
+    linear = twomass.fit(tmp_path / "log" / "MultisineTypeA.mat")
+    soft = twomass.fit_soft(linear)
+    for name in ("J_l", "k", "d_l", "K", "k_3", "c_2"):
+        assert soft.parameters[name].value == pytest.approx(DRIVE[name], rel=2e-3), name
+    assert soft.derived["antiresonance_hz"].value == pytest.approx(53.8, rel=1e-3)
+    assert soft.derived["resonance_hz"].value == pytest.approx(76.2, rel=1e-3)
+    assert linear.parameters["J_l"].value == pytest.approx(DRIVE["J_l"], rel=0.1)
+    assert twomass.leftover(linear, "theta_l")[0] > 0.95
+    log = linear.experiments[0].log
+    misfit = {name: twomass.balance(log, (60.0, 90.0), *extra)[1] for name, extra in
+              (("plain", ()), ("coulomb", ("coulomb",)), ("soft", ("soft",)))}  # fmt: skip
+    assert misfit["soft"] < 0.3 * misfit["plain"] < 0.5 * misfit["coulomb"]
+
+
+def test_a_simulated_pendulum_gives_its_inertia(simulated):
+    ak80 = script("ak80")
+    log = ak80.read(simulated("ak80") / "data_measured.csv")
+    cut = ak80.fit_pieces(log, 0.0, 3.0)
+    for name in ("I_p", "mgL", "tau_c"):
+        assert cut.parameters[name].value == pytest.approx(PENDULUM[name], rel=0.02), name
+    assert ak80.predict(cut.parameters, log, 0.5)[0] > 98
+
+
+def test_a_simulated_flexible_link_gives_its_frequency_and_damping(simulated):
+    """A rigid rod on a spring, unlike the measured beam: its damping comes out positive, and gamma as 1."""
+    flexlink = script("flexlink")
+    log = flexlink.read(simulated("flexlink"))
+    rig, link = flexlink.fit_rig(log), flexlink.fit_link(log)
+    assert rig.derived["clamped_hz"].value == pytest.approx(2.94, rel=0.01)
+    assert link.derived["clamped_hz"].value == pytest.approx(2.94, rel=0.002)
+    assert link.parameters["gamma"].value == pytest.approx(1.0, rel=0.005)
+    for fit in (rig, link):
+        assert fit.parameters["c"].value == pytest.approx(LINK["c"], rel=0.1)
+
+
+def test_a_simulated_servo_gives_its_friction(simulated):
+    xl330 = script("xl330")
+    folder = simulated("xl330")
+    assert xl330.duty_scale(folder) == pytest.approx(4096 / (2 * np.pi) / 256, rel=0.01)
+    logs = xl330.read(folder)
+    fit = xl330.fit(logs)
+    assert fit.parameters["J"].value == pytest.approx(SERVO["J"], rel=0.05)
+    assert fit.parameters["c_m"].value == pytest.approx(SERVO["c_m"], rel=0.1)
+    assert fit.parameters["q_0"].value == pytest.approx(SERVO["q_0"], abs=2e-3)
+    assert xl330.mean_errors(xl330.errors_mrad(fit.parameters, logs, ("sin_sin", "up_and_down")))[0] < 5
 
 
 @pytest.mark.parametrize("name", ["twomass", "ak80", "flexlink", "xl330"])

@@ -93,8 +93,8 @@ def test_a_broken_clock_is_a_finding_and_can_be_drawn(inspect):
     assert "1 row of 5 with a time before" in out
 
 
-def test_a_counter_opens_the_gap_that_it_shows(inspect, data):
-    file = str(data / "formats" / "acqtools" / "Wmsr2_loss.csv")
+def test_a_counter_opens_the_gap_that_it_shows(inspect, recorded):
+    file = str(recorded("formats") / "acqtools" / "Wmsr2_loss.csv")
     shown = json.loads(inspect(file, json=True))
     opened = json.loads(inspect(file, counter="CH1(msr)=2", json=True))
     assert (shown["gaps"]["count"], opened["gaps"]["count"]) == (0, 1)

@@ -168,12 +168,12 @@ def test_it_names_fits_and_can_be_written(stand, thor, short_log):
     assert ranking._repr_html_().startswith("<pre>Ranking")
 
 
-def test_a_measured_drive_prefers_a_soft_coupling_at_its_resonance(data):
+def test_a_two_mass_drive_prefers_a_soft_coupling_at_its_resonance(recorded):
     """Three seconds of a two-mass drive: its coupling softens with twist, seen at 76 Hz (problems/twomass.py)."""
     spec = importlib.util.spec_from_file_location("twomass", ROOT / "problems" / "twomass.py")
     twomass = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(twomass)
-    log = twomass.read(data / "twomass" / "MultisineTypeA.mat").between(2, 5)
+    log = twomass.read(recorded("twomass") / "MultisineTypeA.mat").between(2, 5)
     guess = so.ParameterSet.of(
         J_m=1.0, **{name: (value, twomass.UNITS[name]) for name, value in twomass.LINEAR.items()}
     )

@@ -20,6 +20,9 @@ from seaopt.signals import Signal
 GRAVE = ("error", "warning")
 
 
+MOTOR = ["time", "iq_adx", "theta_mx", "theta_my"]
+
+
 def channels(log):
     return {name: log[name].copy() for name in log.signals}
 
@@ -245,9 +248,9 @@ def test_an_input_that_nothing_answers_to_is_a_warning():
     assert log.quality.of("excitation")[0].severity == "warning"
 
 
-def test_a_counter_shows_lost_samples(data):
+def test_a_counter_shows_lost_samples(recorded):
     def read(name):
-        rows = np.genfromtxt(data / "formats" / "acqtools" / name, delimiter=",", skip_header=1, max_rows=27)
+        rows = np.genfromtxt(recorded("formats") / "acqtools" / name, delimiter=",", skip_header=1, max_rows=27)
         return Table(time=1e-6 * rows[:, 0], signals={"msr": Signal(name="msr", values=rows[:, 1].copy())}, source=name)
 
     lost = assess_quality(read("Wmsr2_loss.csv"))
@@ -258,8 +261,8 @@ def test_a_counter_shows_lost_samples(data):
     assert not assess_quality(read("Wmsr1_ini.csv")).of("gap")
 
 
-def test_a_swung_pendulum_s_encoder_is_not_stuck(data):
-    rows = np.genfromtxt(data / "ak80" / "data_measured.csv", delimiter=",", skip_header=1)
+def test_a_swung_pendulum_s_encoder_is_not_stuck(recorded):
+    rows = np.genfromtxt(recorded("ak80") / "data_measured.csv", delimiter=",", skip_header=1)
     log = so.Log.from_arrays(time=rows[:, 0], position=rows[:, 1], velocity=rows[:, 2], torque=rows[:, 3])
     found = assess_quality(log, inputs=["torque"])
     assert grave(found) == []
@@ -267,8 +270,8 @@ def test_a_swung_pendulum_s_encoder_is_not_stuck(data):
     assert found.clock.rate_hz == pytest.approx(500, rel=1e-3)
 
 
-def test_a_two_mass_drive_is_clean_and_its_load_angle_turned_around(data):
-    content = scipy.io.loadmat(data / "twomass" / "MultisineTypeA.mat", squeeze_me=True)
+def test_a_two_mass_drive_is_clean_and_its_load_angle_turned_around(recorded):
+    content = scipy.io.loadmat(recorded("twomass") / "MultisineTypeA.mat", squeeze_me=True, variable_names=MOTOR)
     log = so.Log.from_arrays(
         time=content["time"], I=content["iq_adx"], motor=content["theta_mx"], load=content["theta_my"],
         units={"time": "us", "I": "A", "motor": "rad", "load": "rad"},
