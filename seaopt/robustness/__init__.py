@@ -1,11 +1,10 @@
 """One controller, many plants: margins, worst case and Monte Carlo certificate."""
 
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
-from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, Requirement
+from seaopt.robustness.certificate.certificate import Certificate, MonteCarlo, PlantMargins, Requirement, plant_margins
 from seaopt.robustness.certificate.certify import certify, failure_bound
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
-from seaopt.robustness.certificate.nominal import PlantMargins, plant_margins
-from seaopt.robustness.certificate.simulated import Simulated, simulated
+from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
 from seaopt.robustness.uncertainty.worst import Witness, Worst
@@ -20,5 +19,5 @@ __all__ = [
     "PlantMargins", "Requirement", "Round", "Scenario", "Simulated", "StabilityMap", "Uncertainty", "Verification",
     "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges", "combine_uncertainty",
     "coupled_stability", "default_scenarios", "failure_bound", "large_signal", "place_value", "plant_margins",
-    "simulated", "tune_certified", "verify",
+    "run_simulations", "tune_certified", "verify",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ import seaopt as so
 from seaopt.control import TransferFunction
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from seaopt.robustness import simulated
+from seaopt.robustness import run_simulations
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 CELL = so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})
@@ -102,11 +102,11 @@ def test_a_run_that_fails_is_a_requirement_with_its_witness(controller, stand, t
 
 def test_what_cannot_be_had_is_said(stand, thor):
     unlimited = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    found = simulated(unlimited, {"stand": stand}, thor)
+    found = run_simulations(unlimited, {"stand": stand}, thor)
     assert found.large_signal == ()
     assert "current_limit_A" in found.left_out["large signals"]
     closed = replace(unlimited, design=(replace(stand, port=None), thor))
-    found = simulated(closed, {"stand": stand}, thor)
+    found = run_simulations(closed, {"stand": stand}, thor)
     assert found.passivity_dict() is None
     assert "no port at link 2" in found.left_out["passivity"]
     assert "no port at link 2" in found.simulation_dict()["left_out"]["environments"]
@@ -124,7 +124,7 @@ def test_a_plant_that_cannot_be_simulated_has_not_passed(controller, linear, sta
 
 def test_a_controller_without_its_design_plant_is_refused(controller, stand, thor):
     with pytest.raises(ControlError, match="design plant"):
-        simulated(replace(controller, design=None), {"stand": stand}, thor)
+        run_simulations(replace(controller, design=None), {"stand": stand}, thor)
 
 
 def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkeypatch):
@@ -135,7 +135,7 @@ def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkey
     monkeypatch.setattr(module, "passivity", broken)
     monkeypatch.setattr(module, "large_signal", broken)
     monkeypatch.setattr(module, "verify", lambda *_, **__: None)
-    found = simulated(controller, {"stand": stand}, thor)
+    found = run_simulations(controller, {"stand": stand}, thor)
     assert "Singular matrix" in found.left_out["passivity"]
     assert found.passivity_dict() is None
     assert set(found.left_out) == {"passivity", "large signals on stand"}

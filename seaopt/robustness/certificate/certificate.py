@@ -1,4 +1,4 @@
-"""The certificate: what one controller does on many plants, as data, JSON and text."""
+"""The certificate as data, JSON and text: what one controller does on many plants, for `certify` and its readers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import resting_on
 from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
@@ -18,15 +19,16 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
-from seaopt.robustness.certificate.nominal import PlantMargins, plant_margins
-from seaopt.robustness.certificate.simulated import Simulated, simulated
+from seaopt.robustness.certificate.simulated import Simulated, run_simulations
+from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.worst import Worst, measure_worst
 from seaopt.robustness.verification.verification import witness
 
-SCHEMA = "seaopt/robustness/1"
-SIMULATION = "simulation_failures"
-FEW = 0.1  # failure probability above which no failure in the draws is noted to say little
+SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
+ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
+SIMULATION_FAILURES = "simulation_failures"
+UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
@@ -76,11 +78,67 @@ class MonteCarlo:
             return head
         return (
             f"{head}: failure probability below {self.failure_probability_bound:.3g} at a confidence of "
-            f"{_confidence(self.confidence)}"
+            f"{_format_confidence(self.confidence)}"
         )
 
     def _repr_html_(self) -> str:
         return draws_html(self)
+
+
+@record
+class PlantMargins:
+    """Margins of a plant's loop.
+
+    Parameters
+    ----------
+    margins : Margins
+        Gain, phase and delay both ways, every crossing, and disk margins with their witnesses.
+    sampled_delay_s : float or None
+        The smallest extra delay that makes the loop unstable when the plant is sampled with that delay in it; None:
+        none as long as was looked for, `searched_delay_s`. The classical `margins.delay_s` takes the delay for a phase,
+        which is exact for whole samples only.
+    searched_delay_s : float
+        How far it was looked for: three times the classical margin and two samples, up to 20,000 samples. A delay
+        that long is beyond what the loop's model means.
+    nu_gap, nu_gap_hz : float and float or None
+        Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: see docs/margins.md.
+
+    """
+
+    margins: Margins
+    sampled_delay_s: float | None
+    searched_delay_s: float
+    nu_gap: float
+    nu_gap_hz: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as they stand in robustness.json."""
+        return {
+            "gain_margin_up_db": self.margins.gain_up_db,
+            "gain_margin_down_db": self.margins.gain_down_db,
+            "sampled_delay_margin_s": self.sampled_delay_s,
+            "disk_margins": {
+                kind: {
+                    "alpha": disk.alpha, "frequency_hz": disk.frequency_hz,
+                    "perturbation": [disk.perturbation.real, disk.perturbation.imag],
+                    "gain_range": list(disk.gain_range), "phase_deg": disk.phase_deg,
+                }
+                for kind, disk in self.margins.disks.items()
+            },
+            "nu_gap": self.nu_gap,
+        }  # fmt: skip
+
+
+def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:
+    """Measure the margins of a controller on a plant; the controller knows its design plant."""
+    loop = controller.close(plant, params)
+    classical = margins(loop)
+    assert controller.design is not None
+    gap, gap_hz = nu_gap(controller.close(*controller.design), loop)
+    period = controller.sample_time_s
+    reach = min(SEARCHED_DELAYS * ((classical.delay_s or 0.0) + 2 * period), LONGEST_DELAY * period)
+    exact = sampled_delay_margin(controller, plant, params, reach) if classical.disks else 0.0
+    return PlantMargins(margins=classical, sampled_delay_s=exact, searched_delay_s=reach, nu_gap=gap, nu_gap_hz=gap_hz)
 
 
 @record(eq=False)
@@ -154,14 +212,15 @@ class Certificate:
         (True, 8)
 
         """
-        found = self._simulated(sensors, current_step_A, seed)
-        kept = tuple(item for item in self.requirements if item.name != SIMULATION)
-        requirements = (*kept, *_simulation_requirements(found))
-        return replace(self, simulated=found, requirements=requirements, passed=all(item.met for item in requirements))
+        simulations = self._simulate(sensors, current_step_A, seed)
+        others = tuple(row for row in self.requirements if row.name != SIMULATION_FAILURES)
+        requirements = (*others, *_require_simulations(simulations))
+        passed = all(row.met for row in requirements)
+        return replace(self, simulated=simulations, requirements=requirements, passed=passed)
 
-    def _simulated(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
+    def _simulate(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
         draws = {name: [worst[1]] for name, worst in self.worst.items()}
-        return simulated(
+        return run_simulations(
             self.controller, self.models, self.parameters, draws=draws, sensors=sensors,
             current_step_A=current_step_A, seed=seed,
         )  # fmt: skip
@@ -187,12 +246,12 @@ class Certificate:
         try:
             models = {name: models[name] for name in content["plants"]}
             worst = {
-                name: measure_worst(controller, models[name], parameters, item["worst"]["parameters"])
-                for name, item in content["plants"].items()
+                name: measure_worst(controller, models[name], parameters, table["worst"]["parameters"])
+                for name, table in content["plants"].items()
             }
-            requirements = tuple(Requirement(**_infinite(item)) for item in content["requirements"])
-            found = cls(
-                passed=all(item.met for item in requirements),
+            requirements = tuple(Requirement(**_read_infinite(row)) for row in content["requirements"])
+            certificate = cls(
+                passed=all(row.met for row in requirements),
                 requirements=requirements,
                 plants={name: controller.close(models[name], parameters).figures() for name in worst},
                 margins={name: plant_margins(controller, models[name], parameters) for name in worst},
@@ -201,35 +260,37 @@ class Certificate:
                 controller=controller,
                 models=models,
                 parameters=parameters,
-                varied=tuple(_varied(item) for item in content.get("varied", [])),
+                varied=tuple(_read_varied(table) for table in content.get("varied", [])),
                 brackets={
-                    name: Bracket.from_dict(item["worst"])
-                    for name, item in content["plants"].items()
-                    if "ms_upper" in item["worst"]
+                    name: Bracket.from_dict(table["worst"])
+                    for name, table in content["plants"].items()
+                    if "ms_upper" in table["worst"]
                 },
             )
-            played = content.get("simulation")
-            if played is None:
-                return found
-            sensors = Sensors(**played["sensors"])
-            return replace(found, simulated=found._simulated(sensors, played["current_step_A"], played["seed"]))
+            simulation = content.get("simulation")
+            if simulation is None:
+                return certificate
+            sensors = Sensors(**simulation["sensors"])
+            return replace(
+                certificate, simulated=certificate._simulate(sensors, simulation["current_step_A"], simulation["seed"])
+            )
         except (KeyError, TypeError, ValueError, AttributeError, SeaoptError) as error:
             raise FileError(f"robustness.json: {error} is missing or malformed; certify again") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/1)."""
         return {
-            "schema": SCHEMA,
+            "schema": ROBUSTNESS_SCHEMA,
             "passed": self.passed,
-            "requirements": [_fields(item) for item in self.requirements],
+            "requirements": [_list_fields(row) for row in self.requirements],
             "plants": {
-                name: {key: getattr(item, key) for key in _REPORTED}
+                name: {key: getattr(figures, key) for key in _REPORTED}
                 | self.margins[name].to_dict()
-                | {"worst": _fields(self.worst[name].witness) | self._bounds(name)}
-                for name, item in self.plants.items()
+                | {"worst": _list_fields(self.worst[name].witness) | self._bounds(name)}
+                for name, figures in self.plants.items()
             },
-            "monte_carlo": _fields(self.monte_carlo),
-            "varied": [_fields(item) for item in self.varied],
+            "monte_carlo": _list_fields(self.monte_carlo),
+            "varied": [_list_fields(varied) for varied in self.varied],
             "notes": list(self.notes),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
@@ -240,14 +301,18 @@ class Certificate:
         """What a reader should know besides the requirements, one sentence each."""
         used = {name for plant in self.models.values() for name in plant.parameters}
         outside = (
-            f"the nominal {item.name} = {item.value:.4g} lies outside its range of {item.low:.4g} to {item.high:.4g}, "
-            "so that no draw is like the nominal plant"
-            for item in self.varied
-            if item.outside
+            f"the nominal {varied.name} = {varied.value:.4g} lies outside its range of {varied.low:.4g} to "
+            f"{varied.high:.4g}, so that no draw is like the nominal plant"
+            for varied in self.varied
+            if varied.outside
         )
         few = self.monte_carlo.samples and not self.monte_carlo.failures
         bound = self.monte_carlo.failure_probability_bound
-        little = (f"so few draws say little: a failure probability below {bound:.2g}",) if few and bound > FEW else ()
+        little = (
+            (f"so few draws say little: a failure probability below {bound:.2g}",)
+            if few and bound > UNINFORMATIVE_BOUND
+            else ()
+        )
         return (*resting_on(self.parameters, used), *outside, *little)
 
     def _bounds(self, name: str) -> dict[str, Any]:
@@ -261,26 +326,26 @@ class Certificate:
             lines.append(f"  varied: {'; '.join(map(str, self.varied))}")
         lines.append(f"  {self.monte_carlo}")
         lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
-        for item in self.requirements:
-            if not item.met:
-                lines.append(f"  NOT MET: {item.name} = {item.value:.6g}, limit {item.limit:.6g} ({item.where})")
+        for row in self.requirements:
+            if not row.met:
+                lines.append(f"  NOT MET: {row.name} = {row.value:.6g}, limit {row.limit:.6g} ({row.where})")
         return "\n".join(lines)
 
     def _plant_lines(self, name: str) -> list[str]:
-        item, found, worst = self.plants[name], self.margins[name], self.worst[name]
-        band = item.tracking_band_hz
-        shown = "none" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz"
+        figures, margins, worst = self.plants[name], self.margins[name], self.worst[name]
+        band = figures.tracking_band_hz
+        tracking = "none" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz"
         lines = [
-            f"  {name}: {'stable' if item.stable else 'UNSTABLE'}, Ms {item.ms:.4g}, Mt {item.mt:.4g} "
-            f"(worst case {worst.ms:.4g}, {worst.mt:.4g}), tracking band {shown}"
+            f"  {name}: {'stable' if figures.stable else 'UNSTABLE'}, Ms {figures.ms:.4g}, Mt {figures.mt:.4g} "
+            f"(worst case {worst.ms:.4g}, {worst.mt:.4g}), tracking band {tracking}"
         ]
-        if item.stable:
-            up, down = found.margins.gain_up_db, found.margins.gain_down_db
-            late = found.sampled_delay_s
+        if figures.stable:
+            up, down = (_format_signed(db) for db in (margins.margins.gain_up_db, margins.margins.gain_down_db))
+            late, phase = margins.sampled_delay_s, _format_number(figures.phase_margin_deg)
             lines.append(
-                f"    gain {_signed(down)} / {_signed(up)} dB, phase {_number(item.phase_margin_deg)} deg, delay "
-                + (f"{1e3 * late:.4g} ms" if late is not None else f"beyond {1e3 * found.searched_delay_s:.3g} ms")
-                + f", disk margin {item.disk_margin:.3g}"
+                f"    gain {down} / {up} dB, phase {phase} deg, delay "
+                + (f"{1e3 * late:.4g} ms" if late is not None else f"beyond {1e3 * margins.searched_delay_s:.3g} ms")
+                + f", disk margin {figures.disk_margin:.3g}"
             )
         if worst.parameters:
             where = ", ".join(f"{key} = {value:.4g}" for key, value in worst.parameters.items())
@@ -293,59 +358,59 @@ class Certificate:
         return certificate_html(self)
 
 
-def _simulation_requirements(found: Simulated) -> list[Requirement]:
-    """Return what the scenarios require: one row a plant where all pass, else one a run that failed, its witness."""
-    played = found.verification
-    if played is None:
-        reason = found.left_out["simulation"]
-        return [Requirement(name=SIMULATION, limit=0.0, value=np.inf, met=False, where=reason)]
+def _require_simulations(simulations: Simulated) -> list[Requirement]:
+    """Return one requirement per plant where every run passes, else one per run that failed, with its witness."""
+    verification = simulations.verification
+    if verification is None:
+        reason = simulations.left_out["simulation"]
+        return [Requirement(name=SIMULATION_FAILURES, limit=0.0, value=np.inf, met=False, where=reason)]
     rows: list[Requirement] = []
-    for plant in played.stages:
-        runs = [row for row in played.rows if row.plant == plant]
+    for plant in verification.stages:
+        runs = [row for row in verification.rows if row.plant == plant]
         failed = [row for row in runs if not row.passed]
         rows += [
             Requirement(
-                name=SIMULATION, limit=0.0, value=1.0, met=False,
-                where=f"{plant}, {row.scenario}, draw {row.draw}, seed {played.seed}: {row.reason}{witness(row)}",
+                name=SIMULATION_FAILURES, limit=0.0, value=1.0, met=False,
+                where=f"{plant}, {row.scenario}, draw {row.draw}, seed {verification.seed}: {row.reason}{witness(row)}",
             )
             for row in failed
         ]  # fmt: skip
         if runs and not failed:
             where = f"{plant}: {len(runs)} runs"
-            rows.append(Requirement(name=SIMULATION, limit=0.0, value=0.0, met=True, where=where))
+            rows.append(Requirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, where=where))
     return rows
 
 
-def _number(value: float | None) -> str:
+def _format_number(value: float | None) -> str:
     return "none" if value is None else f"{value:.4g}"
 
 
-def _signed(value: float | None) -> str:
+def _format_signed(value: float | None) -> str:
     return "none" if value is None else f"{value:+.4g}"
 
 
-def _confidence(value: float) -> str:
+def _format_confidence(value: float) -> str:
     rest = 1.0 - value
     return f"1 - {rest:.0e}" if rest < 1e-3 else f"{value:.3%}"
 
 
-def _varied(item: Mapping[str, Any]) -> Varied:
+def _read_varied(table: Mapping[str, Any]) -> Varied:
     """Return what is varied; JSON has no infinity, so that a missing bound is one."""
     ends = {
-        "low": -np.inf if item["low"] is None else item["low"],
-        "high": np.inf if item["high"] is None else item["high"],
+        "low": -np.inf if table["low"] is None else table["low"],
+        "high": np.inf if table["high"] is None else table["high"],
     }
-    given: dict[str, Any] = {**item, **ends}
-    return Varied(**given)
+    fields_of: dict[str, Any] = {**table, **ends}
+    return Varied(**fields_of)
 
 
-def _infinite(item: Mapping[str, Any]) -> dict[str, Any]:
+def _read_infinite(row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields with null read as infinite: JSON has no infinity."""
-    return {key: np.inf if value is None else value for key, value in item.items()}
+    return {key: np.inf if value is None else value for key, value in row.items()}
 
 
-def _fields(item: Any) -> dict[str, Any]:
-    return {field.name: getattr(item, field.name) for field in fields(item)}
+def _list_fields(data: Any) -> dict[str, Any]:
+    return {field.name: getattr(data, field.name) for field in fields(data)}
 
 
 _PLANT_HEAD = (

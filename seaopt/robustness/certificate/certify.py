@@ -1,4 +1,4 @@
-"""Certify: close one controller around every plant, nominal, over draws, and at the worst that can be found.
+"""Certify one controller on every plant, at nominal parameters, over draws, and at the worst that can be found.
 
 The draws are independent of whatever was used in tuning, so that the statement on the probability of failure holds:
 with no failure in N draws, it is below epsilon at a confidence of 1 - delta where N >= ln(1/delta)/ln(1/(1 - epsilon)),
@@ -23,8 +23,7 @@ from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
-from seaopt.robustness.certificate.certificate import DESIGN_NAMES, Certificate, MonteCarlo, Requirement
-from seaopt.robustness.certificate.nominal import plant_margins
+from seaopt.robustness.certificate.certificate import DESIGN_NAMES, Certificate, MonteCarlo, Requirement, plant_margins
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
@@ -32,12 +31,12 @@ from seaopt.robustness.uncertainty.severity import limits, severities
 from seaopt.robustness.uncertainty.worst import find_worst, measure_worst
 
 CONFIDENCE = 1.0 - 1e-6
-BLOCK = 50_000
-MOST_DELAY = 20  # samples
-KEPT = 64  # worst draws kept of each plant
-STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
+DRAWS_PER_BLOCK = 50_000
+MOST_DELAY_SAMPLES = 20  # samples
+WORST_KEPT = 64  # worst draws kept of each plant
+CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
 
-Progress = Callable[[int, int], None]
+DrawProgress = Callable[[int, int], None]
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -80,7 +79,7 @@ def certify(
     confidence: float = CONFIDENCE,
     max_failure_probability: float | None = None,
     bounds: Budget | None = None,
-    progress: Progress | None = None,
+    progress: DrawProgress | None = None,
 ) -> Certificate:
     """Check a controller against plants, at the nominal parameters and over draws.
 
@@ -136,15 +135,15 @@ def certify(
     (True, 0, ['design', 'swing'])
 
     """
-    _check(controller, plants, samples, seed, confidence, max_failure_probability)
+    _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability)
     plants, others = _with_design(controller, plants, others or ParameterSet())
     unknown = combine_uncertainty(parameters, others, ranges or {}, plants)
     _check_delay(controller, unknown.ranges)
     nominal = unknown.nominal
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
-    rng = np.random.default_rng([seed, STREAM, _digest(controller)])
-    failures, tallies = _drawn(controller, plants, unknown, samples, rng, progress)
+    rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
+    failures, tallies = _measure_draws(controller, plants, unknown, samples, rng, progress)
     worst = {
         name: find_worst(controller, plant, unknown, tallies[name].points, tallies[name].severity)
         for name, plant in plants.items()
@@ -152,9 +151,9 @@ def certify(
     brackets: dict[str, Bracket] = {}
     if bounds is not None:
         brackets = {name: bracket(controller, plant, unknown, worst[name], bounds) for name, plant in plants.items()}
-    for name, item in brackets.items():
-        if item.parameters:
-            worst[name] = measure_worst(controller, plants[name], nominal, item.parameters)
+    for name, bounded in brackets.items():
+        if bounded.parameters:
+            worst[name] = measure_worst(controller, plants[name], nominal, bounded.parameters)
     monte_carlo = MonteCarlo(
         samples=samples, failures=failures.count, seed=seed, confidence=confidence,
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
@@ -162,11 +161,11 @@ def certify(
     )  # fmt: skip
     requirements = (
         *_design_requirements(controller, nominal),
-        *(item for name in plants for item in plant_requirements(controller, name, figures[name])),
+        *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
     )
     return Certificate(
-        passed=all(item.met for item in requirements), requirements=requirements, plants=figures,
+        passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=dict(plants), parameters=nominal,
         varied=unknown.varied(),
@@ -174,7 +173,7 @@ def certify(
     )  # fmt: skip
 
 
-def _check(
+def _check_arguments(
     controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
     max_failure_probability: float | None,
 ) -> None:  # fmt: skip
@@ -188,7 +187,9 @@ def _check(
     if not 0.0 < confidence < 1.0:
         raise ControlError(f"confidence = {confidence:g} is not between 0 and 1")
     if max_failure_probability is not None and not 0.0 < max_failure_probability <= 1.0:
-        raise ControlError(f"max_failure_probability = {max_failure_probability:g} is no probability; give 0.01, say")
+        raise ControlError(
+            f"max_failure_probability = {max_failure_probability:g} is not a probability; give 0.01, say"
+        )
     if controller.design is None:
         raise ControlError(
             "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
@@ -204,7 +205,7 @@ def _with_design(
     if any(plant is design for plant in plants.values()):
         return dict(plants), others
     missing = (values[name] for name in values if name in design.parameters and name not in others)
-    name = next(item for item in DESIGN_NAMES if item not in plants)
+    name = next(name for name in DESIGN_NAMES if name not in plants)
     return {name: design, **plants}, others.with_parameters(*missing)
 
 
@@ -213,10 +214,10 @@ def _check_delay(controller: Controller, ranges: Mapping[str, tuple[float, float
     if DELAY not in ranges:
         return
     high, period = ranges[DELAY][1], controller.sample_time_s
-    if high > MOST_DELAY * period:
+    if high > MOST_DELAY_SAMPLES * period:
         raise ControlError(
             f"range of {DELAY} reaches {high:g} s, {high / period:.0f} samples; delays are in seconds, and up to "
-            f"{MOST_DELAY} samples ({MOST_DELAY * period:g} s) are certified"
+            f"{MOST_DELAY_SAMPLES} samples ({MOST_DELAY_SAMPLES * period:g} s) are certified"
         )
 
 
@@ -225,35 +226,35 @@ def _digest(controller: Controller) -> int:
 
     To six digits: what two machines tune from the same file is the same law.
     """
-    told = (
+    coefficients = (
         f"{value:.6g}" for part in (controller.reference, controller.measurement) for value in (*part.num, *part.den)
     )
-    return int.from_bytes(sha256(" ".join(told).encode()).digest()[:8], "big")
+    return int.from_bytes(sha256(" ".join(coefficients).encode()).digest()[:8], "big")
 
 
-def _drawn(
+def _measure_draws(
     controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
-    progress: Progress | None,
+    progress: DrawProgress | None,
 ) -> tuple[_Failures, dict[str, _Tally]]:  # fmt: skip
     """Draw and measure in blocks: the draws that fail on some plant, and the worst of each plant."""
     tallies = {name: _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0)) for name in plants}
     ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
     failures, steps = _Failures(), samples * len(plants)
-    for start in range(0, samples, BLOCK):
-        points = unknown.draw(min(BLOCK, samples - start), rng)
+    for start in range(0, samples, DRAWS_PER_BLOCK):
+        points = unknown.draw(min(DRAWS_PER_BLOCK, samples - start), rng)
         values = unknown.values(points)
         unstable, over_ms, over_mt = (np.zeros(len(points), dtype=bool) for _ in range(3))
         for number, (name, plant) in enumerate(plants.items()):
             before = start * len(plants) + number * len(points)
             tell = None if progress is None else (lambda done, before=before: progress(before + done, steps))
-            found = batch_figures(controller, plant, unknown.nominal, values, tell)
-            unstable |= found.spectral_radius >= STABLE
-            over_ms |= found.ms > ms
-            over_mt |= found.mt > mt
-            tally, severity = tallies[name], severities(controller, found)
+            batch = batch_figures(controller, plant, unknown.nominal, values, tell)
+            unstable |= batch.spectral_radius >= STABLE
+            over_ms |= batch.ms > ms
+            over_mt |= batch.mt > mt
+            tally, severity = tallies[name], severities(controller, batch)
             points_so_far = np.vstack([tally.points, points])
             severity_so_far = np.concatenate([tally.severity, severity])
-            worst = np.argsort(severity_so_far)[::-1][:KEPT]
+            worst = np.argsort(severity_so_far)[::-1][:WORST_KEPT]
             tallies[name] = _Tally(points=points_so_far[worst], severity=severity_so_far[worst])
         failures.add(unstable, over_ms, over_mt)
     return failures, tallies

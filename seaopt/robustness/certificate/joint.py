@@ -1,4 +1,4 @@
-"""Tune until certified: a cutting-set loop between the tuner and the certificate.
+"""Tune a controller until it is certified, by a cutting-set loop between tuner and certificate.
 
 The tuner keeps its limits on a few plants; the certificate looks for the worst of infinitely many. What it finds goes
 back into the few, and so on, until nothing worse is found or the few alone cannot be met together (Mutapcic, Boyd,
@@ -29,8 +29,8 @@ from seaopt.robustness.certificate.certify import CONFIDENCE, certify
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 
-ROUNDS = 6
-SAME = 1e-6  # witnesses that differ by less than this share in every parameter are one
+MOST_ROUNDS = 6
+SAME_WITNESS = 1e-6  # witnesses that differ by less than this share in every parameter are one
 Pairs = Mapping[str, tuple[Plant, ParameterSet]]
 
 
@@ -91,11 +91,11 @@ class JointTuning:
             return ""
         if self.certificate is None:
             return self.controller.explanation
-        broken = next(item for item in self.certificate.requirements if not item.met)
-        found = f"{broken.name} = {broken.value:.4g}, limit {broken.limit:.4g} ({broken.where})"
+        broken = next(row for row in self.certificate.requirements if not row.met)
+        missed = f"{broken.name} = {broken.value:.4g}, limit {broken.limit:.4g} ({broken.where})"
         if self.status == "rounds":
-            return f"{len(self.rounds)} rounds were too few: {found}; give more rounds, or a larger reserve"
-        return f"no witness is left that the tuner has not met: {found}"
+            return f"{len(self.rounds)} rounds were too few: {missed}; give more rounds, or a larger reserve"
+        return f"no witness is left that the tuner has not met: {missed}"
 
     @property
     def summary(self) -> str:
@@ -104,7 +104,7 @@ class JointTuning:
         return f"certified in {count}" if self.status == "certified" else f"NOT certified ({self.status}, {count})"
 
     def __repr__(self) -> str:
-        table = format_table(map(_cells, self.rounds), ("round", "plants", "failures", "worst case, of its limit"))
+        table = format_table(map(_list_cells, self.rounds), ("round", "plants", "failures", "worst case, of its limit"))
         explanation = [self.explanation] if self.explanation else []
         return "\n  ".join([f"Joint tuning: {self.summary}", *table, *explanation])
 
@@ -124,7 +124,7 @@ def tune_certified(
     samples: int = 1375,
     seed: int = 1,
     confidence: float = CONFIDENCE,
-    rounds: int = ROUNDS,
+    rounds: int = MOST_ROUNDS,
     progress: Callable[[Round], None] | None = None,
 ) -> JointTuning:
     """Tune, certify, and tune again with the worst cases found, until the certificate passes.
@@ -175,81 +175,87 @@ def tune_certified(
     """
     if rounds < 1:
         raise ControlError(f"rounds = {rounds} is not a number of rounds; give 1 or more")
-    values = _values(parameters, others or ParameterSet())
-    held = {name: (item, values) for name, item in plants.items() if item is not plant} | dict(robust_to or {})
+    values = _merge_values(parameters, others or ParameterSet())
+    witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share = 1.0 - (1.0 - confidence) / rounds
     done: list[Round] = []
     for number in range(1, rounds + 1):
-        controller = tune(plant, values, spec, held, draws=draws)
+        controller = tune(plant, values, spec, witnesses, draws=draws)
         certificate = None
         if controller.feasible:
             certificate = certify(
                 controller, plants, parameters, ranges=ranges, others=others, samples=samples, seed=seed + number - 1,
                 confidence=share,
             )  # fmt: skip
-        fresh = _fresh(certificate, [(plant, values), *held.values()], number)
+        added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
         done.append(
-            Round(number=number, plants=1 + len(held), controller=controller, certificate=certificate, added=(*fresh,))
+            Round(
+                number=number,
+                plants=1 + len(witnesses),
+                controller=controller,
+                certificate=certificate,
+                added=(*added,),
+            )
         )
         if progress is not None:
             progress(done[-1])
-        status = _status(certificate, fresh, last=number == rounds)
+        status = _end_of_round(certificate, added, last=number == rounds)
         if status is not None:
             return JointTuning(
-                status=status, controller=controller, certificate=certificate, rounds=tuple(done), robust_to=held
+                status=status, controller=controller, certificate=certificate, rounds=tuple(done), robust_to=witnesses
             )
-        held |= fresh
+        witnesses |= added
     raise AssertionError("the last round has a status")
 
 
-def _status(
-    certificate: Certificate | None, fresh: Pairs, *, last: bool
+def _end_of_round(
+    certificate: Certificate | None, added: Pairs, *, last: bool
 ) -> Literal["certified", "infeasible", "stuck", "rounds"] | None:
     """Return what a round ends with; None if another follows."""
     if certificate is None:
         return "infeasible"
     if certificate.passed:
         return "certified"
-    if not fresh:
+    if not added:
         return "stuck"
     return "rounds" if last else None
 
 
-def _values(parameters: Fit | ParameterSet, others: ParameterSet) -> ParameterSet:
+def _merge_values(parameters: Fit | ParameterSet, others: ParameterSet) -> ParameterSet:
     known = parameters.parameters if isinstance(parameters, Fit) else parameters
     return others.with_parameters(*known.values())
 
 
-def _fresh(
+def _list_new_witnesses(
     certificate: Certificate | None, known: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
     """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need."""
     if certificate is None or certificate.passed:
         return {}
     return {
-        f"{name}, round {number}: {_place(worst)}": worst
+        f"{name}, round {number}: {_describe_place(worst)}": worst
         for name, worst in certificate.worst.items()
-        if not any(_same(worst, pair) for pair in known)
+        if not any(_is_same(worst, pair) for pair in known)
     }
 
 
-def _same(worst: Worst, pair: tuple[Plant, ParameterSet]) -> bool:
+def _is_same(worst: Worst, pair: tuple[Plant, ParameterSet]) -> bool:
     plant, values = worst
     return plant is pair[0] and all(
-        name in pair[1] and np.isclose(values[name].value, pair[1][name].value, rtol=SAME, atol=0.0)
+        name in pair[1] and np.isclose(values[name].value, pair[1][name].value, rtol=SAME_WITNESS, atol=0.0)
         for name in worst.parameters
     )
 
 
-def _place(worst: Worst) -> str:
+def _describe_place(worst: Worst) -> str:
     return ", ".join(f"{name} = {value:.4g}" for name, value in worst.parameters.items()) or "nominal"
 
 
-def _cells(entry: Round) -> tuple[str, str, str, str]:
+def _list_cells(entry: Round) -> tuple[str, str, str, str]:
     """Return a row of the table of rounds."""
     if entry.certificate is None:
         return str(entry.number), str(entry.plants), "–", "limits not met on these plants"
     name, worst = max(entry.certificate.worst.items(), key=lambda pair: pair[1].severity)
     size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
     failures = str(entry.certificate.monte_carlo.failures)
-    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {_place(worst)}"
+    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {_describe_place(worst)}"

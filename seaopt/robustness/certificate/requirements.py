@@ -1,4 +1,4 @@
-"""What a certificate requires: the specification's limits, each figure against its own, and what decides."""
+"""The requirements of a certificate, for `certify`: limits on figures, on draws, on worst cases."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ def design_requirements(controller: Controller, achieved: LoopFigures, values: P
         held = port_of(controller.design[0], values, spec.measured, controller.current_per_force_A_per_N)
         port = measure_port(held, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
     verdicts = judge(spec, MeasuredLoop(name="design", figures=achieved, port=port), "design plant")
-    return [_requirement(verdict, _passive_where(verdict, port, band)) for verdict in verdicts]
+    return [_make_requirement(verdict, _place_passive(verdict, port, band)) for verdict in verdicts]
 
 
 def plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
     """Return what is required of every plant at the nominal parameters."""
     verdicts = judge(controller.spec, MeasuredLoop(name=name, figures=figures), "every plant")
     return [
-        _requirement(item, "" if figures.stable or item.limit.has_field else ": the loop is UNSTABLE")
-        for item in verdicts
+        _make_requirement(verdict, "" if figures.stable or verdict.limit.has_field else ": the loop is UNSTABLE")
+        for verdict in verdicts
     ]
 
 
-def _requirement(verdict: Verdict, remark: str) -> Requirement:
+def _make_requirement(verdict: Verdict, remark: str) -> Requirement:
     name = verdict.limit.requirement or verdict.limit.name
     return Requirement(
         name=name, limit=verdict.allowed, value=verdict.value, met=verdict.met, where=f"{verdict.plant}{remark}"
     )
 
 
-def _passive_where(verdict: Verdict, port: PortFigures | None, band: tuple[float, float] | None) -> str:
+def _place_passive(verdict: Verdict, port: PortFigures | None, band: tuple[float, float] | None) -> str:
     """Return where in the passive band its port is least passive, and what to do where it is not."""
     if verdict.limit.name != "passive_band_hz" or port is None or band is None:
         return ""
@@ -60,13 +60,13 @@ def draw_requirements(
     result: MonteCarlo, worst: Mapping[str, Worst], max_failure_probability: float | None = None
 ) -> list[Requirement]:
     """Return what the draws require; where none fails, that the worst case found by search does not either."""
-    bound = _bound(result, max_failure_probability)
+    bound = _require_bound(result, max_failure_probability)
     if not result.samples:
         return bound
     name = max(worst, key=lambda key: worst[key].severity)
-    found = worst[name]
-    where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
-    size = f"has Ms {found.ms:.4g}, Mt {found.mt:.4g}" if found.severity < UNSTABLE else "is UNSTABLE"
+    case = worst[name]
+    where = ", ".join(f"{key} = {value:.4g}" for key, value in case.parameters.items())
+    size = f"has Ms {case.ms:.4g}, Mt {case.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
     witness = f"{name}: worst case {size}" + (f" at {where}" if where else "")
     rows = [
         Requirement(
@@ -75,11 +75,11 @@ def draw_requirements(
         )
     ]  # fmt: skip
     if not result.failures:
-        rows += [row for key, item in worst.items() for row in _worst_requirements(key, item)]
+        rows += [row for key, case in worst.items() for row in _require_worst(key, case)]
     return rows + bound
 
 
-def _bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
+def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
     """Return that the stated failure probability is low enough, where that is asked for."""
     if limit is None:
         return []
@@ -95,19 +95,19 @@ def _bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
     ]
 
 
-def _worst_requirements(name: str, found: Worst) -> list[Requirement]:
+def _require_worst(name: str, case: Worst) -> list[Requirement]:
     """Return how much of the limits the worst case uses: 1 is all of it."""
-    if not found.limited and found.severity < UNSTABLE:
+    if not case.limited and case.severity < UNSTABLE:
         return []
-    where = ", ".join(f"{key} = {value:.4g}" for key, value in found.parameters.items())
-    met = found.severity <= 1.0 + LIMIT_ROUNDING
-    used = found.severity if found.severity < UNSTABLE else np.inf
+    where = ", ".join(f"{key} = {value:.4g}" for key, value in case.parameters.items())
+    met = case.severity <= 1.0 + LIMIT_ROUNDING
+    used = case.severity if case.severity < UNSTABLE else np.inf
     return [
         Requirement(
             name="worst_case",
             limit=1.0,
             value=used,
             met=met,
-            where=f"{name}{'' if found.severity < UNSTABLE else ', UNSTABLE,'} at {where}" + ("" if met else REMEDY),
+            where=f"{name}{'' if case.severity < UNSTABLE else ', UNSTABLE,'} at {where}" + ("" if met else REMEDY),
         )
     ]

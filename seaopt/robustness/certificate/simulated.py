@@ -1,4 +1,4 @@
-"""What the linear figures leave out: the controller on the nonlinear plants, at large signals, and at its port."""
+"""Run what the linear figures leave out, for a certificate: nonlinear plants, large signals, and the port."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from seaopt.robustness.verification.environments import StabilityMap, coupled_st
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
 from seaopt.robustness.verification.verification import Verification, check_plants, verify
 
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 @record(eq=False)
@@ -33,7 +33,7 @@ class Simulated:
     verification : Verification or None
         None if a plant cannot be simulated.
     large_signal : tuple of LargeSignal
-        One a plant, the design plant first; empty without a current limit.
+        One per plant, the design plant first; empty without a current limit.
     passivity, environments : Passivity and StabilityMap, or None
         None for a plant without a port at link 2.
     left_out : mapping of what to reason
@@ -60,7 +60,7 @@ class Simulated:
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
         return {"passed": self.passed} | played | {
-            "large_signal": [item.to_dict() for item in self.large_signal],
+            "large_signal": [sweep.to_dict() for sweep in self.large_signal],
             "sensors": asdict(self.sensors),
             "current_step_A": self.current_step_A,
             "seed": self.seed,
@@ -74,28 +74,28 @@ class Simulated:
         return self.passivity.to_dict() | {"environments": self.environments.to_dict()}
 
     def lines(self) -> list[str]:
-        """Return the findings in short, a line each; failed scenarios are not among them."""
+        """Return the findings in short, one line each; failed scenarios are not among them."""
         out: list[str] = []
         if self.verification is not None:
             failed, count = len(self.verification.failures), len(self.verification.rows)
             out.append(f"simulation: {f'{failed} of {count} runs FAILED' if failed else f'{count} runs passed'}")
             out += self.verification.following()
-        out += [f"large signals on {item.plant}: {_large(item)}" for item in self.large_signal]
+        out += [f"large signals on {sweep.plant}: {_format_large(sweep)}" for sweep in self.large_signal]
         if self.passivity is not None:
-            out.append(f"port at link 2: passive {_bands(self.passivity)}")
+            out.append(f"port at link 2: passive {_format_bands(self.passivity)}")
         if self.environments is not None:
-            out.append(f"environments at link 2: {_held(self.environments)}")
+            out.append(f"environments at link 2: {_format_environments(self.environments)}")
         return [*out, *(f"no {what}: {reason}" for what, reason in self.left_out.items())]
 
     def __repr__(self) -> str:
-        found = (self.verification, *self.large_signal, self.passivity, self.environments)
+        parts = (self.verification, *self.large_signal, self.passivity, self.environments)
         left_out = [f"No {what}: {reason}" for what, reason in self.left_out.items()]
-        return "\n".join([*(repr(item) for item in found if item is not None), *left_out])
+        return "\n".join([*(repr(part) for part in parts if part is not None), *left_out])
 
     _repr_html_ = html_text
 
 
-def simulated(
+def run_simulations(
     controller: Controller,
     plants: Mapping[str, Plant],
     parameters: ParameterSet,
@@ -105,7 +105,7 @@ def simulated(
     current_step_A: float = 0.0,
     seed: int = 1,
 ) -> Simulated:
-    """Find what the linear figures leave out.
+    """Run scenarios, large signals, passivity and environments, as far as plants and controller allow.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def simulated(
     Returns
     -------
     Simulated
-        What cannot be had is None, and `left_out` says why.
+        What cannot be attempt is None, and `left_out` says why.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def simulated(
     device = sensors or Sensors()
     left_out: dict[str, str] = {}
 
-    def had(what: str, verb: Callable[[], Found]) -> Found | None:
+    def attempt(what: str, verb: Callable[[], Result]) -> Result | None:
         try:
             return verb()
         except SeaoptError as error:
@@ -141,55 +141,56 @@ def simulated(
             left_out[what] = f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
         return None
 
-    swept = [
-        had(what, partial(_swept, controller, name, *on)) for name, on, what in _sweeps(controller, plants, parameters)
+    sweeps = [
+        attempt(what, partial(_sweep, controller, name, *on))
+        for name, on, what in _list_sweeps(controller, plants, parameters)
     ]
     return Simulated(
-        verification=had("simulation", lambda: verify(
+        verification=attempt("simulation", lambda: verify(
             controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed
         )),
-        large_signal=tuple(item for item in swept if item is not None),
-        passivity=had("passivity", lambda: passivity(controller, plant, values)),
-        environments=had("environments", lambda: coupled_stability(controller, plant, values)),
+        large_signal=tuple(sweep for sweep in sweeps if sweep is not None),
+        passivity=attempt("passivity", lambda: passivity(controller, plant, values)),
+        environments=attempt("environments", lambda: coupled_stability(controller, plant, values)),
         left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
     )  # fmt: skip
 
 
-def _sweeps(
+def _list_sweeps(
     controller: Controller, plants: Mapping[str, Plant], parameters: ParameterSet
 ) -> list[tuple[str, tuple[Plant, ParameterSet], str]]:
-    """Return what is swept: a name, plant and parameters, and what to call it where it cannot be had."""
+    """Return what is swept: a name, plant and parameters, and what to call it where it cannot be attempt."""
     assert controller.design is not None
     design, values = controller.design
     if controller.spec.current_limit_A is None:  # one reason for all of them
         return [(design.name, (design, values), "large signals")]
     known = next((name for name, plant in plants.items() if plant is design), design.name)
     on = {known: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != known}
-    return [(name, item, f"large signals on {name}") for name, item in on.items()]
+    return [(name, pair, f"large signals on {name}") for name, pair in on.items()]
 
 
-def _swept(controller: Controller, name: str, plant: Plant, parameters: ParameterSet) -> LargeSignal:
+def _sweep(controller: Controller, name: str, plant: Plant, parameters: ParameterSet) -> LargeSignal:
     return replace(large_signal(controller, plant, parameters), plant=name)
 
 
-def _large(found: LargeSignal) -> str:
-    pairs = zip(found.amplitude_N, found.bandwidth_hz, strict=True)
+def _format_large(sweep: LargeSignal) -> str:
+    pairs = zip(sweep.amplitude_N, sweep.bandwidth_hz, strict=True)
     return ", ".join(f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.3g} N" for amplitude, hz in pairs)
 
 
-def _bands(found: Passivity) -> str:
-    if not found.held_stable:
+def _format_bands(port: Passivity) -> str:
+    if not port.held_stable:
         return "nowhere: the loop is UNSTABLE with link 2 held"
-    bands = ", ".join(f"{low:.3g} to {high:.4g} Hz" for low, high in found.bands_hz) or "nowhere"
-    lost = "" if found.violated_hz is None else f"; {-found.least_damping_N_s_per_m:.3g} N s/m are missing elsewhere"
+    bands = ", ".join(f"{low:.3g} to {high:.4g} Hz" for low, high in port.bands_hz) or "nowhere"
+    lost = "" if port.violated_hz is None else f"; {-port.least_damping_N_s_per_m:.3g} N s/m are missing elsewhere"
     return bands + lost
 
 
-def _held(found: StabilityMap) -> str:
-    if found.everywhere:
-        return f"stable against all of {found.stable.size} masses on springs and dampers"
+def _format_environments(environments: StabilityMap) -> str:
+    if environments.everywhere:
+        return f"stable against all of {environments.stable.size} masses on springs and dampers"
     shares = ", ".join(
         f"{np.count_nonzero(stable)} of {stable.size} at {damping:g} N s/m"
-        for damping, stable in zip(found.damping, found.stable, strict=True)
+        for damping, stable in zip(environments.damping, environments.stable, strict=True)
     )
     return f"stable in {shares}"
