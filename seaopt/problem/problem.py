@@ -40,7 +40,7 @@ from seaopt.problem.schema import (
     UnknownTable,
     VirtualTable,
 )
-from seaopt.problem.validation import validated
+from seaopt.problem.validation import read_table
 from seaopt.records import record
 from seaopt.robustness import place_value
 
@@ -274,7 +274,7 @@ def read_problem(path: Path | str) -> Problem:
 
     """
     source = Path(path)
-    table = validated(source)
+    table = read_table(source)
     try:
         plants = {name: _plant(name, item.kind, item.model_extra or {}) for name, item in table.plant.items()}
         parameters = _parameters(table.parameters, plants)

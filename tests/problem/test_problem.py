@@ -80,6 +80,7 @@ kind = "high_impedance"
         ("J   =", "JJ  =", 'unknown parameter "JJ"'),
         ('kind = "high_impedance"', 'kind = "high"', "plant.stand"),
         ('drive = "unlumped"', 'drive = "unlumpt"', "unlumpt"),
+        ('structure = "pid"', 'structure = "pida"', "controller.structure = 'pida'"),
         ('drive = "unlumped"', 'drave = "unlumped"', "drave"),
         ('plant = "swing"\nvirtual', 'plant = "swung"\nvirtual', "swung"),
         ('robust_to = ["swing"]', 'robust_to = ["swong"]', 'did you mean "swing"'),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import EstimationError, FileError
+from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.residual_statistics import Errors, errors
 from seaopt.estimation.problem.residuals import Residuals
@@ -24,7 +24,6 @@ from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
 
 SCHEMA = "seaopt/fit/1"
-STATUSES = ("converged", "max_iterations", "stalled", "not_identifiable")
 
 
 @record(eq=False)
@@ -216,10 +215,9 @@ class Fit:
             A field is missing or malformed.
 
         """
-        try:
-            return _from_dict(content, experiments)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise FileError(f"fit.json: field {error} is missing or malformed; run the fit again") from error
+        from seaopt.estimation.result.stored import read_fit  # deferred: pydantic
+
+        return cls(**read_fit(content), experiments=experiments)
 
     def __repr__(self) -> str:
         lines = [f"Fit: {self.status} ({self.message})"]
@@ -260,81 +258,3 @@ def _parameter_dict(item: Parameter) -> dict[str, Any]:
         "at_bound": item.at_bound, "min": item.min, "max": item.max, "prior_std": item.prior_std,
         "description": item.description, "identified": item.identified,
     }  # fmt: skip
-
-
-def _number(value: Any, missing: float) -> float:
-    return missing if value is None else float(value)
-
-
-def _covariance(item: Mapping[str, Any]) -> Covariance:
-    names = tuple(item["names"])
-    rows = [[_number(value, math.inf) for value in row] for row in item["matrix"]]
-    matrix = np.array(rows, dtype=float).reshape(len(names), len(names))
-    seen = np.isfinite(np.diag(matrix))
-    if np.any(np.linalg.eigvalsh(matrix[np.ix_(seen, seen)]) < -1e-9 * np.max(np.diag(matrix)[seen], initial=0.0)):
-        raise ValueError("covariance, which has a negative variance,")
-    return Covariance(names=names, matrix=matrix)
-
-
-def _std(item: Mapping[str, Any]) -> float | None:
-    """Return a parameter's std: null stands for an infinite one, and for none of a parameter that is not free."""
-    return _number(item["std"], math.inf) if item["free"] else None
-
-
-def _from_dict(content: Mapping[str, Any], experiments: tuple[Experiment, ...]) -> Fit:
-    parameters = ParameterSet(
-        Parameter(
-            name=name, value=float(item["value"]), unit=item["unit"], free=bool(item["free"]),
-            min=_number(item.get("min"), -math.inf), max=_number(item.get("max"), math.inf),
-            prior_std=item.get("prior_std"), description=item.get("description", ""), std=_std(item),
-            identified=bool(item.get("identified", _std(item) != math.inf)),
-        )
-        for name, item in content["parameters"].items()
-    )  # fmt: skip
-    found = content["identifiability"]
-    if content["status"] not in STATUSES:
-        raise ValueError(f'status "{content["status"]}"')
-    covariance = _covariance(content["covariance"])
-    if set(covariance.names) != {name for name, item in parameters.items() if item.free}:
-        raise ValueError("covariance.names, other than the free parameters,")
-    return Fit(
-        status=content["status"],
-        message=content["message"],
-        parameters=parameters,
-        covariance=covariance,
-        white_covariance=_covariance(content.get("white_covariance", content["covariance"])),
-        derived={
-            name: Derived(value=float(item["value"]), unit=item["unit"], std=_number(item["std"], math.inf))
-            for name, item in content["derived"].items()
-        },
-        outputs={
-            name: {output: OutputFit(**item) for output, item in row.items()}
-            for name, row in content["outputs"].items()
-        },
-        nuisance={
-            name: Nuisance(
-                delay_s=item["delay_s"], gain=item["gain"], offset=item["offset"],
-                initial_state=tuple(item["initial_state"]), substeps=int(item.get("substeps", 1)),
-                drift={output: tuple(row) for output, row in item.get("drift", {}).items()},
-                noise=dict(item.get("noise", {})),
-                std={key: _number(value, math.inf) for key, value in item.get("std", {}).items()},
-            )
-            for name, item in content.get("experiments", {}).items()
-        },
-        identifiability=Identifiability(
-            rank=found["rank"], free=found["free"], condition=_number(found["condition"], math.inf),
-            unidentifiable=tuple(found["unidentifiable"]), weak=tuple(found.get("weak", ())),
-            structural_rank=int(found.get("structural_rank", -1)),
-        ),
-        cost=_number(content["cost"], math.inf),
-        iterations=content["iterations"],
-        samples=content["samples"],
-        wall_s=content["wall_s"],
-        step_error_sigma=float(content.get("step_error_sigma", 0.0)),
-        step_error_parameter=float(content.get("step_error_parameter", 0.0)),
-        log_likelihood=_number(content.get("log_likelihood"), math.nan),
-        unknowns=int(content.get("unknowns", 0)),
-        method=str(content.get("method", "output_error")),
-        notes=tuple(str(note) for note in content.get("notes", ())),
-        experiments=experiments,
-    )  # fmt: skip

@@ -1,0 +1,144 @@
+"""Tables read from JSON and TOML, checked against a pydantic model; the first mistake is one line that says what to do.
+
+What a field may hold is said by its type; what several fields must have in common is checked by those who read them.
+JSON has no infinity, so that null stands for one where a type here says so.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
+
+from seaopt.errors import FileError, SeaoptError, suggestion
+
+MAX_SHOWN = 60  # characters of a wrong value that a message repeats
+# In a place of pydantic's these name what a value was tried as, and are no keys of the file.
+UNION_BRANCH = re.compile(r"\w*Table|float|int|bool|str|(literal|dict|tuple|list)\[.*|(function|constrained)-.*")
+
+Number = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
+_OR_NULL = WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "null"}]})
+NullIsInfinite = Annotated[Number, BeforeValidator(lambda value: math.inf if value is None else value), _OR_NULL]
+NullIsMinusInfinite = Annotated[Number, BeforeValidator(lambda value: -math.inf if value is None else value), _OR_NULL]
+NullIsNaN = Annotated[Number, BeforeValidator(lambda value: math.nan if value is None else value), _OR_NULL]
+
+
+class ResultTable(BaseModel):
+    """A table in a file of results; keys besides those that are read may stand in it."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+Document = TypeVar("Document", bound=BaseModel)
+
+
+def check_table(
+    model: type[Document],
+    content: Any,
+    source: str,
+    *,
+    remedy: str = "",
+    error: type[SeaoptError] = FileError,
+) -> Document:
+    """Return a table as a model.
+
+    Parameters
+    ----------
+    model : type of pydantic.BaseModel
+        What the table may hold.
+    content : mapping
+        As read from the file.
+    source : str
+        The file, for messages.
+    remedy : str
+        What to do about any mistake; left out where the place is the user's own, to be corrected there.
+    error : type of SeaoptError
+        What is raised.
+
+    Raises
+    ------
+    SeaoptError
+        A key is unknown or missing, or a value is of the wrong kind or out of range; of the kind asked for.
+
+    Examples
+    --------
+    >>> class Gains(ResultTable):
+    ...     k_p: Number
+    >>> check_table(Gains, {"k_p": 2.0}, "gains.json").k_p
+    2.0
+    >>> check_table(Gains, {"k_p": "x"}, "gains.json", remedy="tune again")
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.FileError: gains.json: k_p = 'x': should be a valid number; tune again
+
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as problem:
+        raise error(f"{source}: {_describe(model, problem, remedy)}") from problem
+
+
+def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> str:
+    """Return the mistake that the others follow from: place, value and remedy."""
+    mistakes = problem.errors(include_url=False)
+    # A misspelt key is also a missing one: the misspelling is the mistake.
+    first = next((mistake for mistake in mistakes if mistake["type"] == "extra_forbidden"), mistakes[0])
+    # Where a string or a table may stand, what is wrong inside the table is the mistake.
+    inside = [
+        mistake
+        for mistake in mistakes
+        if mistake["loc"][:-1] != first["loc"][:-1] and _within(mistake["loc"], first["loc"])
+    ]
+    first = inside[0] if first["type"] == "string_type" and inside else first
+    place = _place(first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {place}; {suggestion(str(first['loc'][-1]), _known_keys(model, first['loc']))}"
+    if _is_range(first):
+        at = _place(first["loc"][:-1] if first["type"] == "missing" else first["loc"])
+        return f"{at} = {_shorten(first['input'])} is not a range; give [low, high]"
+    if first["type"] == "missing":
+        return f"key {place} is missing; {remedy or 'add it'}"
+    words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    return f"{place} = {_shorten(first['input'])}: {words}" + (f"; {remedy}" if remedy else "")
+
+
+def _is_range(mistake: Mapping[str, Any]) -> bool:
+    """Tell whether a mistake is that of two numbers that are not two; every tuple of the models is a range."""
+    return mistake["type"] in ("tuple_type", "too_long", "too_short") or (
+        mistake["type"] == "missing" and isinstance(mistake["loc"][-1], int)
+    )
+
+
+def _shorten(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
+
+
+def _within(loc: tuple[int | str, ...], other: tuple[int | str, ...]) -> bool:
+    return len(loc) > len(other) and loc[: len(other) - 1] == other[:-1]
+
+
+def _place(loc: Sequence[int | str]) -> str:
+    """Return where in the file a mistake lies: names of union branches are not keys and are left out."""
+    keys = [str(key + 1) if isinstance(key, int) else key for key in loc]
+    return ".".join(key for key in keys if not UNION_BRANCH.fullmatch(key))
+
+
+def _known_keys(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:
+    """Return the keys that are known where `loc` points."""
+    for key in loc[:-1]:
+        if key in model.model_fields:
+            inner = _models_in(model.model_fields[str(key)].annotation)
+            model = inner[0] if inner else model
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in getattr(annotation, "__args__", ()) for model in _models_in(part)]

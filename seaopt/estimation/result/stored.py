@@ -1,0 +1,200 @@
+"""What a fit.json holds, as pydantic models, and its way back to the fields of a `Fit`.
+
+Null stands for what is infinite: the std of a parameter that the data do not tell, and a bound that is not there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from seaopt.documents import (
+    Flag,
+    NullIsInfinite,
+    NullIsMinusInfinite,
+    NullIsNaN,
+    Number,
+    ResultTable,
+    Whole,
+    check_table,
+)
+from seaopt.errors import FileError
+from seaopt.estimation.result.covariance import Covariance
+from seaopt.estimation.result.findings import Derived, Nuisance, OutputFit
+from seaopt.estimation.result.identifiability import Identifiability
+from seaopt.files import plain
+from seaopt.parameters import Parameter, ParameterSet
+
+REMEDY = "run the fit again"
+
+
+class StoredParameter(ResultTable):
+    """A parameter: its value, what the fit might do with it, and the std that it found."""
+
+    value: Number
+    unit: str
+    free: Flag
+    std: Number | None
+    min: NullIsMinusInfinite = -math.inf
+    max: NullIsInfinite = math.inf
+    prior_std: Number | None = None
+    description: str = ""
+    identified: Flag | None = None
+
+    def restore(self, name: str) -> Parameter:
+        """Return the parameter; one that is free and has no std has an infinite one."""
+        std = (math.inf if self.std is None else self.std) if self.free else None
+        identified = std != math.inf if self.identified is None else self.identified
+        return Parameter(
+            name=name, value=self.value, unit=self.unit, free=self.free, min=self.min, max=self.max,
+            prior_std=self.prior_std, description=self.description, std=std, identified=identified,
+        )  # fmt: skip
+
+
+class StoredDerived(ResultTable):
+    """A figure that follows from the parameters."""
+
+    value: Number
+    unit: str
+    std: NullIsInfinite
+
+
+class StoredCovariance(ResultTable):
+    """A covariance, its rows and columns in the order of the names."""
+
+    names: list[str]
+    matrix: list[list[NullIsInfinite]]
+
+    def restore(self, place: str) -> Covariance:
+        """Return the covariance.
+
+        Raises
+        ------
+        FileError
+            The matrix is not square, or has a negative variance.
+
+        """
+        n = len(self.names)
+        if [len(row) for row in self.matrix] != [n] * n:
+            raise FileError(f"fit.json: {place}.matrix is not {n} by {n}, as names is long; {REMEDY}")
+        matrix = np.array(self.matrix, dtype=float).reshape(n, n)
+        finite = np.isfinite(np.diag(matrix))
+        least = np.linalg.eigvalsh(matrix[np.ix_(finite, finite)])
+        if np.any(least < -1e-9 * np.max(np.diag(matrix)[finite], initial=0.0)):
+            raise FileError(f"fit.json: {place} has a negative variance; {REMEDY}")
+        return Covariance(names=tuple(self.names), matrix=matrix)
+
+
+class StoredOutput(ResultTable):
+    """How well an output is explained."""
+
+    fit_percent: NullIsNaN
+    holdout_fit_percent: Number | None
+    rms_residual: NullIsNaN
+    sigma: NullIsNaN
+    unit: str
+    whiteness_p: NullIsNaN
+    band_fit_percent: Number | None = None
+    one_step_fit_percent: Number | None = None
+
+
+class StoredExperiment(ResultTable):
+    """An experiment's own unknowns."""
+
+    delay_s: Number
+    gain: dict[str, Number]
+    offset: dict[str, Number]
+    initial_state: list[dict[str, Number]]
+    substeps: Whole = 1
+    drift: dict[str, list[Number]] = {}
+    noise: dict[str, Number] = {}
+    std: dict[str, NullIsInfinite] = {}
+
+    def restore(self) -> Nuisance:
+        """Return the unknowns."""
+        content = {name: getattr(self, name) for name in StoredExperiment.model_fields}
+        content["initial_state"] = tuple(self.initial_state)
+        content["drift"] = {output: tuple(coefficients) for output, coefficients in self.drift.items()}
+        return Nuisance(**content)
+
+
+class StoredIdentifiability(ResultTable):
+    """What the data tell of the free parameters."""
+
+    rank: Whole
+    free: Whole
+    condition: NullIsInfinite
+    unidentifiable: list[dict[str, Number]]
+    weak: list[dict[str, Number]] = []
+    structural_rank: Whole = -1
+
+    def restore(self) -> Identifiability:
+        """Return the findings."""
+        return Identifiability(
+            rank=self.rank, free=self.free, condition=self.condition, unidentifiable=tuple(self.unidentifiable),
+            weak=tuple(self.weak), structural_rank=self.structural_rank,
+        )  # fmt: skip
+
+
+class StoredFit(ResultTable):
+    """A fit.json."""
+
+    status: Literal["converged", "max_iterations", "stalled", "not_identifiable"]
+    message: str
+    parameters: dict[str, StoredParameter]
+    covariance: StoredCovariance
+    white_covariance: StoredCovariance | None = None
+    derived: dict[str, StoredDerived]
+    outputs: dict[str, dict[str, StoredOutput]]
+    experiments: dict[str, StoredExperiment] = {}
+    identifiability: StoredIdentifiability
+    cost: NullIsInfinite
+    iterations: Whole
+    samples: Whole
+    wall_s: Number
+    step_error_sigma: NullIsNaN = 0.0
+    step_error_parameter: NullIsNaN = 0.0
+    log_likelihood: NullIsNaN = math.nan
+    unknowns: Whole = 0
+    method: str = "output_error"
+    notes: list[str] = []
+
+
+def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a `Fit` that a fit.json holds.
+
+    Raises
+    ------
+    FileError
+        A field is missing or malformed, or the covariance is not that of the free parameters.
+
+    """
+    stored = check_table(StoredFit, plain(content), "fit.json", remedy=REMEDY)
+    parameters = ParameterSet(parameter.restore(name) for name, parameter in stored.parameters.items())
+    covariance = stored.covariance.restore("covariance")
+    if set(covariance.names) != set(parameters.free_names):
+        raise FileError(
+            f"fit.json: covariance.names = {', '.join(covariance.names)} is not what parameters has free, "
+            f"{', '.join(parameters.free_names)}; {REMEDY}"
+        )
+    white = covariance if stored.white_covariance is None else stored.white_covariance.restore("white_covariance")
+    kept = (
+        "status", "message", "cost", "iterations", "samples", "wall_s", "step_error_sigma", "step_error_parameter",
+        "log_likelihood", "unknowns", "method",
+    )  # fmt: skip
+    return {name: getattr(stored, name) for name in kept} | {
+        "parameters": parameters,
+        "covariance": covariance,
+        "white_covariance": white,
+        "derived": {name: Derived(**figure.model_dump()) for name, figure in stored.derived.items()},
+        "outputs": {
+            name: {output: OutputFit(**row.model_dump()) for output, row in outputs.items()}
+            for name, outputs in stored.outputs.items()
+        },
+        "nuisance": {name: experiment.restore() for name, experiment in stored.experiments.items()},
+        "identifiability": stored.identifiability.restore(),
+        "notes": tuple(stored.notes),
+    }
