@@ -16,12 +16,12 @@ from seaopt.estimation import (
     Experiment,
     Fit,
     Huber,
-    Linear,
     Method,
     MultipleShooting,
     OutputError,
     PredictionError,
     SoftL1,
+    Squares,
 )
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
@@ -80,7 +80,7 @@ class Problem:
         table: FitTable = self.table.fit
         return {
             "method": _method(table),
-            "loss": {"linear": Linear(), "huber": Huber(), "soft_l1": SoftL1()}[table.loss],
+            "loss": {"linear": Squares(), "huber": Huber(), "soft_l1": SoftL1()}[table.loss],
             "band_hz": table.band_hz,
             "holdout": table.holdout,
         }

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.estimation import Experiment, Fit
-from seaopt.estimation.result.fit_result import Derived
+from seaopt.estimation import DerivedFigure, Experiment, Fit
 from seaopt.frequency import Drive, Pair, Survey, Uncertain, survey
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.reporting.bode import Curve, Panel, bode_figure
@@ -143,7 +142,7 @@ def _reading(pair: Pair, drive: Drive, fit: Fit) -> str:
     )
 
 
-def _gap(name: str, form: Uncertain, fitted: Derived) -> str:
+def _gap(name: str, form: Uncertain, fitted: DerivedFigure) -> str:
     away, std = form.value - fitted.value, float(np.hypot(form.std, fitted.std))
     side = "above" if away > 0.0 else "below"
     return f"{name} {abs(away / fitted.value):.2%} {side} it ({abs(away) / max(std, 1e-300):.1f} combined std)"

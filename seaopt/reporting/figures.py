@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller, Loop
-from seaopt.estimation import Fit, Prediction
+from seaopt.estimation import Fit, ModelledOutputs
 from seaopt.frequency import Survey
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -37,7 +37,7 @@ def panels(rows: int, columns: int, height: float, **options: Any) -> tuple[Figu
     return figure, axes
 
 
-def time_figure(prediction: Prediction, units: dict[str, str]) -> Figure:
+def time_figure(prediction: ModelledOutputs, units: dict[str, str]) -> Figure:
     """Draw measured and model outputs over the second with the largest motion, and the residual of the whole log."""
     names = list(prediction.measured)
     figure, axes = panels(len(names), 2, 2.3 * len(names), sharex="col", width_ratios=(1, 1))

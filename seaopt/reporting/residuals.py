@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from seaopt.estimation import Diagnostics, Fit, Ranking
+from seaopt.estimation import Diagnostics, Experiment, Fit, Ranking
 from seaopt.estimation.problem.correlation import CrossCorrelation
 from seaopt.reporting.figures import MEASURED, PLANT_COLOURS, envelope, panels
 
@@ -20,12 +20,11 @@ ROW = 2.3  # inches
 
 def residual_figure(fit: Fit, found: Diagnostics, name: str) -> Figure:
     """Draw, for each output of an experiment, the residual, its autocorrelation and its correlation with each input."""
-    e = [experiment.name for experiment in fit.experiments].index(name)
+    experiment = next(experiment for experiment in fit.experiments if experiment.name == name)
     outputs = found.outputs[name]
     figure, axes = panels(len(outputs), 3, ROW * len(outputs), sharex="col", width_ratios=(1.2, 0.8, 1.0))
-    for o, (output, item) in enumerate(outputs.items()):
-        left, middle, right = axes[o]
-        _residual(left, fit, found, e, o)
+    for (output, item), (left, middle, right) in zip(outputs.items(), axes, strict=True):
+        _residual(left, experiment, found, output)
         left.set_ylabel(f"{output} [sigma]")
         lags = np.arange(item.autocorrelation.size)
         _band(middle, item.autocorrelation_bound)
@@ -47,11 +46,10 @@ def residual_figure(fit: Fit, found: Diagnostics, name: str) -> Figure:
     return figure
 
 
-def _residual(axis: Axes, fit: Fit, found: Diagnostics, e: int, o: int) -> None:
-    rows = [error.weighted[:, o] for error in found.residuals[e]]
-    log = fit.experiments[e].log
-    time = np.concatenate([log.time[piece] for piece in fit.experiments[e].pieces]) - log.time[0]
-    values = np.concatenate(rows)
+def _residual(axis: Axes, experiment: Experiment, found: Diagnostics, output: str) -> None:
+    log = experiment.log
+    time = np.concatenate([log.time[piece] for piece in experiment.pieces]) - log.time[0]
+    values = np.concatenate(found.residuals[experiment.name].weighted_of(output))
     low, high, at = envelope(np.where(values == 0.0, np.nan, values), time)
     axis.fill_between(at, low, high, color=MEASURED, linewidth=0.0)
 

@@ -9,7 +9,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.control import NoiseModel, estimate_noise, estimator
 from seaopt.errors import ControlError
-from seaopt.estimation.problem.observer import kalman_gain
+from seaopt.estimation.problem.steady_state_filter import kalman_gain
 
 NOISE = NoiseModel(sensor_std={"F1": 2.0, "F2": 2.0}, input_noise={"I": 0.005})
 PERIOD = 1 / 400

@@ -10,7 +10,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.errors import EstimationError
 from seaopt.estimation import bootstrap
-from seaopt.estimation.uncertainty.bootstrap import block_length
+from seaopt.estimation.uncertainty.bootstrap import estimate_block_length
 
 FREE = ("J", "b_r", "eta")
 DRAWS = 400
@@ -41,7 +41,7 @@ def test_the_blocks_of_ar1_noise_are_the_known_optimum(a):
     """b = (6 N)^(1/3) (a / (1 - a^2))^(2/3) for AR(1) (Carlstein 1986; Politis and White 2004, sec. 3)."""
     n = 40_000
     known = (6 * n) ** (1 / 3) * (a / (1 - a * a)) ** (2 / 3)
-    found = np.median([block_length(coloured(a, n, seed)) for seed in range(5)])
+    found = np.median([estimate_block_length(coloured(a, n, seed)) for seed in range(5)])
     assert found == pytest.approx(known, rel=0.25)
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
-from seaopt.estimation import Linear, profile
+from seaopt.estimation import Squares, profile
 from seaopt.files import to_json
 
 FREE = ("J", "b_r", "eta")
@@ -249,11 +249,11 @@ def test_huber_shrugs_off_outliers(stand, short_log, thor):
     spoiled[rng.choice(spoiled.size, 200, replace=False)] += 400
     log = so.Log.from_arrays(time=short_log.time, I=short_log["I"], F1=spoiled)
     errors = {}
-    for loss in (Linear(), so.Huber()):
+    for loss in (Squares(), so.Huber()):
         fit = so.fit([experiment(stand, log, outputs=("F1",))], thor.free("J", "b_r"), loss=loss)
         errors[type(loss)] = abs(fit.parameters["b_r"].value / thor["b_r"].value - 1)
     assert errors[so.Huber] < 0.002
-    assert errors[so.Huber] < 0.3 * errors[Linear]
+    assert errors[so.Huber] < 0.3 * errors[Squares]
 
 
 def test_band_weighting_hides_what_is_outside(stand, short_log, thor):

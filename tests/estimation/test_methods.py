@@ -14,10 +14,10 @@ from scipy.optimize import least_squares
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
-from seaopt.estimation.problem.losses import Linear
-from seaopt.estimation.problem.observer import kalman_gain
-from seaopt.estimation.problem.unknowns import collect
-from seaopt.estimation.result.fit import _complete, _problem, check_choices
+from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.problem.residuals import pose_problem
+from seaopt.estimation.problem.steady_state_filter import kalman_gain
+from seaopt.estimation.result.fit import check_choices, complete_parameters
 
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 METHODS = {
@@ -259,12 +259,13 @@ def test_what_is_linear_is_eliminated_exactly(stand, thor):
     shifted = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + 30, F2=log["F2"] - 5)
     bench = experiment(stand, shifted, drift=2)
     free = thor.update(J=2e-6).free("J", "b_r")
-    unknowns = collect((bench,), _complete((bench,), free))
-    problem = _problem((bench,), unknowns, Linear(), None, 0.0)
+    problem = pose_problem((bench,), complete_parameters((bench,), free), loss=Squares())
+    unknowns, (one,) = problem.unknowns, problem.experiments
+    (segment,) = one.segments
     found = problem.evaluate(unknowns.start)
-    columns = problem.run(0, 0, unknowns.start, columns=True).columns / problem.sigma[0][:, None]
+    columns = one.run(segment, unknowns.start, columns=True).columns / one.sigma[:, None]
     j, r = np.zeros((2 * len(log), unknowns.start.size)), columns[:, :, 0].ravel()
-    for o, places in enumerate(problem.columns(0, 0)):
+    for o, places in enumerate(one.columns(segment)):
         for column, k in enumerate(places, start=1):
             if k >= 0:
                 j[o::2, k] += columns[:, o, column]
@@ -273,31 +274,31 @@ def test_what_is_linear_is_eliminated_exactly(stand, thor):
     np.testing.assert_allclose(found.z[linear], best, rtol=1e-6, atol=1e-8 * np.max(np.abs(best)))
     left = r + j[:, linear] @ best
     assert found.cost == pytest.approx(0.5 * left @ left, rel=1e-9)
-    assert found.squares[0][0] == pytest.approx(np.sum(left[0::2] ** 2) * problem.sigma[0][0] ** 2, rel=1e-9)
+    assert found.power["log"].squares[0] == pytest.approx(np.sum(left[0::2] ** 2) * one.sigma[0] ** 2, rel=1e-9)
 
 
 def test_the_step_error_is_that_of_the_parameters(swing, thor):
     """A crude step biases J; the stated error is the bias, found by a fit with a fine one."""
-    from seaopt.estimation.solver.solve import settle
-    from seaopt.estimation.solver.step_size import step_error
+    from seaopt.estimation.solver.settle import settle
+    from seaopt.estimation.solver.step_size import measure_step_error
 
     truth = thor.update(f_c=40.0, v_s=1e-3, d=0.1)
     bench = experiment(swing, noisy(swing, truth), offset=False, initial_state="rest", sigma={"F1": 2.0, "F2": 2.0})
     free = truth.free("J", "f_c")
-    unknowns = collect((bench,), _complete((bench,), free))
-    problem = _problem((bench,), unknowns, Linear(), None, 0.0)
+    problem = pose_problem((bench,), complete_parameters((bench,), free), loss=Squares())
+    unknowns = problem.unknowns
     from seaopt.estimation.solver.least_squares import minimise
 
     def minimum(substeps):
-        fixed = replace(problem, substeps=(substeps,))
-        return fixed, minimise(fixed.evaluate, unknowns.start, unknowns.low, unknowns.high)
+        fixed = problem.with_each(substeps=substeps)
+        return fixed, minimise(fixed, unknowns.start, unknowns.low, unknowns.high)
 
     crude, coarse = minimum(1)
     _, fine = minimum(16)
     std = np.sqrt(np.diag(np.linalg.inv(fine.evaluation.hessian)))
     bias = np.max(np.abs(coarse.z - fine.z) / std)
     assert bias > 1.0
-    assert step_error(crude, 0, coarse.evaluation).parameter == pytest.approx(bias, rel=0.35)
+    assert measure_step_error(crude, crude.experiments[0], coarse.evaluation).parameter == pytest.approx(bias, rel=0.35)
     done = settle(problem, problem.evaluate(unknowns.start), 60, None)
     assert done.step_error.small
     np.testing.assert_allclose(done.solution.z, fine.z, atol=0.1 * np.max(std / fine.z) * np.max(fine.z))
@@ -485,8 +486,8 @@ def test_a_free_delay_of_a_plant_that_depends_on_time_is_refused():
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        (("multiple_shooting", None, None), "is no method"),
-        ((so.OutputError(), "huber", None), "is no loss"),
+        (("multiple_shooting", None, None), "is not a valid method"),
+        ((so.OutputError(), "huber", None), "is not a valid loss"),
         ((so.OutputError(), None, 20.0), "is not a band"),
         ((so.PredictionError(), None, (0.0, 20.0)), "does not go with"),
     ],

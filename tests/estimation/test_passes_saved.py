@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 import seaopt as so
 from seaopt.estimation.problem.correlation import LaggedSums
-from seaopt.estimation.problem.residuals import Evaluation
+from seaopt.estimation.problem.normal_equations import QuadraticModel
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, make_model, run_passes
 from seaopt.simulation.compiled import PARALLEL, Program
@@ -104,6 +104,7 @@ def test_a_last_step_is_followed_without_an_evaluation_and_ends_where_scipy_does
     t, rng = np.linspace(0, 3, 400), np.random.default_rng(3)
     y = 2.0 * np.exp(-0.7 * t) + 0.01 * rng.normal(size=t.size)
     seen: list[np.ndarray] = []
+    origins: dict[int, tuple[QuadraticModel, np.ndarray]] = {}
 
     def residual(z):
         return (z[0] * np.exp(-z[1] * t) - y) / 0.01
@@ -114,20 +115,27 @@ def test_a_last_step_is_followed_without_an_evaluation_and_ends_where_scipy_does
     def evaluation(z, origin):
         r, j = residual(origin), jacobian(origin)
         r = r + j @ (z - origin)
-        return Evaluation(
-            z=z, cost=0.5 * float(r @ r), gradient=j.T @ r, hessian=j.T @ j, squares=(), counts=(),
-            undamped=np.zeros(2, dtype=bool), origin=origin, passes=(),
-        )  # fmt: skip
+        here = QuadraticModel(
+            z=z, cost=0.5 * float(r @ r), gradient=j.T @ r, hessian=j.T @ j, linear=np.zeros(2, dtype=bool)
+        )
+        origins[id(here)] = here, origin
+        return here
 
-    def evaluate(z, here, damping):
-        seen.append(z)
-        return evaluation(z, z)
+    class Exponential:
+        def evaluate(self, z):
+            seen.append(z)
+            return evaluation(z, z)
+
+        def take_step(self, here, z, share):
+            return self.evaluate(z)
 
     bounds, start = np.full(2, np.inf), np.array([1.95, 0.71])
-    all_made = minimise(evaluate, start, -bounds, bounds)
+    all_made = minimise(Exponential(), start, -bounds, bounds)
     plain = len(seen)
     seen.clear()
-    followed = minimise(evaluate, start, -bounds, bounds, follow=lambda here, z: evaluation(z, here.origin))
+    followed = minimise(
+        Exponential(), start, -bounds, bounds, follow=lambda here, z: evaluation(z, origins[id(here)][1])
+    )
     best = least_squares(residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
     std = np.sqrt(np.diag(np.linalg.inv(jacobian(best).T @ jacobian(best))))
     assert followed.status == all_made.status == "converged"

@@ -22,6 +22,7 @@ word: the preferred fit must not predict them worse, in free run, than one it be
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import field
 from itertools import pairwise
 from typing import Any
 
@@ -29,17 +30,147 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.advice.forecasts import Percent, fit_percent, free_run, in_band, used_and_held_out
-from seaopt.estimation.advice.ranking import Band, Ranked, Ranking
+from seaopt.estimation.advice.forecasts import (
+    Percent,
+    compute_percent,
+    filter_to_band,
+    simulate_freely,
+    split_samples,
+)
 from seaopt.estimation.problem.correlation import autocorrelation
-from seaopt.estimation.problem.residual_statistics import Errors
+from seaopt.estimation.problem.fit_experiment import FitOutput
+from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.fit_result import Fit
+from seaopt.formatting import format_table, html_text
+from seaopt.records import record
 
 MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0  # differences of BIC (Kass and Raftery)
-WORSE = 1.02  # ratio of held-out residuals that contradicts the likelihood
+CONTRADICTION = 1.02  # ratio of held-out residuals that contradicts the likelihood
 OCTAVES = 12  # at most, below the Nyquist frequency
 LINES = 4  # lines of the spectrum that the lowest octave has at least
+
+
+@record(eq=False)
+class Ranked:
+    """One fit in a ranking.
+
+    Parameters
+    ----------
+    name : str
+        Its label.
+    aic, bic : float
+        With every sample counted.
+    effective_bic : float
+        With the effective number of samples, up to a constant that all fits share.
+    unknowns : int
+        Sigmas included.
+    free_run : mapping of experiment to mapping of output to Percent
+        Fit of the simulation, over the samples used and those held out.
+    held_out_ratio : float or None
+        Held-out residual over that of the first in the ranking, geometric mean over outputs; None if nothing is held
+        out.
+
+    """
+
+    name: str
+    aic: float
+    bic: float
+    effective_bic: float
+    unknowns: int
+    free_run: Mapping[str, Mapping[str, Percent]]
+    held_out_ratio: float | None
+
+
+@record(eq=False)
+class OctavePower:
+    """Power of the residuals in one octave of one output: mean squares by fit, in the output's unit squared."""
+
+    experiment: str
+    output: str
+    unit: str
+    low_hz: float
+    high_hz: float
+    power: Mapping[str, float]
+
+
+@record(eq=False, repr=False)
+class Ranking:
+    """What `compare` returns; ``print(ranking)`` is a report.
+
+    Parameters
+    ----------
+    rows : tuple of Ranked
+        Best first, by effective BIC.
+    preferred : str or None
+        The first's name; None if undecided.
+    evidence : str
+        For it, against the next: "very strong", "strong", "positive" or "undecided".
+    samples, effective_samples : int, float
+        Of all outputs.
+    bands : tuple of OctavePower
+        Residual power per octave, of every output.
+    sentences : tuple of str
+        The verdict, and why.
+    fits : mapping of name to Fit
+        In the order of `rows`.
+
+    """
+
+    rows: tuple[Ranked, ...]
+    preferred: str | None
+    evidence: str
+    samples: int
+    effective_samples: float
+    bands: tuple[OctavePower, ...]
+    sentences: tuple[str, ...]
+    fits: Mapping[str, Fit] = field(repr=False)
+
+    @property
+    def decisive(self) -> bool:
+        """Whether the evidence is very strong: a difference of BIC beyond 10, and no objection by held-out samples."""
+        return self.evidence == "very strong"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content as numbers, lists and text."""
+        return {
+            "preferred": self.preferred, "evidence": self.evidence, "samples": self.samples,
+            "effective_samples": self.effective_samples, "sentences": list(self.sentences),
+            "ranking": [
+                {
+                    "name": row.name, "aic": row.aic, "bic": row.bic, "effective_bic": row.effective_bic,
+                    "unknowns": row.unknowns, "held_out_ratio": row.held_out_ratio,
+                    "free_run": {
+                        name: {output: {"used": p.used, "held_out": p.held_out} for output, p in outputs.items()}
+                        for name, outputs in row.free_run.items()
+                    },
+                }
+                for row in self.rows
+            ],
+            "bands": [
+                {"experiment": band.experiment, "output": band.output, "low_hz": band.low_hz, "high_hz": band.high_hz,
+                 "unit": f"({band.unit})^2", "power": dict(band.power)}
+                for band in self.bands
+            ],
+        }  # fmt: skip
+
+    def __repr__(self) -> str:
+        head = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]")
+        rows = format_table((self._cells(row) for row in self.rows), head, "<>>>>")
+        return "\n  ".join([f"Ranking: {self.sentences[0]}", *self.sentences[1:], *rows])
+
+    def _cells(self, row: Ranked) -> list[str]:
+        """Return a row of the table; the criteria are counted from those of the best fit."""
+        first = self.rows[0]
+        percents = ", ".join(
+            f"{name}.{output} {p.used:.2f}" + ("" if p.held_out is None else f" ({p.held_out:.2f})")
+            for name, outputs in row.free_run.items()
+            for output, p in outputs.items()
+        )
+        away = (row.effective_bic - first.effective_bic, row.bic - first.bic, row.aic - first.aic)
+        return [row.name, *(f"{value:+.6g}" for value in away), str(row.unknowns), percents]
+
+    _repr_html_ = html_text
 
 
 def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
@@ -80,61 +211,64 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
     ('unlumped', 'very strong')
 
     """
-    named = _named(fits)
-    minima = {name: fit.at_minimum("compare") for name, fit in named.items()}
+    named = _name_apart(fits)
+    minima = {name: fit.require_minimum("compare") for name, fit in named.items()}
     problems = {name: minimum.problem for name, minimum in minima.items()}
     _check(problems)
-    weighted = {name: minimum.errors() for name, minimum in minima.items()}
-    free = {name: free_run(minimum, weighted[name]) for name, minimum in minima.items()}
+    residuals = {name: minimum.residuals() for name, minimum in minima.items()}
+    free = {name: simulate_freely(minimum, residuals[name]) for name, minimum in minima.items()}
     shared = next(iter(problems.values()))
-    places = [(e, o) for e, experiment in enumerate(shared.experiments) for o in range(len(experiment.outputs))]
     effective = {
-        (e, o): min(_effective(left[e], o) for left in weighted.values()) for e, o in places
-    }  # fmt: skip
-    bic = {name: _effective_bic(fit, problems[name], weighted[name], effective) for name, fit in named.items()}
+        output.label: min(_count_effective(output, own) for own in residuals.values()) for output in shared.outputs
+    }
+    bic = {name: _compute_bic(fit, problems[name], residuals[name], effective) for name, fit in named.items()}
     order = sorted(named, key=lambda name: bic[name])
     rows = tuple(
         Ranked(
             name=name, aic=named[name].aic, bic=named[name].bic, effective_bic=bic[name],
-            unknowns=named[name]._count, free_run=_percents(problems[name], free[name]),
-            held_out_ratio=_held_out(shared, free[name], free[order[0]]),
+            unknowns=named[name].all_unknowns, free_run=_compute_percents(problems[name], free[name]),
+            held_out_ratio=_compare_held_out(shared, free[name], free[order[0]]),
         )
         for name in order
     )  # fmt: skip
-    bands = tuple(band for e, o in places for band in _bands({n: problems[n] for n in order}, e, o, weighted))
-    evidence = _evidence(rows)
+    octaves = [
+        _compute_octaves(places, {name: residuals[name] for name in order})
+        for places in zip(*(problems[name].outputs for name in order), strict=True)
+    ]
+    bands = tuple(octave for row in octaves for octave in row)
+    evidence = _weigh_evidence(rows)
     return Ranking(
         rows=rows, preferred=None if evidence == "undecided" else order[0], evidence=evidence,
         samples=named[order[0]].samples, effective_samples=float(sum(effective.values())), bands=bands,
-        sentences=_sentences(rows, evidence, bands, named), fits={name: named[name] for name in order},
+        sentences=_explain(rows, evidence, bands, named), fits={name: named[name] for name in order},
     )  # fmt: skip
 
 
-def _named(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
+def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
     """Return the fits under names of their own."""
     if isinstance(fits, Fit):
         raise EstimationError("compare takes two fits or more; put them in brackets, [one, other]")
-    found: dict[str, Fit] = {}
-    for given, fit in fits.items() if isinstance(fits, Mapping) else ((None, fit) for fit in fits):
+    named: dict[str, Fit] = {}
+    for chosen, fit in fits.items() if isinstance(fits, Mapping) else ((None, fit) for fit in fits):
         if not isinstance(fit, Fit):
             raise EstimationError(f"compare got a {type(fit).__name__}; give results of fit")
         plants = dict.fromkeys(experiment.plant.name for experiment in fit.experiments)
-        label = given if given is not None else " + ".join(plants) or "fit"
+        label = chosen if chosen is not None else " + ".join(plants) or "fit"
         name, number = label, 1
-        while name in found:
+        while name in named:
             number += 1
             name = f"{label} {number}"
-        found[name] = fit
-    if len(found) < 2:
-        raise EstimationError(f"compare got {len(found)} fit; give two or more to the same logs")
-    return found
+        named[name] = fit
+    if len(named) < 2:
+        raise EstimationError(f"compare got {len(named)} fit; give two or more to the same logs")
+    return named
 
 
 def _check(problems: dict[str, Residuals]) -> None:
     """Refuse fits to data that are not the same: their likelihoods are not of the same thing."""
     (first, one), *others = problems.items()
     for name, other in others:
-        what = _difference(one, other)
+        what = _find_difference(one, other)
         if what:
             raise EstimationError(
                 f'compare: "{name}" and "{first}" differ in {what}, and likelihoods of other data cannot be compared; '
@@ -142,7 +276,7 @@ def _check(problems: dict[str, Residuals]) -> None:
             )
 
 
-def _difference(one: Residuals, other: Residuals) -> str:
+def _find_difference(one: Residuals, other: Residuals) -> str:
     """Return what differs in the data of two problems; empty if nothing does."""
     names, others = [e.name for e in one.experiments], [e.name for e in other.experiments]
     if names != others:
@@ -153,7 +287,7 @@ def _difference(one: Residuals, other: Residuals) -> str:
         return f"their loss ({one.loss}; {other.loss})"
     if one.holdout != other.holdout:
         return f"holdout ({one.holdout:g}; {other.holdout:g})"
-    for a, b in zip(one.experiments, other.experiments, strict=True):
+    for a, b in zip((e.data for e in one.experiments), (e.data for e in other.experiments), strict=True):
         if a.outputs != b.outputs:
             return f"the outputs of {a.name} ({', '.join(a.outputs)}; {', '.join(b.outputs)})"
         channels = [*a.outputs, *(u for u in a.plant.inputs if u in a.log.signals and u in b.plant.inputs)]
@@ -166,81 +300,80 @@ def _difference(one: Residuals, other: Residuals) -> str:
     return ""
 
 
-def _effective(row: list[Errors], o: int) -> float:
+def _count_effective(output: FitOutput, residuals: ResidualsByExperiment) -> float:
     """Return how many independent samples tell as much of the variance of an output's residual."""
-    r = np.concatenate([error.weighted[:, o] for error in row])
+    r = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
     count = int(np.count_nonzero(r))
     lags = int(min(max(32, 4 * np.sqrt(r.size)), r.size - 1))
     squares = autocorrelation(r, lags)[1:] ** 2 - 1.0 / max(count, 1)  # what white noise leaves is taken off
     return count / (1.0 + 2.0 * max(float(np.sum(squares)), 0.0))
 
 
-def _effective_bic(
-    fit: Fit, problem: Residuals, left: list[list[Errors]], effective: Mapping[tuple[int, int], float]
+def _compute_bic(
+    fit: Fit, problem: Residuals, residuals: ResidualsByExperiment, effective: Mapping[str, float]
 ) -> float:
+    """Return the BIC with the effective number of samples of each output."""
     total = 0.0
-    for (e, o), number in effective.items():
-        r = np.concatenate([error.weighted[:, o] for error in left[e]]) * problem.sigma[e][o]
-        total += number * float(np.log(max(float(np.sum(r**2)) / max(np.count_nonzero(r), 1), 1e-300)))
-    return total + fit._count * float(np.log(max(sum(effective.values()), 1.0)))
+    for output in problem.outputs:
+        r = np.concatenate(residuals[output.experiment.name].weighted_of(output.name)) * output.sigma
+        power = float(np.sum(r**2)) / max(np.count_nonzero(r), 1)
+        total += effective[output.label] * float(np.log(max(power, 1e-300)))
+    return total + fit.all_unknowns * float(np.log(max(sum(effective.values()), 1.0)))
 
 
-def _percents(problem: Residuals, left: list[list[Errors]]) -> dict[str, dict[str, Percent]]:
+def _compute_percents(problem: Residuals, residuals: ResidualsByExperiment) -> dict[str, dict[str, Percent]]:
     return {
-        experiment.name: {name: fit_percent(problem, e, o, left) for o, name in enumerate(experiment.outputs)}
-        for e, experiment in enumerate(problem.experiments)
+        experiment.name: {output.name: compute_percent(output, residuals) for output in experiment.outputs}
+        for experiment in problem.experiments
     }
 
 
-def _held_out(problem: Residuals, left: list[list[Errors]], best: list[list[Errors]]) -> float | None:
+def _compare_held_out(problem: Residuals, one: ResidualsByExperiment, best: ResidualsByExperiment) -> float | None:
     """Return the ratio of held-out residuals to the best fit's, geometric mean over outputs."""
     logs: list[float] = []
-    for e, experiment in enumerate(problem.experiments):
-        for o in range(len(experiment.outputs)):
-            _, held = used_and_held_out(problem, e, o)
-            if np.any(held):
-                rms = [
-                    float(np.sqrt(np.mean(in_band(problem, e, _raw(found, e, o))[held] ** 2))) for found in (left, best)
-                ]
-                logs.append(float(np.log(max(rms[0], 1e-300) / max(rms[1], 1e-300))))
+    for output in problem.outputs:
+        _, held_out = split_samples(output)
+        if np.any(held_out):
+            raw = [residuals[output.experiment.name].raw_of(output.name) for residuals in (one, best)]
+            signals = [filter_to_band(output.experiment, rows)[held_out] for rows in raw]
+            rms = [max(float(np.sqrt(np.mean(signal**2))), 1e-300) for signal in signals]
+            logs.append(float(np.log(rms[0] / rms[1])))
     return float(np.exp(np.mean(logs))) if logs else None
 
 
-def _raw(left: list[list[Errors]], e: int, o: int) -> list[Float[np.ndarray, "..."]]:
-    return [error.raw[:, o] for error in left[e]]
+def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, ResidualsByExperiment]) -> list[OctavePower]:
+    """Return the power of what each likelihood sees of an output's residual, in octaves below the Nyquist frequency.
 
-
-def _bands(problems: Mapping[str, Residuals], e: int, o: int, left: Mapping[str, list[list[Errors]]]) -> list[Band]:
-    """Return the power of what each likelihood sees of an output's residual, in octaves below the Nyquist frequency."""
-    problem = next(iter(problems.values()))
-    experiment, period = problem.experiments[e], problem.experiments[e].log.period
-    residuals = {
-        name: np.concatenate([error.weighted[:, o] for error in left[name][e]]) * own.sigma[e][o]
-        for name, own in problems.items()
+    `places` is the output in each fit's own problem.
+    """
+    output, period = places[0], places[0].experiment.period
+    signals = {
+        name: np.concatenate(own[place.experiment.name].weighted_of(place.name)) * place.sigma
+        for place, (name, own) in zip(places, residuals.items(), strict=True)
     }
-    counts = {name: max(int(np.count_nonzero(r)), 1) for name, r in residuals.items()}
+    counts = {name: max(int(np.count_nonzero(r)), 1) for name, r in signals.items()}
     lowest = LINES / (max(counts.values()) * period)
     edges = [0.5 / period]
     while len(edges) <= OCTAVES and edges[-1] / 2.0 > lowest:
         edges.append(edges[-1] / 2.0)
     edges[-1] = 0.0
-    rows: list[Band] = []
-    spectra = {name: _spectrum(r, counts[name], period) for name, r in residuals.items()}
+    rows: list[OctavePower] = []
+    spectra = {name: _compute_spectrum(r, counts[name], period) for name, r in signals.items()}
     for high, low in pairwise(edges):
         power = {
             name: float(np.sum(density[(f > low if low else f >= 0.0) & (f <= high)]))
             for name, (f, density) in spectra.items()
         }  # fmt: skip
         rows.append(
-            Band(
-                experiment=experiment.name, output=experiment.outputs[o],
-                unit=experiment.plant.outputs[experiment.outputs[o]], low_hz=low, high_hz=high, power=power,
+            OctavePower(
+                experiment=output.experiment.name, output=output.name, unit=output.unit, low_hz=low, high_hz=high,
+                power=power,
             )
         )  # fmt: skip
     return rows[::-1]
 
 
-def _spectrum(r: Float[np.ndarray, " n"], count: int, period: float) -> tuple[Any, Any]:
+def _compute_spectrum(r: Float[np.ndarray, " n"], count: int, period: float) -> tuple[Any, Any]:
     """Return frequencies, and the mean square of the samples that counted which each line carries (Parseval)."""
     from scipy.fft import rfft  # deferred: scipy is slow to load
 
@@ -249,50 +382,58 @@ def _spectrum(r: Float[np.ndarray, " n"], count: int, period: float) -> tuple[An
     return np.arange(line.size) / (r.size * period), line / (r.size * count)
 
 
-def _evidence(rows: tuple[Ranked, ...]) -> str:
+def _weigh_evidence(rows: tuple[Ranked, ...]) -> str:
     margin = rows[1].effective_bic - rows[0].effective_bic
-    if margin <= MENTION or any(_objects(row) for row in rows[1:]):
+    if margin <= MENTION or any(_contradicts(row) for row in rows[1:]):
         return "undecided"
     return "very strong" if margin > VERY_STRONG else "strong" if margin > STRONG else "positive"
 
 
-def _objects(row: Ranked) -> bool:
+def _contradicts(row: Ranked) -> bool:
     """Tell whether held-out samples are predicted better than by the fit that the likelihood prefers."""
-    return row.held_out_ratio is not None and row.held_out_ratio < 1.0 / WORSE
+    return row.held_out_ratio is not None and row.held_out_ratio < 1.0 / CONTRADICTION
 
 
-def _sentences(
-    rows: tuple[Ranked, ...], evidence: str, bands: tuple[Band, ...], fits: Mapping[str, Fit]
+def _explain(
+    rows: tuple[Ranked, ...], evidence: str, bands: tuple[OctavePower, ...], fits: Mapping[str, Fit]
 ) -> tuple[str, ...]:
     first, second = rows[0], rows[1]
     margin, whole = second.effective_bic - first.effective_bic, second.bic - first.bic
     counted = f"BIC differs by {margin:.3g} with the effective number of samples, {whole:+.3g} with all"
-    objections = [row.name for row in rows[1:] if _objects(row)]
+    objections = [row.name for row in rows[1:] if _contradicts(row)]
     if objections:
-        told = [f"undecided: the likelihood prefers {first.name} ({counted}), held-out samples {', '.join(objections)}"]
+        sentences = [
+            f"undecided: the likelihood prefers {first.name} ({counted}), held-out samples {', '.join(objections)}"
+        ]
     elif evidence == "undecided":
-        told = [f"undecided between {first.name} and {second.name}: {counted}; excite or measure what tells them apart"]
+        sentences = [
+            f"undecided between {first.name} and {second.name}: {counted}; excite or measure what tells them apart"
+        ]
     else:
-        told = [f"{first.name} is preferred, with {evidence} evidence against {second.name}: {counted}"]
+        sentences = [f"{first.name} is preferred, with {evidence} evidence against {second.name}: {counted}"]
     if first.held_out_ratio is None:
-        told.append("no samples were held out: fit with holdout=0.2 to see whether the best repeats")
-    told += [_why(row.name, first.name, bands) for row in rows[1:] if row.effective_bic - first.effective_bic > MENTION]
-    told += [
+        sentences.append("no samples were held out: fit with holdout=0.2 to see whether the best repeats")
+    sentences += [
+        _explain_loss(row.name, first.name, bands)
+        for row in rows[1:]
+        if row.effective_bic - first.effective_bic > MENTION
+    ]
+    sentences += [
         f"{name} ended as {fit.status.replace('_', ' ')} and may explain more than was found: {fit.message}"
         for name, fit in fits.items()
         if not fit.ok
     ]
-    return tuple(told)
+    return tuple(sentences)
 
 
-def _why(loser: str, winner: str, bands: tuple[Band, ...]) -> str:
-    """Say in which output and octave a fit falls short most, in units of the winner's residual."""
+def _explain_loss(loser: str, winner: str, bands: tuple[OctavePower, ...]) -> str:
+    """Return in which output and octave a fit falls short most, in units of the winner's residual."""
     totals: dict[tuple[str, str], float] = {}
     for band in bands:
         key = (band.experiment, band.output)
         totals[key] = totals.get(key, 0.0) + band.power[winner]
 
-    def excess(band: Band) -> float:
+    def excess(band: OctavePower) -> float:
         return (band.power[loser] - band.power[winner]) / max(totals[band.experiment, band.output], 1e-300)
 
     worst = max(bands, key=excess)

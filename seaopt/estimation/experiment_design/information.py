@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from seaopt.bench import Excitation, excite
 from seaopt.errors import EstimationError, suggestion
-from seaopt.estimation.problem.normal_equations import inverse
-from seaopt.estimation.result.covariance import with_infinities
+from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.result.covariance import mark_unseen
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -167,8 +167,8 @@ class Bench:
         if not np.all(np.isfinite(total)):
             return np.full((p, p), np.inf)
         total[np.arange(p), np.arange(p)] += self.prior
-        back, unseen = inverse(total)
-        return with_infinities(back[:p, :p], unseen[:p])
+        back, unseen = invert(total)
+        return mark_unseen(back[:p, :p], unseen[:p])
 
 
 def make_bench(

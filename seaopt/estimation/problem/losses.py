@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,8 +13,20 @@ from seaopt.simulation import RobustLoss
 
 
 @record
-class Linear:
+class Squares:
     """Plain least squares."""
+
+    kind: ClassVar[RobustLoss] = "square"
+    quadratic: ClassVar[bool] = True
+    threshold: ClassVar[float] = np.inf
+
+    def slope(self, r: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return the loss's derivative at each residual, in sigma."""
+        return r
+
+    def curvature(self, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the loss's second derivative at each residual, in sigma."""
+        return np.ones_like(r)
 
 
 @record
@@ -26,10 +40,20 @@ class Huber:
 
     """
 
+    kind: ClassVar[RobustLoss] = "huber"
+    quadratic: ClassVar[bool] = False
     threshold: float = 1.345
 
     def __post_init__(self) -> None:
         _check_threshold("Huber", self.threshold)
+
+    def slope(self, r: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return the loss's derivative at each residual, in sigma."""
+        return np.clip(r, -self.threshold, self.threshold)
+
+    def curvature(self, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the loss's second derivative at each residual, in sigma."""
+        return (np.abs(r) <= self.threshold).astype(float)
 
 
 @record
@@ -43,10 +67,20 @@ class SoftL1:
 
     """
 
+    kind: ClassVar[RobustLoss] = "soft_l1"
+    quadratic: ClassVar[bool] = False
     threshold: float = 1.345
 
     def __post_init__(self) -> None:
         _check_threshold("SoftL1", self.threshold)
+
+    def slope(self, r: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return the loss's derivative at each residual, in sigma."""
+        return r / np.sqrt(1.0 + (r / self.threshold) ** 2)
+
+    def curvature(self, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the loss's second derivative at each residual, in sigma."""
+        return (1.0 + (r / self.threshold) ** 2) ** -1.5
 
 
 def _check_threshold(name: str, value: float) -> None:
@@ -54,19 +88,4 @@ def _check_threshold(name: str, value: float) -> None:
         raise EstimationError(f"{name}(threshold={value:g}): give a positive number of sigmas")
 
 
-Loss = Linear | Huber | SoftL1
-NAMES: dict[type, RobustLoss] = {Linear: "square", Huber: "huber", SoftL1: "soft_l1"}  # of the passes
-
-
-def pull_of(loss: Loss, r: Float[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
-    """Return the loss's derivative at each residual, in sigma."""
-    if isinstance(loss, Huber):
-        return np.clip(r, -loss.threshold, loss.threshold)
-    return r if isinstance(loss, Linear) else r / np.sqrt(1.0 + (r / loss.threshold) ** 2)
-
-
-def curvature_of(loss: Loss, r: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the loss's second derivative at each residual, in sigma."""
-    if isinstance(loss, Huber):
-        return (np.abs(r) <= loss.threshold).astype(float)
-    return np.ones_like(r) if isinstance(loss, Linear) else (1.0 + (r / loss.threshold) ** 2) ** -1.5
+Loss = Squares | Huber | SoftL1

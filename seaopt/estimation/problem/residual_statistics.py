@@ -1,24 +1,23 @@
-"""What a fit leaves over, chunk by chunk: residuals, their derivatives, and the sums that say how well it explains."""
+"""The residuals of each experiment, and sums over them that tell how well it is explained."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from seaopt.estimation.problem.correlation import LaggedSums, ljung_box
-from seaopt.estimation.problem.losses import pull_of
-from seaopt.estimation.problem.residuals import CHUNK, Residuals
+from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
+from seaopt.estimation.problem.residuals import Residuals
 from seaopt.records import record
-from seaopt.simulation import Point, Segment, stream
+from seaopt.simulation import Point
 
 
 @record(eq=False)
-class Errors:
-    """What one segment's outputs leave over.
+class SegmentResiduals:
+    """The residuals of one segment.
 
     Parameters
     ----------
@@ -33,24 +32,56 @@ class Errors:
     raw: Float[np.ndarray, "n ny"]
 
 
-def errors(problem: Residuals, z: Float[np.ndarray, " n"]) -> list[list[Errors]]:
-    """Return the residuals of every experiment and segment."""
-    found: list[list[Errors]] = []
-    for e, pieces in enumerate(problem.segments):
-        row: list[Errors] = []
-        for s in range(len(pieces)):
-            parts = list(_chunks(problem, e, s, z))
-            weighted = np.concatenate([part.where_used(part.weighted) for part in parts], axis=1)
-            row.append(Errors(weighted=weighted.T, raw=np.concatenate([part.raw for part in parts], axis=1).T))
-        found.append(row)
-    return found
+@record(eq=False)
+class ExperimentResiduals:
+    """The residuals of one experiment, segment by segment."""
+
+    outputs: tuple[str, ...]
+    segments: tuple[SegmentResiduals, ...]
+
+    @property
+    def weighted(self) -> Float[np.ndarray, "n ny"]:
+        """Those of all segments, filtered and in sigma; zero where a sample does not count."""
+        return np.concatenate([segment.weighted for segment in self.segments])
+
+    @property
+    def raw(self) -> Float[np.ndarray, "n ny"]:
+        """Model minus measured of all segments; NaN where missing."""
+        return np.concatenate([segment.raw for segment in self.segments])
+
+    def weighted_of(self, output: str) -> list[Float[np.ndarray, "..."]]:
+        """Return the weighted residuals of one output, segment by segment."""
+        return [segment.weighted[:, self.outputs.index(output)] for segment in self.segments]
+
+    def raw_of(self, output: str) -> list[Float[np.ndarray, "..."]]:
+        """Return model minus measured of one output, segment by segment."""
+        return [segment.raw[:, self.outputs.index(output)] for segment in self.segments]
+
+
+ResidualsByExperiment = Mapping[str, ExperimentResiduals]
+
+
+def compute_residuals(problem: Residuals, z: Float[np.ndarray, " n"]) -> dict[str, ExperimentResiduals]:
+    """Return the residuals of every experiment, by its name."""
+    return {experiment.name: compute_experiment_residuals(experiment, z) for experiment in problem.experiments}
+
+
+def compute_experiment_residuals(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> ExperimentResiduals:
+    """Return the residuals of one experiment."""
+    rows: list[SegmentResiduals] = []
+    for segment in experiment.segments:
+        chunks = list(_stream_residuals(experiment, segment, z))
+        weighted = np.concatenate([chunk.where_used(chunk.weighted) for chunk in chunks], axis=1)
+        raw = np.concatenate([chunk.raw for chunk in chunks], axis=1)
+        rows.append(SegmentResiduals(weighted=weighted.T, raw=raw.T))
+    return ExperimentResiduals(outputs=experiment.data.outputs, segments=tuple(rows))
 
 
 @record(eq=False)
 class _Chunk:
     """Rows of a segment: model minus measured, filtered residuals in sigma, which count, and the measured in a band.
 
-    Arrays have one row an output. `used` is None where every sample counts.
+    Arrays have one row per output. `used` is None where every sample counts.
     """
 
     rows: slice
@@ -64,58 +95,38 @@ class _Chunk:
         return values if self.used is None else np.where(self.used, values, 0.0)
 
 
-def _chunks(problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chunk: int = CHUNK) -> Iterator[_Chunk]:
-    """Yield what a segment's outputs leave over, chunk by chunk."""
-    model, point, weights, piece = (
-        problem.unknowns.models[e], problem.point(e, z), problem.weights(e), problem.segments[e][s],
-    )  # fmt: skip
-    first, filtered, sigma = 0, bool(len(weights.sections)), problem.sigma[e][:, None]
-    for part in stream(model, piece, point, problem.start(e, s, z), weights, chunk=chunk, columns=filtered):
+def _stream_residuals(
+    experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], chunk: int = CACHED_SAMPLES
+) -> Iterator[_Chunk]:
+    """Yield the residuals of a segment, chunk by chunk."""
+    point, weights, samples = experiment.point(z), experiment.weights, segment.samples
+    filtered, sigma = bool(len(weights.sections)), experiment.sigma[:, None]
+    for rows, part in experiment.stream(segment, z, point, chunk=chunk, columns=filtered):
         assert part.outputs is not None
-        rows = slice(first, first + len(part.outputs))
-        first = rows.stop
         raw = np.multiply(part.outputs.T, point.gain[:, None], order="C")
         raw += point.offset[:, None]
-        for o, channel in enumerate(piece.y):
+        for o, channel in enumerate(samples.y):
             raw[o] -= channel[rows]
         if point.drift_terms:
-            raw += point.drift @ piece.drift_basis(rows, point.drift_terms).T
-        left = raw if part.columns is None else part.columns[:, :, 0].T
-        every = not piece.keep and rows.start >= weights.settle and bool(np.all(np.isfinite(np.sum(raw, axis=1))))
+            raw += point.drift @ samples.drift_basis(rows, point.drift_terms).T
+        residual = raw if part.columns is None else part.columns[:, :, 0].T
+        every = not samples.keep and rows.start >= weights.settle and bool(np.all(np.isfinite(np.sum(raw, axis=1))))
         yield _Chunk(
-            rows=rows, raw=raw, weighted=left / sigma,
-            used=None if every else counted(piece, weights.settle, rows).T,
-            in_band=None if part.columns is None else _modelled(part.columns, point).T - left,
+            rows=rows, raw=raw, weighted=residual / sigma,
+            used=None if every else segment.mark_counted(weights.settle, rows).T,
+            in_band=None if part.columns is None else _model_in_band(part.columns, point).T - residual,
         )  # fmt: skip
 
 
-def _modelled(columns: Float[np.ndarray, "m ny nc"], point: Point) -> Float[np.ndarray, "m ny"]:
+def _model_in_band(columns: Float[np.ndarray, "m ny nc"], point: Point) -> Float[np.ndarray, "m ny"]:
     """Return the filtered model of what is measured, from the filtered columns of 1, drift's polynomials and output."""
-    own = columns[:, :, -(2 + point.drift_terms) :]
-    drift = np.sum(own[:, :, 1:-1] * point.drift, axis=2)
-    return own[:, :, 0] * point.offset + drift + point.gain * own[:, :, -1]
-
-
-def counted(piece: Segment, settle: int, rows: slice | None = None) -> Bool[np.ndarray, "n ny"]:
-    """Return which samples take part in the cost."""
-    chosen = rows if rows is not None else slice(0, piece.n)
-    present = np.column_stack([np.isfinite(channel[chosen]) for channel in piece.y])
-    if piece.keep:
-        present &= np.column_stack([mask[chosen] > 0 for mask in piece.keep])
-    present[: max(settle - chosen.start, 0)] = False
-    return present
-
-
-def count_of(piece: Segment) -> Int[np.ndarray, " ny"]:
-    """Return how many samples of each output are there and have a weight."""
-    present = [np.isfinite(channel) for channel in piece.y]
-    if piece.keep:
-        present = [own & (mask > 0) for own, mask in zip(present, piece.keep, strict=True)]
-    return np.array([np.count_nonzero(own) for own in present])
+    sensor = columns[:, :, -(2 + point.drift_terms) :]
+    drift = np.sum(sensor[:, :, 1:-1] * point.drift, axis=2)
+    return sensor[:, :, 0] * point.offset + drift + point.gain * sensor[:, :, -1]
 
 
 @record(eq=False)
-class Part:
+class MisfitSums:
     """Sums over samples of one output: how many, power and mean of model minus measured, spread of the measured."""
 
     count: int
@@ -128,39 +139,46 @@ class Part:
         """100 (1 - |y - yhat| / |y - mean(y)|); None of no samples."""
         return 100.0 * (1.0 - float(np.sqrt(self.power / max(self.spread, 1e-300)))) if self.count else None
 
-    def levelled(self, bias: float) -> Part:
+    def shift(self, offset: float) -> MisfitSums:
         """Return the sums with an offset taken out of model minus measured."""
-        power = self.power - self.count * bias * (2.0 * self.bias - bias)
-        return replace(self, power=max(power, 0.0), bias=self.bias - bias)
+        power = self.power - self.count * offset * (2.0 * self.bias - offset)
+        return replace(self, power=max(power, 0.0), bias=self.bias - offset)
 
 
 @record(eq=False)
-class Leftover:
+class ResidualStatistics:
     """What an experiment's residuals come to, in the memory of a chunk.
 
     Parameters
     ----------
+    outputs : tuple of str
+        In the order of the arrays.
     correlation : array, shape (lags + 1, ny, ny)
         Sums of r_a(t) r_b(t - k), r what the loss makes of the weighted residuals.
     mean, count : array, shape (ny,)
         Of r, over the samples that count.
-    used, rest : tuple of Part
-        One an output: samples that count but for the filter's settling, and those held out.
-    band : tuple of Part
+    used, held_out : mapping of output to MisfitSums
+        Over the samples that count, those in which the filter settles included, and over those held out.
+    in_band : mapping of output to MisfitSums
         The same in the fit's band, of the samples that count, each segment's mean taken out; empty without a band.
 
     """
 
+    outputs: tuple[str, ...]
     correlation: Float[np.ndarray, "lags1 ny ny"]
     mean: Float[np.ndarray, " ny"]
     count: Float[np.ndarray, " ny"]
-    used: tuple[Part, ...]
-    rest: tuple[Part, ...]
-    band: tuple[Part, ...] = ()
+    used: Mapping[str, MisfitSums]
+    held_out: Mapping[str, MisfitSums]
+    in_band: Mapping[str, MisfitSums]
 
-    def whiteness(self, o: int, lags: int = 20) -> float:
+    def count_of(self, output: str) -> float:
+        """Return how many samples of an output count."""
+        return float(self.count[self.outputs.index(output)])
+
+    def whiteness(self, output: str, lags: int = 20) -> float:
         """Return the p-value of the Ljung-Box test that r is white (Biometrika 65, 1978)."""
-        n = float(self.count[o])
+        o, n = self.outputs.index(output), self.count_of(output)
         lags = min(lags, len(self.correlation) - 1, int(n / 5))
         power = self.correlation[0, o, o] - n * self.mean[o] ** 2
         if lags < 1 or power <= 0.0:
@@ -169,81 +187,105 @@ class Leftover:
         return ljung_box(rho, n)
 
 
-def leftover(problem: Residuals, e: int, z: Float[np.ndarray, " n"]) -> Leftover:
-    """Return what an experiment's residuals come to."""
-    pieces, ny = problem.segments[e], len(problem.sigma[e])
-    lags = _lags(max(piece.n for piece in pieces))
-    total, count = np.zeros(ny), np.zeros(ny)
-    longest = max(piece.n for piece in pieces)
-    chunk = -(
-        -longest // max(round(longest / max(CHUNK, 4 * lags)), 1)
-    )  # of even lengths: transforms are of the longest
-    whole, again = LaggedSums(ny, lags + chunk, lags), LaggedSums(ny, lags, lags)  # tail and chunk, and the tail
-    banded = bool(len(problem.weights(e).sections))
-    sums = np.zeros((2 + banded, ny, 5))  # used, rest, in the band; see _sums
-    for s, piece in enumerate(pieces):
-        tail, here = np.zeros((ny, 0)), np.zeros((2 + banded, ny, 5))
-        started = not piece.keep or bool(np.any(piece.keep[0]))  # else it has no initial state: it says nothing
-        origin = [float(channel[np.argmax(np.isfinite(channel))]) for channel in piece.y]
-        for part in _chunks(problem, e, s, z, chunk):
-            pull = part.where_used(pull_of(problem.loss, part.weighted))
-            with_tail = np.concatenate([tail, pull], axis=1)
-            whole.add(with_tail)
-            if tail.size:
-                again.add(tail)
-            tail = with_tail[:, max(with_tail.shape[1] - lags, 0) :]
-            total += np.sum(pull, axis=1)
-            count += pull.shape[1] if part.used is None else np.count_nonzero(part.used, axis=1)
-            kept = None if part.used is None else counted(piece, 0, part.rows).T
-            for o, channel in enumerate(piece.y):
-                measured = channel[part.rows] - origin[o]
-                if part.used is None or kept is None:
-                    here[0, o] += _sums(None, measured, part.raw[o])
-                else:
-                    here[0, o] += _sums(kept[o], measured, part.raw[o])
-                    here[1, o] += _sums(~kept[o] & np.isfinite(measured) & started, measured, part.raw[o])
-                if part.in_band is not None:
-                    left = part.weighted[o] * problem.sigma[e][o]
-                    here[2, o] += _sums(None if part.used is None else part.used[o], part.in_band[o], left)
+StatisticsByExperiment = Mapping[str, ResidualStatistics]
+
+
+def compute_statistics(problem: Residuals, z: Float[np.ndarray, " n"]) -> dict[str, ResidualStatistics]:
+    """Return what the residuals of every experiment come to, by its name."""
+    return {experiment.name: _compute_statistics(experiment, z) for experiment in problem.experiments}
+
+
+class _Sums:
+    """Collects sums over an experiment's residuals chunk by chunk; lives only inside `compute_statistics`."""
+
+    def __init__(self, experiment: FitExperiment) -> None:
+        ny, longest = len(experiment.sigma), experiment.longest
+        self.lags = int(min(max(32, 4 * np.sqrt(longest)), longest // 4))
+        # Chunks are of even lengths: transforms are of the longest.
+        self.chunk = -(-longest // max(round(longest / max(CACHED_SAMPLES, 4 * self.lags)), 1))
+        self.whole = LaggedSums(ny, self.lags + self.chunk, self.lags)  # of the last chunk's tail and a chunk
+        self.twice = LaggedSums(ny, self.lags, self.lags)  # of the tails, which `whole` counts twice
+        self.total, self.count = np.zeros(ny), np.zeros(ny)
+
+    def add(
+        self, slopes: Float[np.ndarray, "ny m"], used: Bool[np.ndarray, "ny m"] | None,
+        tail: Float[np.ndarray, "ny t"],
+    ) -> Float[np.ndarray, "ny next"]:  # fmt: skip
+        """Add what the loss makes of a chunk of a segment, and return the tail that the next one takes."""
+        with_tail = np.concatenate([tail, slopes], axis=1)
+        self.whole.add(with_tail)
+        if tail.size:
+            self.twice.add(tail)
+        self.total += np.sum(slopes, axis=1)
+        self.count += slopes.shape[1] if used is None else np.count_nonzero(used, axis=1)
+        return with_tail[:, max(with_tail.shape[1] - self.lags, 0) :]
+
+
+def _compute_statistics(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> ResidualStatistics:
+    names, sums = experiment.data.outputs, _Sums(experiment)
+    banded = bool(len(experiment.weights.sections))
+    misfits = np.zeros((2 + banded, len(names), 5))  # used, held out, in the band; see _sum_misfits
+    for segment in experiment.segments:
+        tail = np.zeros((len(names), 0))
+        added = np.zeros_like(misfits)
+        origins = [float(channel[np.argmax(np.isfinite(channel))]) for channel in segment.samples.y]
+        for chunk in _stream_residuals(experiment, segment, z, sums.chunk):
+            tail = sums.add(chunk.where_used(experiment.loss.slope(chunk.weighted)), chunk.used, tail)
+            _add_misfits(added, experiment, segment, chunk, origins)
         if banded:  # each segment's filter settles at a level of its own
-            here[2, :, 3] -= here[2, :, 2] ** 2 / np.maximum(here[2, :, 0], 1.0)
-            here[2, :, 2] = 0.0
-        sums += here
-    used, rest, *band = (tuple(_part(*row) for row in rows) for rows in sums.tolist())
-    return Leftover(
-        correlation=whole.sums() - again.sums(), mean=total / np.maximum(count, 1.0), count=count, used=used,
-        rest=rest, band=band[0] if band else (),
+            added[2, :, 3] -= added[2, :, 2] ** 2 / np.maximum(added[2, :, 0], 1.0)
+            added[2, :, 2] = 0.0
+        misfits += added
+    used, held_out, *in_band = (
+        {name: _make_sums(*row) for name, row in zip(names, rows, strict=True)} for rows in misfits.tolist()
+    )
+    return ResidualStatistics(
+        outputs=names, correlation=sums.whole.sums() - sums.twice.sums(),
+        mean=sums.total / np.maximum(sums.count, 1.0), count=sums.count, used=used, held_out=held_out,
+        in_band=in_band[0] if in_band else {},
     )  # fmt: skip
 
 
-def _sums(
-    chosen: Bool[np.ndarray, " m"] | None, measured: Float[np.ndarray, " m"], misses: Float[np.ndarray, " m"]
+def _add_misfits(
+    added: Float[np.ndarray, "parts ny 5"], experiment: FitExperiment, segment: FitSegment, chunk: _Chunk,
+    origins: list[float],
+) -> None:  # fmt: skip
+    """Add a chunk's sums to those of the samples used, of those held out, and of those used in the band."""
+    kept = None if chunk.used is None else segment.mark_counted(0, chunk.rows).T
+    for o, channel in enumerate(segment.samples.y):
+        measured = channel[chunk.rows] - origins[o]
+        if chunk.used is None or kept is None:
+            added[0, o] += _sum_misfits(None, measured, chunk.raw[o])
+        else:
+            held_out = ~kept[o] & np.isfinite(measured) & segment.has_start
+            added[0, o] += _sum_misfits(kept[o], measured, chunk.raw[o])
+            added[1, o] += _sum_misfits(held_out, measured, chunk.raw[o])
+        if chunk.in_band is not None:
+            residual = chunk.weighted[o] * experiment.sigma[o]
+            added[2, o] += _sum_misfits(None if chunk.used is None else chunk.used[o], chunk.in_band[o], residual)
+
+
+def _sum_misfits(
+    chosen: Bool[np.ndarray, " m"] | None, measured: Float[np.ndarray, " m"], misfits: Float[np.ndarray, " m"]
 ) -> tuple[float, float, float, float, float]:
-    """Return of the chosen samples: count, power of the misses, sum and squares of the measured, sum of the misses."""
+    """Return of the chosen samples: count, power of the misfits, sum and squares of the measured, sum of misfits."""
     if chosen is not None:
-        measured, misses = measured[chosen], misses[chosen]
-    power, square = (float(np.einsum("m,m->", x, x)) for x in (misses, measured))
-    return measured.size, power, float(np.sum(measured)), square, float(np.sum(misses))
+        measured, misfits = measured[chosen], misfits[chosen]
+    power, square = (float(np.einsum("m,m->", x, x)) for x in (misfits, measured))
+    return measured.size, power, float(np.sum(measured)), square, float(np.sum(misfits))
 
 
-def _part(n: float, power: float, first: float, square: float, raw: float) -> Part:
-    """Return the part that `_sums` give."""
+def _make_sums(n: float, power: float, level: float, square: float, misfit: float) -> MisfitSums:
+    """Return the record of what `_sum_misfits` gave."""
     count = max(n, 1.0)
-    return Part(count=int(n), power=power, spread=square - first**2 / count, bias=raw / count)
+    return MisfitSums(count=int(n), power=power, spread=square - level**2 / count, bias=misfit / count)
 
 
-def _lags(n: int) -> int:
-    return int(min(max(32, 4 * np.sqrt(n)), n // 4))
-
-
-def column_chunks(
-    problem: Residuals, e: int, s: int, z: Float[np.ndarray, " n"], chunk: int = CHUNK
-) -> Iterator[tuple[slice, Any, Any]]:
+def stream_columns(
+    experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], chunk: int = CACHED_SAMPLES
+) -> Iterator[tuple[slice, Float[np.ndarray, "m ny nc"], Bool[np.ndarray, "m ny"]]]:
     """Yield rows, their columns, and which samples count, chunk by chunk."""
-    first, weights, piece = 0, problem.weights(e), problem.segments[e][s]
-    arguments = problem.unknowns.models[e], piece, problem.point(e, z), problem.start(e, s, z)
-    for part in stream(*arguments, weights, chunk=chunk, columns=True):
+    settle = experiment.weights.settle
+    for rows, part in experiment.stream(segment, z, experiment.point(z), chunk=chunk, columns=True):
         assert part.columns is not None
-        rows = slice(first, first + len(part.columns))
-        first = rows.stop
-        yield rows, part.columns, counted(piece, weights.settle, rows)
+        yield rows, part.columns, segment.mark_counted(settle, rows)

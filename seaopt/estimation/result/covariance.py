@@ -28,18 +28,22 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from seaopt.estimation.problem.correlation import lagged_size, parzen, transforms
-from seaopt.estimation.problem.losses import curvature_of
+from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
 from seaopt.estimation.problem.normal_equations import add_gram
-from seaopt.estimation.problem.residual_statistics import Leftover, column_chunks
-from seaopt.estimation.problem.residuals import CHUNK, Residuals
+from seaopt.estimation.problem.residual_statistics import (
+    ResidualStatistics,
+    StatisticsByExperiment,
+    stream_columns,
+)
+from seaopt.estimation.problem.residuals import Residuals
 from seaopt.records import record
 from seaopt.simulation import double_sum
 
-CHANCE = 2.0  # correlations above CHANCE sqrt(log10(n) / n) are told from chance
-SMALL = 512  # samples of a product that the linear-algebra library does on one thread
-SHORT = 64  # lags that a compiled pass sums more quickly than transforms do
-FEW = 5000  # samples, beyond which what a fit takes out of its own residuals no longer matters
-LEAST, WIDER = 8, 3.0  # shortest window, and its reach over the last lag that is told from chance
+CHANCE_CORRELATION = 2.0  # correlations above this times sqrt(log10(n) / n) are told from chance
+SINGLE_THREADED = 512  # samples of a product that the linear-algebra library does on one thread
+COMPILED_LAGS = 64  # that a compiled pass sums more quickly than transforms do
+SHORT_LOG = 5000  # samples, beyond which what a fit takes out of its own residuals no longer matters
+SHORTEST_WINDOW, WIDER = 8, 3.0  # and a window's reach over the last lag that is told from chance
 
 
 @record(eq=False)
@@ -55,87 +59,95 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[i, i], 0.0)))
 
 
-def robust_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+def compute_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
-    return _weighted(problem, z, lambda e, o, r: curvature_of(problem.loss, r))
+    return _sum_weighted(problem, z, lambda experiment, o, r: problem.loss.curvature(r))
 
 
-def robust_meat(problem: Residuals, z: Float[np.ndarray, " n"], left: list[Leftover]) -> Float[np.ndarray, "n n"]:
+def compute_white_meat(
+    problem: Residuals, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
+) -> Float[np.ndarray, "n n"]:
     """Return B for white residuals: J^T J with the mean square of what the loss makes of each output's residuals."""
-    power = [np.diagonal(sums.correlation[0]) / np.maximum(sums.count, 1.0) for sums in left]
-    return _weighted(problem, z, lambda e, o, r: np.full(r.size, power[e][o]))
+    power = {
+        name: np.diagonal(sums.correlation[0]) / np.maximum(sums.count, 1.0) for name, sums in statistics.items()
+    }  # fmt: skip
+    return _sum_weighted(problem, z, lambda experiment, o, r: np.full(r.size, power[experiment.name][o]))
 
 
-def _weighted(
+def _sum_weighted(
     problem: Residuals, z: Float[np.ndarray, " n"],
-    weigh: Callable[[int, int, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
+    weigh: Callable[[FitExperiment, int, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
 ) -> Float[np.ndarray, "n n"]:  # fmt: skip
     """Return J^T J with weights that come of the residuals, in sigma, of an experiment's output."""
     normal = np.zeros((1 + z.size, 1 + z.size))
-    for e, pieces in enumerate(problem.segments):
-        for s in range(len(pieces)):
-            for _, columns, used in column_chunks(problem, e, s, z):
-                for o, places in enumerate(problem.columns(e, s)):
-                    v = columns[:, o] / problem.sigma[e][o]
-                    weight = used[:, o] * weigh(e, o, v[:, 0])
+    for experiment in problem.experiments:
+        for segment in experiment.segments:
+            for _, columns, used in stream_columns(experiment, segment, z):
+                for o, places in enumerate(experiment.columns(segment)):
+                    v = columns[:, o] / experiment.sigma[o]
+                    weight = used[:, o] * weigh(experiment, o, v[:, 0])
                     add_gram(normal, (v * weight[:, None]).T @ v, places)
     return normal[1:, 1:]
 
 
-def coloured(
-    problem: Residuals, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"], left: list[Leftover]
-) -> Float[np.ndarray, "p p"]:
-    """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E."""
+def compute_meat(
+    problem: Residuals, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
+    statistics: StatisticsByExperiment,
+) -> Float[np.ndarray, "p p"]:  # fmt: skip
+    """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E: B for residuals of any colour."""
     p = inverse.shape[1]
     total = np.zeros((p, p))
-    for e, sums in enumerate(left):
-        r, last = correlations(sums)
-        found = _summed(problem, e, z, inverse, r)
-        if np.max(sums.count) < FEW and not last:
-            found = _at_least(found, _summed(problem, e, z, inverse, r[:1]))
-        total += found
+    for experiment in problem.experiments:
+        sums = statistics[experiment.name]
+        r, last = estimate_correlations(sums)
+        meat = _sum_twice(experiment, z, inverse, r)
+        if np.max(sums.count) < SHORT_LOG and not last:
+            meat = _at_least(meat, _sum_twice(experiment, z, inverse, r[:1]))
+        total += meat
     return total
 
 
-def _summed(
-    problem: Residuals, e: int, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
+def _sum_twice(
+    experiment: FitExperiment, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
     r: Float[np.ndarray, "lags1 ny ny"],
 ) -> Float[np.ndarray, "p p"]:  # fmt: skip
     """Return one experiment's part of the double sum."""
-    pieces, total = problem.segments[e], np.zeros((inverse.shape[1],) * 2)
-    reach, chunk = len(r) - 1, max(CHUNK, 4 * len(r))
-    into_of = [_into(problem, e, s, inverse) for s in range(len(pieces))]
-    if reach <= SHORT:
-        model, point, weights = problem.unknowns.models[e], problem.point(e, z), problem.weights(e)
+    total = np.zeros((inverse.shape[1],) * 2)
+    reach, chunk = len(r) - 1, max(CACHED_SAMPLES, 4 * len(r))
+    pairs = [(segment, _map_to_influence(experiment, segment, inverse)) for segment in experiment.segments]
+    if reach <= COMPILED_LAGS:
+        point, weights = experiment.point(z), experiment.weights
         sums = [
-            double_sum(model, piece, point, problem.start(e, s, z), weights, into_of[s], r)
-            for s, piece in enumerate(pieces)
+            double_sum(experiment.model, segment.samples, point, segment.start(z), weights, into, r)
+            for segment, into in pairs
         ]
-        if all(found is not None for found in sums):
+        if all(one is not None for one in sums):
             return np.sum(np.array(sums), axis=0)
-    longest = reach + min(chunk, max(piece.n for piece in pieces))
-    whole, again = (_Form.make(r, n) for n in (longest, reach))
-    for s, into in enumerate(into_of):
+    longest = reach + min(chunk, experiment.longest)
+    whole, twice = (_Form.make(r, n) for n in (longest, reach))
+    for segment, into in pairs:
         tail = np.zeros((*into.shape[:2], 0))
-        for _, columns, used in column_chunks(problem, e, s, z, chunk):
+        for _, columns, used in stream_columns(experiment, segment, z, chunk):
             with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)
-            total += whole(with_tail) - again(tail)
+            total += whole(with_tail) - twice(tail)
             tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
     return total
 
 
-def _at_least(found: Float[np.ndarray, "p p"], floor: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def _at_least(matrix: Float[np.ndarray, "p p"], floor: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Return the floor, and of what lies beside it only the directions in which it is more."""
     scale = np.sqrt(np.maximum(np.diag(floor), 1e-300))
-    values, vectors = np.linalg.eigh((found - floor) / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh((matrix - floor) / np.outer(scale, scale))
     return floor + np.outer(scale, scale) * ((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def _into(problem: Residuals, e: int, s: int, inverse: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "ny p nc"]:
+def _map_to_influence(
+    experiment: FitExperiment, segment: FitSegment, inverse: Float[np.ndarray, "n p"]
+) -> Float[np.ndarray, "ny p nc"]:
     """Return what takes the columns of each output to their influence on the parameters."""
     rows: list[Float[np.ndarray, "p nc"]] = []
-    for o, places in enumerate(problem.columns(e, s)):
-        moved = np.where(places >= 0, inverse[places].T, 0.0) / problem.sigma[e][o]
+    for o, places in enumerate(experiment.columns(segment)):
+        moved = np.where(places >= 0, inverse[places].T, 0.0) / experiment.sigma[o]
         rows.append(np.hstack([np.zeros((inverse.shape[1], 1)), moved]))
     return np.array(rows)
 
@@ -144,11 +156,11 @@ def _influence(
     columns: Float[np.ndarray, "m ny nc"], used: Bool[np.ndarray, "m ny"], into: Float[np.ndarray, "ny p nc"]
 ) -> Float[np.ndarray, "ny p m"]:
     """Return the influence of each sample; zero where it does not count."""
-    found = np.empty((*into.shape[:2], len(columns)))
-    for first in range(0, len(columns), SMALL):
-        rows = slice(first, first + SMALL)
-        np.matmul(into, columns[rows].transpose(1, 2, 0), out=found[:, :, rows])
-    return found if np.all(used) else found * used.T[:, None, :]
+    influence = np.empty((*into.shape[:2], len(columns)))
+    for first in range(0, len(columns), SINGLE_THREADED):
+        rows = slice(first, first + SINGLE_THREADED)
+        np.matmul(into, columns[rows].transpose(1, 2, 0), out=influence[:, :, rows])
+    return influence if np.all(used) else influence * used.T[:, None, :]
 
 
 @record(eq=False)
@@ -178,42 +190,42 @@ class _Form:
             return np.zeros((p, p))
         spectrum = np.asarray(transforms()[2](a, self.size))
         density = self.density[:, :, None]
-        found = np.zeros((p, p))
+        total = np.zeros((p, p))
         for o in range(ny):
             filtered: Complex[np.ndarray, "p f"] = np.zeros_like(spectrum[o])
             for b in range(ny):
                 filtered += density[o, b] * spectrum[b]
-            found += np.einsum("if,jf->ij", spectrum[o].view(float), filtered.view(float))
-        return found
+            total += np.einsum("if,jf->ij", spectrum[o].view(float), filtered.view(float))
+        return total
 
 
-def correlations(left: Leftover) -> tuple[Float[np.ndarray, "lags1 ny ny"], int]:
+def estimate_correlations(statistics: ResidualStatistics) -> tuple[Float[np.ndarray, "lags1 ny ny"], int]:
     """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window, and the last lag.
 
     The last lag is that at which correlation can be told from chance. The window reaches three times as far (after
     Politis, J. Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
-    count = np.maximum(left.count, 1.0)
-    found = left.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
-    last = _last_told(found, float(np.max(count)))
-    reach = min(max(LEAST, int(WIDER * last)), found.shape[2] - 1)
-    return (found[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1), last
+    count = np.maximum(statistics.count, 1.0)
+    r = statistics.correlation.transpose(1, 2, 0) / np.sqrt(np.outer(count, count))[:, :, None]
+    last = _find_last_lag(r, float(np.max(count)))
+    reach = min(max(SHORTEST_WINDOW, int(WIDER * last)), r.shape[2] - 1)
+    return (r[:, :, : reach + 1] * parzen(reach)).transpose(2, 0, 1), last
 
 
-def _last_told(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
+def _find_last_lag(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
     """Return the last lag before a run of lags at which no correlation can be told from chance; 0 if there is none."""
     power = np.sqrt(np.maximum(np.diagonal(r[:, :, 0]), 1e-300))
     size = np.max(np.abs(r) / np.outer(power, power)[:, :, None], axis=(0, 1))[1:]
-    seen = np.flatnonzero(size > CHANCE * np.sqrt(np.log10(max(count, 10.0)) / max(count, 1.0)))
+    seen = np.flatnonzero(size > CHANCE_CORRELATION * np.sqrt(np.log10(max(count, 10.0)) / max(count, 1.0)))
     run = max(20, int(np.sqrt(count) / 2))
     before = np.concatenate([[-1], seen])
     quiet = np.flatnonzero(np.diff(np.append(before, size.size + run)) > run)
     return int(before[quiet[0]]) + 1
 
 
-def with_infinities(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
+def mark_unseen(matrix: Float[np.ndarray, "p p"], unseen: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
     """Return a covariance in which what is not seen has infinite variance."""
     lost = unseen > 1e-6
-    found = 0.5 * (matrix + matrix.T)
-    found[lost, :] = found[:, lost] = np.inf
-    return found
+    marked = 0.5 * (matrix + matrix.T)
+    marked[lost, :] = marked[:, lost] = np.inf
+    return marked

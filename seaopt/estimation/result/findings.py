@@ -47,10 +47,10 @@ class OutputFit:
 
 @record
 class Nuisance:
-    """An experiment's own unknowns as estimated: delay, gain and offset an output, initial state a segment.
+    """An experiment's own unknowns as estimated: delay, gain and offset per output, initial state per segment.
 
     `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise
-    over each state's size (of a prediction-error fit), `substeps` how many integration steps a sample took (a linear
+    over each state's size (of a prediction-error fit), `substeps` how many integration steps each sample took (a linear
     plant needs one).
     """
 
@@ -63,15 +63,14 @@ class Nuisance:
     noise: dict[str, float] = field(default_factory=dict[str, float])
     std: dict[str, float] = field(default_factory=dict[str, float])
 
-    @property
-    def told(self) -> list[str]:
-        """What was estimated of delay and gains, in words."""
-        found = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (g, "") for name, g in self.gain.items()}
-        return [f"{key} = {found[key][0]:.5g} ± {std:.2g} {found[key][1]}".rstrip() for key, std in self.std.items()]
+    def describe(self) -> list[str]:
+        """Return what was estimated of delay and gains, in words."""
+        values = {"delay_s": (self.delay_s, "s")} | {f"gain.{name}": (gain, "") for name, gain in self.gain.items()}
+        return [f"{key} = {values[key][0]:.5g} ± {std:.2g} {values[key][1]}".rstrip() for key, std in self.std.items()]
 
 
 @record
-class Derived:
+class DerivedFigure:
     """A figure that follows from the parameters, with its standard deviation from the covariance."""
 
     value: float
@@ -85,7 +84,7 @@ class Derived:
 
 
 @record(eq=False)
-class Prediction:
+class ModelledOutputs:
     """Measured and model outputs of an experiment on its clock; NaN where there is nothing."""
 
     time: Float[np.ndarray, " n"]

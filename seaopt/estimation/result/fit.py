@@ -7,20 +7,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
-from seaopt.estimation.problem.losses import Huber, Linear, Loss, SoftL1
-from seaopt.estimation.problem.methods import Method, MultipleShooting, OutputError, PredictionError
-from seaopt.estimation.problem.residual_statistics import count_of
-from seaopt.estimation.problem.residuals import Residuals, spread_of
-from seaopt.estimation.problem.unknowns import Unknowns, collect
+from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
+from seaopt.estimation.problem.residuals import Residuals, pose_problem
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.least_squares import Callback
-from seaopt.estimation.solver.shooting import multiple_shooting
-from seaopt.estimation.solver.solve import Solved, output_error, prediction_error
+from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.simulation.simulate import input_samples
 
@@ -46,7 +41,7 @@ def fit(
         Values, bounds and priors; the free ones are estimated, from anywhere within a factor of ten.
     method : OutputError, MultipleShooting or PredictionError, optional
         How the plant is compared with a log; OutputError if left out.
-    loss : Linear, Huber or SoftL1, optional
+    loss : Squares, Huber or SoftL1, optional
         Least squares if left out.
     band_hz : (low, high), optional
         Residuals are weighted to this band.
@@ -83,43 +78,38 @@ def fit(
     """
     started = time.perf_counter()
     chosen = method if method is not None else OutputError()
-    named = _named(experiments)
+    named = _name_apart(experiments)
     if not 0.0 <= holdout <= 0.9:
         raise EstimationError(f"holdout = {holdout:g} is not a fraction; give 0 (none) to 0.9")
     check_choices(chosen, loss, band_hz)
     _check_motion(named)
-    complete = _complete(named, params)
-    unknowns = collect(named, complete, noise=isinstance(chosen, PredictionError), band_hz=band_hz)
-    problem = _problem(named, unknowns, loss if loss is not None else Linear(), band_hz, holdout)
-    solved = _solved(problem, complete, chosen, callback)
-    return summarise(complete, solved, chosen, diagnostics, started)
+    problem = pose_problem(
+        named, complete_parameters(named, params), loss=loss if loss is not None else Squares(), band_hz=band_hz,
+        holdout=holdout, noise=chosen.models_noise,
+    )  # fmt: skip
+    _check_samples(problem)
+    return summarise(chosen.solve(problem, callback), chosen, diagnostics, started)
 
 
 def check_choices(method: Any, loss: Any, band_hz: Any) -> None:
-    """Refuse what is no method, no loss or no band."""
-    if not isinstance(method, OutputError | MultipleShooting | PredictionError):
+    """Refuse what is not a method, a loss or a band."""
+    if not isinstance(method, Method):
         raise EstimationError(
-            f"method = {method!r} is no method; give OutputError(), MultipleShooting() or PredictionError()"
+            f"method = {method!r} is not a valid method; expected one of OutputError(), MultipleShooting(), "
+            "PredictionError()"
         )
-    if loss is not None and not isinstance(loss, Linear | Huber | SoftL1):
-        raise EstimationError(f"loss = {loss!r} is no loss; give Linear(), Huber() or SoftL1()")
+    if loss is not None and not isinstance(loss, Squares | Huber | SoftL1):
+        raise EstimationError(f"loss = {loss!r} is not a valid loss; expected one of Squares(), Huber(), SoftL1()")
     if band_hz is not None and (not isinstance(band_hz, tuple | list) or len(band_hz) != 2):
         raise EstimationError(f"band_hz = {band_hz!r} is not a band; give (low, high) in Hz")
-    if band_hz is not None and isinstance(method, PredictionError):
+    if band_hz is not None and method.models_noise:
         raise EstimationError(
-            f"band_hz = {band_hz!r} does not go with PredictionError, whose filter models the noise; leave it out"
+            f"band_hz = {band_hz!r} does not go with {type(method).__name__}, whose filter models the noise; leave it "
+            "out"
         )
 
 
-def _solved(problem: Residuals, params: ParameterSet, method: Method, callback: Callback | None) -> Solved:
-    if isinstance(method, MultipleShooting):
-        return multiple_shooting(problem, params, method, callback)
-    if isinstance(method, PredictionError):
-        return prediction_error(problem, method, callback)
-    return output_error(problem, method, callback)
-
-
-def _named(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     """Return the experiments under names of their own."""
     if isinstance(experiments, Experiment):
         raise EstimationError("fit takes a list of experiments; put the experiment in brackets, [experiment]")
@@ -161,49 +151,33 @@ def _check_motion(experiments: tuple[Experiment, ...]) -> None:
         )
 
 
-def _complete(experiments: tuple[Experiment, ...], params: ParameterSet) -> ParameterSet:
+def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSet) -> ParameterSet:
     """Return every parameter of the plants, in order, and the free ones that no plant has (an error later)."""
-    items: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = {}
     for experiment in experiments:
-        for name, item in experiment.plant.complete(params).items():
-            items.setdefault(name, item)
+        for name, parameter in experiment.plant.complete(params).items():
+            parameters.setdefault(name, parameter)
     for name in params.free_names:
-        items.setdefault(name, params[name])
-    return ParameterSet(items.values())
+        parameters.setdefault(name, params[name])
+    return ParameterSet(parameters.values())
 
 
-def _problem(
-    experiments: tuple[Experiment, ...], unknowns: Unknowns, loss: Loss, band_hz: tuple[float, float] | None,
-    holdout: float,
-) -> Residuals:  # fmt: skip
-    segments = tuple(tuple(experiment.segments(holdout)) for experiment in experiments)
-    sigma: list[Float[np.ndarray, " ny"]] = []
-    spreads: list[Float[np.ndarray, " ny"]] = []
-    for experiment in experiments:
-        spread = [spread_of(experiment.log[name]) for name in experiment.outputs]
-        spreads.append(np.array(spread))
-        known = [experiment.sigma.get(name, s or 1.0) for name, s in zip(experiment.outputs, spread, strict=True)]
-        sigma.append(np.array(known))
-    problem = Residuals(
-        experiments=experiments, segments=segments, unknowns=unknowns, sigma=tuple(sigma), loss=loss, band_hz=band_hz,
-        substeps=(1,) * len(experiments), holdout=holdout, spread=tuple(spreads),
-    )  # fmt: skip
-    for e, experiment in enumerate(experiments):
-        settle = problem.weights(e).settle
-        seen = sum(count_of(piece) for piece in segments[e])
-        for name, count in zip(experiment.outputs, np.asarray(seen), strict=True):
+def _check_samples(problem: Residuals) -> None:
+    """Refuse outputs of which no sample counts, and segments and shots that are too short."""
+    for experiment in problem.experiments:
+        settle, data = experiment.weights.settle, experiment.data
+        counts = np.sum([segment.count_weighted() for segment in experiment.segments], axis=0)
+        for name, count in zip(data.outputs, counts, strict=True):
             if not count:
                 raise EstimationError(
                     f"experiment {experiment.name}: output {name} has no sample that counts; "
                     "leave it out of outputs, or keep back less (holdout)"
                 )
-        whole = max(stretch.stop - stretch.start for stretch in experiment.stretches)
-        check_shots(experiment, whole, experiment.shots, f"shots = {experiment.shots}")
-        longest = max(segment.n for segment in segments[e])
-        if longest <= settle + 2:
+        whole = max(stretch.stop - stretch.start for stretch in data.stretches)
+        check_shots(data, whole, data.shots, f"shots = {data.shots}")
+        if experiment.longest <= settle + 2:
             raise EstimationError(
-                f"experiment {experiment.name}: its longest segment has {longest} samples"
+                f"experiment {experiment.name}: its longest segment has {experiment.longest} samples"
                 + (f" and the band filter takes {settle} to settle; widen band_hz or" if settle else ";")
                 + " use a longer log"
             )
-    return problem

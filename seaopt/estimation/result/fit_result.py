@@ -12,11 +12,12 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.residual_statistics import Errors, errors
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
 from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.estimation.result.findings import Derived, Nuisance, OutputFit, Prediction
+from seaopt.estimation.result.findings import DerivedFigure, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
+from seaopt.estimation.solver.methods import Method
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.records import record
@@ -28,14 +29,15 @@ SCHEMA = "seaopt/fit/1"
 
 @record(eq=False)
 class Minimum:
-    """The problem that was solved, with its sigma and steps, and the unknowns where its cost is least."""
+    """The problem that was solved, with its sigma and steps, the unknowns where its cost is least, and the method."""
 
     problem: Residuals
     z: Float[np.ndarray, " n"]
+    method: Method
 
-    def errors(self) -> list[list[Errors]]:
-        """Return the residuals of each experiment and segment, by a simulation of them all."""
-        return errors(self.problem, self.z)
+    def residuals(self) -> dict[str, ExperimentResiduals]:
+        """Return the residuals of each experiment, by a simulation of them all."""
+        return compute_residuals(self.problem, self.z)
 
 
 @record(eq=False)
@@ -87,7 +89,7 @@ class Fit:
     parameters: ParameterSet
     covariance: Covariance
     white_covariance: Covariance
-    derived: Mapping[str, Derived]
+    derived: Mapping[str, DerivedFigure]
     outputs: Mapping[str, Mapping[str, OutputFit]]
     nuisance: Mapping[str, Nuisance]
     identifiability: Identifiability
@@ -111,19 +113,20 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion, -2 log L + 2 k, with k the unknowns and one sigma an output."""
-        return 2.0 * self._count - 2.0 * self.log_likelihood
+        """Akaike's criterion, -2 log L + 2 k, with k the unknowns and one sigma per output."""
+        return 2.0 * self.all_unknowns - 2.0 * self.log_likelihood
 
     @property
     def bic(self) -> float:
         """Schwarz's criterion, -2 log L + k log N."""
-        return self._count * math.log(max(self.samples, 1)) - 2.0 * self.log_likelihood
+        return self.all_unknowns * math.log(max(self.samples, 1)) - 2.0 * self.log_likelihood
 
     @property
-    def _count(self) -> int:
+    def all_unknowns(self) -> int:
+        """All that was estimated, sigmas included."""
         return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
 
-    def at_minimum(self, what: str) -> Minimum:
+    def require_minimum(self, what: str) -> Minimum:
         """Return the minimum, for `what` needs it.
 
         Raises
@@ -136,7 +139,7 @@ class Fit:
             raise EstimationError(f"{what} needs the fit itself, and this one was read from a file; call fit again")
         return self.minimum
 
-    def predict(self, experiment: Experiment) -> Prediction:
+    def predict(self, experiment: Experiment) -> ModelledOutputs:
         """Return measured and model outputs of one of the fit's experiments."""
         own = self.nuisance[experiment.name]
         model = make_model(experiment.plant, self.parameters, (), experiment.outputs)
@@ -152,14 +155,14 @@ class Fit:
         )
         for segment, piece, state in zip(experiment.segments(), experiment.pieces, own.initial_state, strict=True):
             start = np.array([list(state.values())])
-            found = run_passes(model, segment, point, start, sums=False, outputs=True).outputs
-            assert found is not None
-            y[piece] = found * point.gain + point.offset
+            outputs = run_passes(model, segment, point, start, sums=False, outputs=True).outputs
+            assert outputs is not None
+            y[piece] = outputs * point.gain + point.offset
             for o, name in enumerate(experiment.outputs):
                 drift = np.array(own.drift.get(name, ()))
                 y[piece, o] += segment.drift_basis(slice(0, segment.n), drift.size) @ drift
         log = experiment.log
-        return Prediction(
+        return ModelledOutputs(
             time=log.time,
             inputs={name: log[name] for name in experiment.plant.inputs if name in log.signals},
             measured={name: log[name] for name in experiment.outputs},
@@ -229,7 +232,7 @@ class Fit:
             for name, item in self.derived.items()
         ]
         for name, own in self.nuisance.items():
-            lines += [f"  {name}: {line}" for line in own.told]
+            lines += [f"  {name}: {line}" for line in own.describe()]
             if len(own.initial_state) > 1:
                 lines.append(f"  {name}: {len(own.initial_state)} segments with initial states of their own")
         for name, row in self.outputs.items():

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.normal_equations import RANK, eliminated
+from seaopt.estimation.problem.normal_equations import RANK, eliminate
 from seaopt.estimation.problem.residuals import Residuals
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
@@ -37,7 +37,7 @@ class Identifiability:
     condition : float
         Ratio of the largest to the smallest singular value of the normalised sensitivities.
     unidentifiable : tuple of mappings
-        One a direction that is not seen: relative changes {NAME: weight} that leave every output as it is.
+        One per direction that is not seen: relative changes {NAME: weight} that leave every output as it is.
     weak : tuple of mappings
         The same for directions that are hardly seen.
     structural_rank : int
@@ -53,28 +53,28 @@ class Identifiability:
     structural_rank: int = -1
 
 
-def identifiability(
+def assess_identifiability(
     hessian: Float[np.ndarray, "n n"], names: tuple[str, ...], values: Float[np.ndarray, " p"]
 ) -> Identifiability:
     """Return what the normalised Hessian says of the first ``len(names)`` unknowns, the others eliminated.
 
-    `values` are the unknowns' own, to which changes along an unseen direction are relative.
+    `values` are those of the unknowns, to which changes along an unseen direction are relative.
     """
     p = len(names)
-    left, own = eliminated(hessian, p), np.diag(hessian)[:p]
-    size = np.sqrt(np.where(own > 0.0, own, 1.0))
-    eigenvalues, vectors = np.linalg.eigh(left / np.outer(size, size))
+    reduced, diagonal = eliminate(hessian, p), np.diag(hessian)[:p]
+    size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    eigenvalues, vectors = np.linalg.eigh(reduced / np.outer(size, size))
     largest = max(float(eigenvalues[-1]), 1e-300)
     smallest = max(float(eigenvalues[0]), 0.0)
     relative = size * np.where(values != 0.0, np.abs(values), 1.0)
 
     def directions(chosen: Float[np.ndarray, " p"], cut: float) -> tuple[dict[str, float], ...]:
-        found: list[dict[str, float]] = []
+        weighted: list[dict[str, float]] = []
         for k in np.flatnonzero(chosen):
             weights = vectors[:, k] / relative
             weights = weights / np.max(np.abs(weights))
-            found.append({name: float(w) for name, w in zip(names, weights, strict=True) if abs(w) > cut})
-        return tuple(found)
+            weighted.append({name: float(w) for name, w in zip(names, weights, strict=True) if abs(w) > cut})
+        return tuple(weighted)
 
     unseen = eigenvalues <= RANK * largest
     return Identifiability(
@@ -86,7 +86,7 @@ def identifiability(
     )
 
 
-def structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
+def compute_structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
     """Return how many directions of the parameters a rich input would show on the outputs that were measured.
 
     The input is white noise of the log's own size on every input that the log excites, from rest and without noise.
@@ -94,16 +94,15 @@ def structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
     p = problem.unknowns.shared
     information = np.diag(problem.unknowns.precision[:p])
     rng = np.random.default_rng(0)
-    for e, model in enumerate(problem.unknowns.models):
-        index = np.array(problem.unknowns.theta_index(model), dtype=int)
-        log = problem.segments[e][0]
+    for experiment in problem.experiments:
+        model, index, log = experiment.model, experiment.theta, experiment.segments[0].samples
         spans = [float(np.ptp(channel)) for channel in log.u]
         u = tuple(span * rng.normal(size=RICH) for span in spans)
         piece = Segment(u=u, y=(np.zeros(RICH),) * model.ny, start_s=log.start_s)
-        point = replace(problem.point(e, z), correction=None)
-        found = run_passes(model, piece, point, np.zeros((1, model.nx)))
+        point = replace(experiment.point(z), correction=None)
+        passes = run_passes(model, piece, point, np.zeros((1, model.nx)))
         for o in range(model.ny):
-            gram = found.gram[0, o, 1 : 1 + index.size, 1 : 1 + index.size] / problem.sigma[e][o] ** 2
+            gram = passes.gram[0, o, 1 : 1 + index.size, 1 : 1 + index.size] / experiment.sigma[o] ** 2
             information[np.ix_(index, index)] += gram
     if not np.all(np.isfinite(information)):
         return -1
@@ -112,7 +111,7 @@ def structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
     return int(np.count_nonzero(values > RANK * max(float(values[-1]), 1e-300)))
 
 
-def told(direction: dict[str, float], alone_seen: bool) -> str:
+def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
     """Say in words what cannot be told.
 
     Parameters
@@ -132,7 +131,7 @@ def told(direction: dict[str, float], alone_seen: bool) -> str:
         how = "product" if direction[names[0]] * direction[names[1]] < 0.0 else "ratio"
         return f"{names[0]} and {names[1]} enter only together, as their {how}"
     changes = ", ".join(f"{name} {100 * direction[name]:+.3g} %" for name in names)
-    return f"{listed(names)} enter only together: {changes} change no output"
+    return f"{join_names(names)} enter only together: {changes} change no output"
 
 
 def resting_on(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
@@ -150,13 +149,14 @@ def resting_on(params: ParameterSet, used: Container[str] | None = None) -> tupl
     if not names:
         return ()
     values = ", ".join(f"{name} = {params[name].value:.4g}{unit_after(params[name].unit)}" for name in names)
+    verb = "is" if len(names) == 1 else "are"
     return (
-        f"the fit does not identify {listed(names)}: {values} {'is' if len(names) == 1 else 'are'} one choice among "
-        "others that fit as well, and what follows at these values holds for no other; excite more, or give a value, a "
-        "prior, or a range to certify over",
+        f"the fit does not identify {join_names(names)}: {values} {verb} one choice among others that fit as well, "
+        "and what follows at these values holds for no other; excite more, or give a value, a prior, or a range to "
+        "certify over",
     )
 
 
-def listed(names: list[str]) -> str:
+def join_names(names: list[str]) -> str:
     """Return names as a sentence lists them."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -23,7 +23,7 @@ from seaopt.documents import (
 )
 from seaopt.errors import FileError
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.estimation.result.findings import Derived, Nuisance, OutputFit
+from seaopt.estimation.result.findings import DerivedFigure, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.files import plain
 from seaopt.parameters import Parameter, ParameterSet
@@ -189,7 +189,7 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
         "parameters": parameters,
         "covariance": covariance,
         "white_covariance": white,
-        "derived": {name: Derived(**figure.model_dump()) for name, figure in stored.derived.items()},
+        "derived": {name: DerivedFigure(**figure.model_dump()) for name, figure in stored.derived.items()},
         "outputs": {
             name: {output: OutputFit(**row.model_dump()) for output, row in outputs.items()}
             for name, outputs in stored.outputs.items()

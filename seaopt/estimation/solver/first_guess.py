@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError
-from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.unknowns import Unknowns
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.residuals import Residuals
 from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.records import record
 from seaopt.simulation import Model, linearised
@@ -25,7 +25,7 @@ CANDIDATES = 128
 REFINED = 8
 POINTS = 60
 EXPLAINED = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
-LONGEST = 1 << 14  # samples a stretch: resolution enough for a guess
+LONGEST = 1 << 14  # samples of a stretch: resolution enough for a guess
 
 
 @record(eq=False)
@@ -45,55 +45,43 @@ class _Target:
     weight: Float[np.ndarray, "m ny"]
 
 
-def first_guess(
-    experiments: tuple[Experiment, ...],
-    unknowns: Unknowns,
-    band_hz: tuple[float, float] | None,
-    rng: np.random.Generator,
-) -> tuple[list[Float[np.ndarray, " n"]], bool]:
+def guess_from_responses(problem: Residuals, rng: np.random.Generator) -> tuple[list[Float[np.ndarray, " n"]], bool]:
     """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
 
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
     """
-    found_targets = (_target(experiment, unknowns, e, band_hz) for e, experiment in enumerate(experiments))
-    targets = [target for target in found_targets if target is not None]
+    unknowns = problem.unknowns
+    usable = (_measure_target(experiment) for experiment in problem.experiments)
+    targets = [target for target in usable if target is not None]
     if not targets:
         return [], False
     start = unknowns.start[: unknowns.shared]
     low, high = unknowns.low[: unknowns.shared], unknowns.high[: unknowns.shared]
     prior = unknowns.prior_std[: unknowns.shared]
     spread = np.isinf(prior) & (start != 0.0)
-    found = [_refine(targets, start, low, high, spread)]
+    refined = [_refine(targets, start, low, high, spread)]
     enough = 0.5 * EXPLAINED**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
-    if found[0][0] > enough:
+    if refined[0][0] > enough:
         candidates = [
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
             for _ in range(CANDIDATES)
         ]
         ranked = np.argsort(_misfits(targets, candidates), kind="stable")
-        found += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED]]
-    guesses: list[Float[np.ndarray, " n"]] = []
-    ranked_guesses = sorted(found, key=_first)
-    for _, theta in ranked_guesses:
-        guess = unknowns.start.copy()
-        guess[: unknowns.shared] = theta
-        guesses.append(guess)
-    return guesses, ranked_guesses[0][0] <= enough
+        refined += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED]]
+    refined.sort(key=lambda pair: pair[0])
+    guesses = [np.concatenate([theta, unknowns.start[unknowns.shared :]]) for _, theta in refined]
+    return guesses, refined[0][0] <= enough
 
 
-def _first(pair: tuple[float, Any]) -> float:
-    return pair[0]
-
-
-def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[float, float] | None) -> _Target | None:
-    log = experiment.log
-    active = [n for n in experiment.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
-    if len(active) != 1 or len(experiment.stretches) != 1:
+def _measure_target(experiment: FitExperiment) -> _Target | None:
+    data, log, band_hz = experiment.data, experiment.data.log, experiment.band_hz
+    active = [n for n in data.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
+    if len(active) != 1 or len(data.stretches) != 1:
         return None
-    whole = [o for o, output in enumerate(experiment.outputs) if np.all(np.isfinite(log[output]))]
-    measured = [log[experiment.outputs[o]] for o in whole]
+    whole = [o for o, output in enumerate(data.outputs) if np.all(np.isfinite(log[output]))]
+    measured = [log[data.outputs[o]] for o in whole]
     try:
-        stretch_s = _stretch(len(log)) * log.period
+        stretch_s = _choose_stretch(len(log)) * log.period
         estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
     except LogError:
         return None
@@ -103,22 +91,22 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
         f = estimate.frequency_hz
         good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
         if np.count_nonzero(good) >= 8:
-            chosen[o] = estimate, _log_spaced(f, good)
+            chosen[o] = estimate, _space_by_logarithm(f, good)
     if not chosen:
         return None
-    rows = np.unique(np.concatenate([own for _, own in chosen.values()]))
+    rows = np.unique(np.concatenate([places for _, places in chosen.values()]))
     estimates = [estimate for estimate, _ in chosen.values()]
-    used = np.column_stack([np.isin(rows, own) for _, own in chosen.values()])
+    used = np.column_stack([np.isin(rows, places) for _, places in chosen.values()])
     response = np.column_stack([estimate.response[rows] for estimate in estimates])
     spread = np.column_stack([np.maximum(estimate.relative_std[rows], 0.02) for estimate in estimates])
-    delay = unknowns.locals_of[e].delay.value + (0.5 * log.period if experiment.hold == "zero" else 0.0)
+    delay = experiment.slots.delay.value + (0.5 * log.period if data.hold == "zero" else 0.0)
     s = 2j * np.pi * estimates[0].frequency_hz[rows]
-    gain = np.array([unknowns.locals_of[e].gain[o].value for o in chosen])
-    model = linearised(unknowns.models[e])
+    gain = np.array([experiment.slots.gain[o].value for o in chosen])
+    model = linearised(experiment.model)
     return _Target(
         model=model,
-        index=[unknowns.names.index(name) for name in model.free],
-        input=list(experiment.plant.inputs).index(active[0]),
+        index=experiment.theta.tolist(),
+        input=list(data.plant.inputs).index(active[0]),
         outputs=list(chosen),
         s=s,
         shift=np.exp(-s * delay)[:, None] * gain,
@@ -128,14 +116,14 @@ def _target(experiment: Experiment, unknowns: Unknowns, e: int, band_hz: tuple[f
 
 
 @lru_cache(maxsize=64)
-def _stretch(n: int) -> int:
+def _choose_stretch(n: int) -> int:
     """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
     length = min(n // 16, LONGEST)
     fast = [2**a * 3**b for a in range(15) for b in range(9) if 2**a * 3**b <= length]
     return max(fast, default=16)
 
 
-def _log_spaced(f: Float[np.ndarray, " m"], good: Any) -> Any:
+def _space_by_logarithm(f: Float[np.ndarray, " m"], good: Any) -> Any:
     """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
     candidates = np.flatnonzero(good)
     places = np.log(f[candidates])

@@ -5,7 +5,7 @@ At each iterate the step is the one with the least
 .. math:: g^T d + \tfrac12 d^T H d \quad\text{subject to}\quad |D d| \le \Delta,
           \qquad\text{which solves}\qquad (H + \lambda D^2)\, d = -g
 
-over the unknowns that are not held by a bound, with :math:`H = J^T J` and D the largest norms yet of J's columns (Moré,
+over the unknowns that no bound blocks, with :math:`H = J^T J` and D the largest norms yet of J's columns (Moré,
 Lecture Notes in Mathematics 630, 1978): a parameter that the data hardly show at a far point is not thrown out of the
 world. The step is clipped to the bounds and is taken if the cost falls; :math:`\Delta` follows from how well the fall
 was predicted. Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance
@@ -16,34 +16,48 @@ point (to the best linear unknowns, see `residuals`); the region does not bound 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.problem.normal_equations import newton_decrement, solved
-from seaopt.estimation.problem.residuals import Evaluation
+from seaopt.estimation.problem.normal_equations import QuadraticModel, solve_seen
 from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
 Callback = Callable[[int, float], None]
-Evaluate = Callable[[Any, "Evaluation | None", float], Evaluation]
-Follow = Callable[[Evaluation, Any], Evaluation]
+M = TypeVar("M", bound=QuadraticModel)
 
 DECREMENT = 1e-10  # squared standard deviations still to go
-RELATIVE = 1e-12  # of the cost
-REACH = 0.3  # first radius, over the size of the first point
-NEAR = 1e-4  # squared standard deviations that rounding may leave, where the residuals themselves are rounding
-TINY = 1e-15  # of the size of the point: a radius that is rounding
-STRAIGHT = 2e-5  # distance over the one before, squared: the Hessian changes by a few times that over the step to come
+RELATIVE_DECREMENT = 1e-12  # of the cost
+FIRST_RADIUS = 0.3  # over the size of the first point
+ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave of residuals that are rounding
+ROUNDING_RADIUS = 1e-15  # of the size of the point
+STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
+
+
+@runtime_checkable
+class Objective(Protocol[M]):
+    """A sum of squares that can be minimised: its quadratic model at a point, and at the end of a step."""
+
+    def evaluate(self, z: Float[np.ndarray, " n"]) -> M:
+        """Return the model at z."""
+        ...
+
+    def take_step(self, here: M, z: Float[np.ndarray, " n"], share: float) -> M:
+        """Return the model at z, to which a step was made from `here`.
+
+        `share` is 1 for a whole Gauss-Newton step and less for one that the region shortened, 1/(1 + lambda).
+        """
+        ...
 
 
 @record(eq=False)
-class Solution:
+class Solution(Generic[M]):
     """Where the search ended, and the distance, squared, from which its last step was made if that was a whole one."""
 
     z: Float[np.ndarray, " n"]
-    evaluation: Evaluation
+    evaluation: M
     status: Status
     message: str
     iterations: int
@@ -51,30 +65,30 @@ class Solution:
 
 
 def minimise(
-    evaluate: Evaluate,
-    start: Float[np.ndarray, " n"] | Evaluation,
+    objective: Objective[M],
+    start: Float[np.ndarray, " n"] | M,
     low: Float[np.ndarray, " n"],
     high: Float[np.ndarray, " n"],
     *,
-    reach: float = REACH,
+    first_radius: float = FIRST_RADIUS,
     decrement: float = DECREMENT,
     max_iterations: int = 50,
     callback: Callback | None = None,
-    follow: Follow | None = None,
+    follow: Callable[[M, Float[np.ndarray, " n"]], M] | None = None,
     before: float = 0.0,
-) -> Solution:
+) -> Solution[M]:
     """Minimise a sum of squares from `start`, inside the bounds.
 
     Parameters
     ----------
-    evaluate : callable
-        (z, where the step came from, damping) -> cost, gradient and Gauss-Newton Hessian at z.
-    start : array, shape (n,), or Evaluation
-        First point, or what was found there.
+    objective : Objective
+        Gives cost, gradient and Gauss-Newton Hessian at any point.
+    start : array, shape (n,), or QuadraticModel
+        First point, or the model there.
     low, high : array, shape (n,)
         Bounds.
-    reach : float
-        First radius of the region, over the size of the first point.
+    first_radius : float
+        Of the region, over the size of the first point.
     decrement : float
         Squared standard deviations to the minimum at which to stop.
     max_iterations : int
@@ -82,60 +96,61 @@ def minimise(
     callback : callable, optional
         Called with the iteration and the cost.
     follow : callable, optional
-        (evaluation, z) -> what it says of a z nearby if residuals are straight from there: then a last step needs no
+        (model, z) -> what it says of a z nearby if residuals are straight from there: then a last step needs no
         evaluation of its own once the whole steps before it have shown how straight they are.
     before : float
         Of the search that this one goes on from.
 
     """
-    here = start if isinstance(start, Evaluation) else evaluate(np.clip(start, low, high), None, 0.0)
+    here = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
     if not np.isfinite(here.cost):
         message = "the simulation overflows at the first guess; start closer or check units"
         return Solution(z=here.z, evaluation=here, status="stalled", message=message, iterations=0)
-    scale = _norms(here)
-    radius = reach * max(float(np.linalg.norm(scale * here.z)), 1.0)
+    scale = _column_norms(here)
+    radius = first_radius * max(float(np.linalg.norm(scale * here.z)), 1.0)
     for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
-        held = held_by_bounds(here, low, high)
-        distance = _decrement(here, held) + 2.0 * here.pending
-        if distance <= decrement + RELATIVE * here.cost:
+        blocked = find_blocked(here, low, high)
+        distance = here.distance_squared(~blocked)
+        if distance <= decrement + RELATIVE_DECREMENT * here.cost:
             return Solution(
                 z=here.z, evaluation=here, status="converged", iterations=iteration - 1, before=before,
                 message=f"the minimum is {np.sqrt(distance):.1g} standard deviations away",
             )  # fmt: skip
         if iteration > max_iterations:
             break
-        step, damping = _step(here, held, scale, radius)
+        step, multiplier = _step(here, blocked, scale, radius)
         trial = np.clip(here.z + step, low, high)
         moved = trial - here.z
-        length = float(np.linalg.norm(np.where(here.undamped, 0.0, scale * moved)))
-        if radius < TINY * max(float(np.linalg.norm(scale * here.z)), 1e-300):
-            near = distance < NEAR
+        length = float(np.linalg.norm(np.where(here.linear, 0.0, scale * moved)))
+        if radius < ROUNDING_RADIUS * max(float(np.linalg.norm(scale * here.z)), 1e-300):
+            near = distance < ROUNDING_DECREMENT
             left = f"{np.sqrt(distance):.1g} standard deviations are left" if near else "the gradient is not zero"
             return Solution(
                 z=here.z, evaluation=here, status="converged" if near else "stalled", iterations=iteration,
                 message=f"no smaller step can be told from rounding, and {left}",
             )  # fmt: skip
-        whole = damping == 0.0 and bool(np.all(trial == here.z + step))
-        if follow is not None and whole and _straight(distance, before, decrement + RELATIVE * here.cost):
+        whole = multiplier == 0.0 and bool(np.all(trial == here.z + step))
+        if follow is not None and whole and _is_straight(distance, before, decrement + RELATIVE_DECREMENT * here.cost):
             there = follow(here, trial)
             # A bound that held so far need not hold there.
-            if _decrement(there, held_by_bounds(there, low, high)) <= decrement + RELATIVE * there.cost:
+            remaining = there.distance_squared(~find_blocked(there, low, high))
+            if remaining <= decrement + RELATIVE_DECREMENT * there.cost:
                 if callback is not None:
                     callback(iteration, there.cost)
                 return Solution(
                     z=there.z, evaluation=there, status="converged", iterations=iteration,
                     message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
                 )  # fmt: skip
-        predicted = -float(here.gradient @ moved + 0.5 * moved @ here.hessian @ moved) + here.pending
-        there = evaluate(trial, here, damping)
+        predicted = here.predict_fall(moved)
+        there = objective.take_step(here, trial, 1.0 / (1.0 + multiplier))
         ratio = (here.cost - there.cost) / predicted if predicted > 0.0 and np.isfinite(there.cost) else -1.0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
-        elif ratio > 0.75 or damping == 0.0:
+        elif ratio > 0.75 or multiplier == 0.0:
             radius = max(radius, 2.0 * length)
         if ratio > 1e-4:
             here, before = there, distance if whole else 0.0
-            scale = np.maximum(scale, _norms(here))
+            scale = np.maximum(scale, _column_norms(here))
         if callback is not None:
             callback(iteration, here.cost)
     return Solution(
@@ -144,59 +159,55 @@ def minimise(
     )  # fmt: skip
 
 
-def _straight(distance: float, before: float, allowed: float) -> bool:
+def _is_straight(distance: float, before: float, allowed: float) -> bool:
     """Tell from two distances to the minimum, squared, whether the next step may be followed without an evaluation.
 
     Whole steps square what is left of the distance: it falls by r = distance / before to the power of two, and then of
     four; all are squares. A tenth of the distance allowed is asked of that, for it is not quite so in many dimensions.
     If steps only shortened the distance by one factor, what is left would still be small.
     """
-    if not 0.0 < distance <= STRAIGHT * before:
+    if not 0.0 < distance <= STRAIGHT_RATIO * before:
         return False
     ratio = distance / before
-    return distance * ratio <= NEAR and distance * ratio**2 <= 0.01 * allowed
+    return distance * ratio <= ROUNDING_DECREMENT and distance * ratio**2 <= 0.01 * allowed
 
 
-def _norms(here: Evaluation) -> Float[np.ndarray, " n"]:
+def _column_norms(here: QuadraticModel) -> Float[np.ndarray, " n"]:
     """Return the norms of the Jacobian's columns."""
     return np.sqrt(np.maximum(np.diag(here.hessian), 1e-300))
 
 
-def held_by_bounds(
-    here: Evaluation, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+def find_blocked(
+    here: QuadraticModel, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Tell which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
-    near = 1e-4 / _norms(here)
+    """Return which unknowns lie on a bound, to a ten-thousandth of a standard deviation, that descent would cross."""
+    near = 1e-4 / _column_norms(here)
     return ((here.z - low <= near) & (here.gradient > 0.0)) | ((high - here.z <= near) & (here.gradient < 0.0))
 
 
-def _decrement(here: Evaluation, held: Bool[np.ndarray, " n"]) -> float:
-    return newton_decrement(here.hessian[np.ix_(~held, ~held)], here.gradient[~held], 1e-12)
-
-
 def _step(
-    here: Evaluation, held: Bool[np.ndarray, " n"], scale: Float[np.ndarray, " n"], radius: float
+    here: QuadraticModel, blocked: Bool[np.ndarray, " n"], scale: Float[np.ndarray, " n"], radius: float
 ) -> tuple[Float[np.ndarray, " n"], float]:
-    """Return the step within the radius and its lambda; the undamped unknowns follow the others."""
-    bound, follow = ~held & ~here.undamped, ~held & here.undamped
+    """Return the step within the radius and its lambda; the linear unknowns follow the others."""
+    bound, follow = ~blocked & ~here.linear, ~blocked & here.linear
     h, g = here.hessian, here.gradient
     matrix, gradient, response = h[np.ix_(bound, bound)], g[bound], np.zeros((0, 0))
     if np.any(follow):
         right = np.column_stack([g[follow], h[np.ix_(follow, bound)]])
-        response = solved(h[np.ix_(follow, follow)], right, 1e-13)
+        response = solve_seen(h[np.ix_(follow, follow)], right, 1e-13)
         matrix = matrix - h[np.ix_(bound, follow)] @ response[:, 1:]
         gradient = gradient - h[np.ix_(bound, follow)] @ response[:, 0]
-    step = np.zeros(held.size)
+    step = np.zeros(blocked.size)
     d = scale[bound]
     values, vectors = np.linalg.eigh(matrix / np.outer(d, d))
-    along, damping = _within(np.maximum(values, 0.0), vectors.T @ (gradient / d), radius)
+    along, multiplier = _shorten(np.maximum(values, 0.0), vectors.T @ (gradient / d), radius)
     step[bound] = vectors @ along / d
     if np.any(follow):
         step[follow] = -response[:, 0] - response[:, 1:] @ step[bound]
-    return step, damping
+    return step, multiplier
 
 
-def _within(
+def _shorten(
     values: Float[np.ndarray, " n"], g: Float[np.ndarray, " n"], radius: float
 ) -> tuple[Float[np.ndarray, " n"], float]:
     """Return the step -g / (values + lambda), no longer than the radius, with the smallest such lambda >= 0."""
@@ -205,12 +216,12 @@ def _within(
     newton = np.where(seen, -g / np.where(seen, values, 1.0), 0.0)
     if float(np.linalg.norm(newton)) <= radius:
         return newton, 0.0
-    damping = max(float(np.linalg.norm(g)) / radius - float(np.max(values)), floor)
+    multiplier = max(float(np.linalg.norm(g)) / radius - float(np.max(values)), floor)
     for _ in range(50):  # Newton's method on 1 / |step|, which is nearly straight in lambda
-        step = -g / (values + damping)
+        step = -g / (values + multiplier)
         size = float(np.linalg.norm(step))
         if abs(size - radius) <= 1e-3 * radius:
             break
-        slope = float(np.sum(step**2 / (values + damping))) / size
-        damping = max(damping + (size / slope) * (size - radius) / radius, 1e-3 * damping)
-    return -g / (values + damping), damping
+        slope = float(np.sum(step**2 / (values + multiplier))) / size
+        multiplier = max(multiplier + (size / slope) * (size - radius) / radius, 1e-3 * multiplier)
+    return -g / (values + multiplier), multiplier

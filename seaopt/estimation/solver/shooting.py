@@ -11,43 +11,87 @@ parameters :math:`z` and the nodes :math:`n` has a Hessian
 .. math:: \begin{pmatrix} H & F^T \\ F & M \end{pmatrix}
 
 with M block tridiagonal: M is factored in time linear in the shots, and what is left, :math:`H - F^T M^{-1} F`, is no
-larger than the parameters. `least_squares` sees that; the nodes follow, :math:`dn = -M^{-1} (g_n + F dz)`.
+larger than the parameters. `least_squares` is given that condensed problem; the nodes follow,
+:math:`dn = -M^{-1} (g_n + F dz)`.
 """
 
 from __future__ import annotations
 
-from dataclasses import field, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment, check_shots, shot_edges
-from seaopt.estimation.problem.losses import Linear
-from seaopt.estimation.problem.methods import MultipleShooting
-from seaopt.estimation.problem.normal_equations import add_gram
-from seaopt.estimation.problem.residual_statistics import errors
-from seaopt.estimation.problem.residuals import Evaluation, Residuals
-from seaopt.estimation.problem.unknowns import collect
+from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment, ResidualPower
+from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.problem.normal_equations import QuadraticModel, add_gram
+from seaopt.estimation.problem.residual_statistics import compute_residuals
+from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.solver.least_squares import Callback, minimise
-from seaopt.estimation.solver.solve import (
-    Solved,
-    best_start,
-    estimated_sigma,
-    explains_little,
-    held_start,
-    settle,
-    with_observers,
-)
-from seaopt.parameters import ParameterSet
+from seaopt.estimation.solver.methods import Method, find_start
+from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
+from seaopt.estimation.solver.settle import Solved, estimate_sigma, explains_little, settle
 from seaopt.records import record
 from seaopt.simulation import Pass, run_passes
 
 STIFFNESS = (1e-4, 1e-2, 1.0, 1e2, 1e4)  # of the joints, over what the log says of a node
 JOINED = 1e-7  # of the size of the states
 MULTIPLIER_ROUNDS = 8
-WORSE = 2.0  # residual power of single shooting, over that of the joined shots, that is no longer the same fit
+ANOTHER_FIT = 2.0  # residual power of single shooting, over that of the joined shots, that is no longer the same fit
+
+
+@record
+class MultipleShooting(Method):
+    """Each segment is cut into shots that start from states of their own; the shots are joined while the fit goes on.
+
+    For plants that are unstable, or start far off: a simulation that starts anew every so often cannot run away. At the
+    end the shots join to rounding: the result is that of `OutputError` wherever both find it. Where the plant runs away
+    in one go the shots keep initial states of their own, which the message says: the intervals are then wider.
+
+    Parameters
+    ----------
+    segments : int
+        Shots per log segment; a segment shorter than the longest may have fewer. Each shot needs a sample more than the
+        plant has states, and at least four.
+    max_iterations : int
+        Of least squares, each time the joints are made stiffer.
+    search : bool
+        Start from the logs' frequency responses where they explain the logs better than the given values.
+    seed : int
+        Of that search.
+
+    """
+
+    key: ClassVar[str] = "multiple_shooting"
+
+    segments: int = 50
+
+    def __post_init__(self) -> None:
+        if self.segments < 1:
+            raise EstimationError(f"MultipleShooting(segments={self.segments}): give at least 1")
+
+    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+        """Join the shots step by step; then settle by single shooting, or on separate shots if the plant runs away."""
+        for experiment in problem.experiments:
+            check_shots(
+                experiment.data, experiment.longest, self.segments, f"MultipleShooting(segments={self.segments})"
+            )
+        start, _ = find_start(problem, self)
+        z = start.z
+        if self.search and (not np.isfinite(start.cost) or explains_little(problem, start.power)):
+            predicting = find_predicting_start(problem, z, self.max_iterations)
+            z = z if predicting is None else predicting
+        joined, z, shots = _join(problem.with_each(band_hz=None, loss=Squares()), z, self, callback)
+        single = problem.evaluate(_with_first_nodes(problem, z, shots))
+        if np.isfinite(single.cost):
+            solved = settle(problem, single, self.max_iterations, callback)
+            if solved.solution.status == "converged" and _explains_as_much(solved, joined):
+                return solved
+        return _settle_apart(problem, self, z, shots, callback)
 
 
 @record(eq=False)
@@ -60,101 +104,16 @@ class Shots:
     weight: Float[np.ndarray, " nx"]
     fixed: bool
 
-    def moved(self, step: Float[np.ndarray, "shots nx"]) -> Shots:
-        """Return the shots with nodes moved."""
-        return replace(self, nodes=self.nodes + step)
+
+ShotsByExperiment = Mapping[str, tuple[Shots, ...]]  # one per segment
 
 
 @record(eq=False)
-class ShotEvaluation(Evaluation):
-    """An evaluation with its nodes, and the step of the nodes that goes with a step of z: own - slope dz."""
+class CondensedSegment:
+    """What a segment gives to the problem without nodes, and the step of the nodes with a step dz: own - slope dz.
 
-    shots: tuple[tuple[Shots, ...], ...] = ()
-    own: tuple[tuple[Float[np.ndarray, "shots nx"], ...], ...] = ()
-    slope: tuple[tuple[Float[np.ndarray, "shots nx n"], ...], ...] = ()
-    gaps: tuple[tuple[Float[np.ndarray, "joints nx"], ...], ...] = field(default=())
-
-
-@record(eq=False)
-class Shooting:
-    """The problem of `least_squares` at one stiffness: residuals of the log and of the joints."""
-
-    problem: Residuals
-    shots: tuple[tuple[Shots, ...], ...]
-
-    @np.errstate(all="ignore")
-    def evaluate(
-        self, z: Float[np.ndarray, " n"], here: Evaluation | None = None, damping: float = 0.0
-    ) -> ShotEvaluation:
-        """Return cost and reduced gradient and Hessian at z, with the nodes moved along."""
-        shots = self._followed(z, here, damping)
-        n = z.size
-        unknowns = self.problem.unknowns
-        (cost, gradient, hessian), pending = unknowns.prior(z), 0.0
-        own: list[tuple[Any, ...]] = []
-        slope: list[tuple[Any, ...]] = []
-        gaps: list[tuple[Any, ...]] = []
-        passes: list[tuple[Pass, ...]] = []
-        for e, row in enumerate(shots):
-            parts = [self._segment(e, s, z, shot) for s, shot in enumerate(row)]
-            for part in parts:
-                cost, gradient, hessian = cost + part.cost, gradient + part.gradient, hessian + part.hessian
-                pending += part.pending
-            own.append(tuple(part.own for part in parts))
-            slope.append(tuple(part.slope for part in parts))
-            gaps.append(tuple(part.gaps for part in parts))
-            passes.append(tuple(part.found for part in parts))
-        initial = [
-            slot.index for places in unknowns.locals_of for r in places.initial for slot in r if slot.index is not None
-        ]
-        hessian[initial, initial] += 1.0  # an initial state is the first node, not an unknown of its own
-        finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
-        squares = tuple(np.sum([p.gram[:, :, 0, 0].sum(axis=0) for p in row], axis=0) for row in passes)
-        counts = tuple(np.sum([p.count.sum(axis=0) for p in row], axis=0) for row in passes)
-        return ShotEvaluation(
-            z=z, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian, squares=squares, counts=counts,
-            undamped=np.zeros(n, dtype=bool), origin=z, passes=tuple(passes), pending=pending, shots=shots,
-            own=tuple(own), slope=tuple(slope), gaps=tuple(gaps),
-        )  # fmt: skip
-
-    def _followed(
-        self, z: Float[np.ndarray, " n"], here: Evaluation | None, damping: float
-    ) -> tuple[tuple[Shots, ...], ...]:
-        if not isinstance(here, ShotEvaluation):
-            return self.shots
-        dz, part = z - here.z, 1.0 / (1.0 + damping)
-        return tuple(
-            tuple(shot.moved(part * own - slope @ dz) for shot, own, slope in zip(*row, strict=True))
-            for row in zip(here.shots, here.own, here.slope, strict=True)
-        )
-
-    def _segment(self, e: int, s: int, z: Float[np.ndarray, " n"], shots: Shots) -> _Segment:
-        problem, n = self.problem, z.size
-        model, piece = problem.unknowns.models[e], problem.segments[e][s]
-        found = run_passes(model, piece, problem.point(e, z), shots.nodes, problem.weights(e), edges=shots.edges)
-        count, nx = shots.nodes.shape
-        shared = found.last.shape[2] - 1 - nx
-        normal = np.zeros((count, 1 + n + nx, 1 + n + nx))  # of [residual, z, node], one a shot
-        for o, places in enumerate(problem.columns(e, s)):
-            is_node = (np.arange(places.size) >= shared) & (np.arange(places.size) < shared + nx)
-            where = np.where(is_node, n + np.arange(places.size) - shared, places)
-            add_gram(normal, found.gram[:, o] / problem.sigma[e][o] ** 2, where)
-        cost = float(np.sum(found.loss / problem.sigma[e] ** 2))
-        gaps = found.last[:-1, :, 0] - shots.nodes[1:]
-        pulled = gaps + shots.shift
-        cost += 0.5 * float(np.sum(shots.weight * pulled**2))
-        joint = np.zeros((count - 1, nx, 1 + n + nx))  # residual of a joint, its derivatives by z and the node before
-        joint[:, :, 0] = pulled
-        theta = problem.columns(e, s)[0][:shared]
-        joint[:, :, 1 + theta] = found.last[:-1, :, 1 : 1 + shared]
-        joint[:, :, 1 + n :] = found.last[:-1, :, 1 + shared : 1 + shared + nx]
-        normal[:-1] += np.einsum("sia,i,sib->sab", joint, shots.weight, joint)
-        return _eliminated(cost, normal, joint, shots, found, gaps, n)
-
-
-@record(eq=False)
-class _Segment:
-    """What a segment gives to the reduced problem, and how its nodes follow."""
+    `pending` is the fall of the cost still expected from the nodes, `gaps` what the joints still leave open.
+    """
 
     cost: float
     gradient: Float[np.ndarray, " n"]
@@ -163,17 +122,122 @@ class _Segment:
     own: Float[np.ndarray, "shots nx"]
     slope: Float[np.ndarray, "shots nx n"]
     gaps: Float[np.ndarray, "joints nx"]
-    found: Pass
+    shots: Shots
+    passes: Pass
+
+    def move_nodes(self, dz: Float[np.ndarray, " n"], share: float) -> Shots:
+        """Return the shots with their nodes moved along."""
+        return replace(self.shots, nodes=self.shots.nodes + (share * self.own - self.slope @ dz))
 
 
-def _eliminated(
+@record(eq=False)
+class CondensedModel(QuadraticModel):
+    """The quadratic model in the parameters alone, and the segments whose nodes were eliminated."""
+
+    power: Mapping[str, ResidualPower]
+    segments: Mapping[str, tuple[CondensedSegment, ...]]
+
+    @property
+    def pending(self) -> float:
+        """The fall of the cost still expected from the nodes."""
+        return sum(segment.pending for row in self.segments.values() for segment in row)
+
+    @property
+    def shots(self) -> dict[str, tuple[Shots, ...]]:
+        """Of every experiment."""
+        return {name: tuple(segment.shots for segment in row) for name, row in self.segments.items()}
+
+    def distance_squared(self, free: Bool[np.ndarray, " n"]) -> float:
+        """Return the squared distance to the minimum, nodes included."""
+        return QuadraticModel.distance_squared(self, free) + 2.0 * self.pending
+
+    def predict_fall(self, step: Float[np.ndarray, " n"]) -> float:
+        """Return by how much a step lowers the cost with the nodes moved along."""
+        return QuadraticModel.predict_fall(self, step) + self.pending
+
+
+@record(eq=False)
+class Shooting:
+    """The condensed problem at one stiffness: residuals of the log and of the joints."""
+
+    problem: Residuals
+    first_shots: ShotsByExperiment
+
+    def evaluate(self, z: Float[np.ndarray, " n"]) -> CondensedModel:
+        """Return the condensed model at z, with the nodes where the stage starts."""
+        return self._condense(z, self.first_shots)
+
+    def take_step(self, here: CondensedModel, z: Float[np.ndarray, " n"], share: float) -> CondensedModel:
+        """Return the condensed model at z, with the nodes moved along."""
+        dz = z - here.z
+        return self._condense(
+            z, {name: tuple(s.move_nodes(dz, share) for s in row) for name, row in here.segments.items()}
+        )
+
+    @np.errstate(all="ignore")
+    def _condense(self, z: Float[np.ndarray, " n"], shots: ShotsByExperiment) -> CondensedModel:
+        unknowns = self.problem.unknowns
+        cost, gradient, hessian = unknowns.prior(z)
+        segments: dict[str, tuple[CondensedSegment, ...]] = {}
+        for experiment in self.problem.experiments:
+            pairs = zip(experiment.segments, shots[experiment.name], strict=True)
+            segments[experiment.name] = tuple(_condense(experiment, segment, z, one) for segment, one in pairs)
+            for part in segments[experiment.name]:
+                cost, gradient, hessian = cost + part.cost, gradient + part.gradient, hessian + part.hessian
+        starts = (segment.initial for experiment in self.problem.experiments for segment in experiment.segments)
+        initial = [slot.index for slots in starts for slot in slots if slot.index is not None]
+        hessian[initial, initial] += 1.0  # an initial state is the first node, not an unknown of its own
+        finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
+        power = {
+            name: ResidualPower(
+                squares=np.sum([part.passes.gram[:, :, 0, 0].sum(axis=0) for part in row], axis=0),
+                counts=np.sum([part.passes.count.sum(axis=0) for part in row], axis=0),
+            )
+            for name, row in segments.items()
+        }
+        return CondensedModel(
+            z=z, cost=cost if finite else np.inf, gradient=gradient, hessian=hessian,
+            linear=np.zeros(z.size, dtype=bool), power=power, segments=segments,
+        )  # fmt: skip
+
+
+def _condense(
+    experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], shots: Shots
+) -> CondensedSegment:
+    """Add up the normal equations of a segment's shots and joints, and eliminate the nodes."""
+    n, (count, nx) = z.size, shots.nodes.shape
+    passes = run_passes(
+        experiment.model, segment.samples, experiment.point(z), shots.nodes, experiment.weights, edges=shots.edges
+    )
+    shared = passes.last.shape[2] - 1 - nx
+    columns = experiment.columns(segment)
+    normal = np.zeros((count, 1 + n + nx, 1 + n + nx))  # of [residual, z, node], one per shot
+    for o, places in enumerate(columns):
+        is_node = (np.arange(places.size) >= shared) & (np.arange(places.size) < shared + nx)
+        where = np.where(is_node, n + np.arange(places.size) - shared, places)
+        add_gram(normal, passes.gram[:, o] / experiment.sigma[o] ** 2, where)
+    cost = float(np.sum(passes.loss / experiment.sigma**2))
+    gaps = passes.last[:-1, :, 0] - shots.nodes[1:]
+    pulled = gaps + shots.shift
+    cost += 0.5 * float(np.sum(shots.weight * pulled**2))
+    joint = np.zeros((count - 1, nx, 1 + n + nx))  # residual of a joint, its derivatives by z and the node before
+    joint[:, :, 0] = pulled
+    theta = columns[0][:shared]
+    joint[:, :, 1 + theta] = passes.last[:-1, :, 1 : 1 + shared]
+    joint[:, :, 1 + n :] = passes.last[:-1, :, 1 + shared : 1 + shared + nx]
+    normal[:-1] += np.einsum("sia,i,sib->sab", joint, shots.weight, joint)
+    return _eliminate_nodes(cost, normal, joint, shots, passes, gaps)
+
+
+def _eliminate_nodes(
     cost: float, normal: Float[np.ndarray, "shots m m"], joint: Float[np.ndarray, "joints nx m"], shots: Shots,
-    found: Pass, gaps: Float[np.ndarray, "joints nx"], n: int,
-) -> _Segment:  # fmt: skip
+    passes: Pass, gaps: Float[np.ndarray, "joints nx"],
+) -> CondensedSegment:  # fmt: skip
     """Eliminate the nodes: factor the block tridiagonal M, and form the Schur complement."""
     from scipy.linalg import LinAlgError, solveh_banded
 
     count, nx = shots.nodes.shape
+    n = normal.shape[1] - 1 - nx
     node, z = slice(1 + n, 1 + n + nx), slice(1, 1 + n)
     diagonal = normal[:, node, node].copy()
     right = np.concatenate([normal[:, node, :1], normal[:, node, z]], axis=2)  # [g_n, F]
@@ -193,72 +257,45 @@ def _eliminated(
     flat = right.reshape(count * nx, 1 + n)
     try:
         with np.errstate(all="ignore"):
-            solved = solveh_banded(band, flat)
+            solution = solveh_banded(band, flat)
     except (LinAlgError, ValueError):
-        solved = np.full_like(flat, np.nan)
-    own, slope = -solved[:, 0].reshape(count, nx), solved[:, 1:].reshape(count, nx, n)
-    gradient = normal[:, 0, z].sum(axis=0) - flat[:, 1:].T @ solved[:, 0]
-    hessian = normal[:, z, z].sum(axis=0) - flat[:, 1:].T @ solved[:, 1:]
-    return _Segment(
+        solution = np.full_like(flat, np.nan)
+    own, slope = -solution[:, 0].reshape(count, nx), solution[:, 1:].reshape(count, nx, n)
+    gradient = normal[:, 0, z].sum(axis=0) - flat[:, 1:].T @ solution[:, 0]
+    hessian = normal[:, z, z].sum(axis=0) - flat[:, 1:].T @ solution[:, 1:]
+    return CondensedSegment(
         cost=cost, gradient=gradient, hessian=0.5 * (hessian + hessian.T),
-        pending=0.5 * float(flat[:, 0] @ solved[:, 0]), own=own, slope=slope, gaps=gaps, found=found,
+        pending=0.5 * float(flat[:, 0] @ solution[:, 0]), own=own, slope=slope, gaps=gaps,
+        shots=shots, passes=passes,
     )  # fmt: skip
 
 
-def multiple_shooting(
-    problem: Residuals, params: ParameterSet, method: MultipleShooting, callback: Callback | None
-) -> Solved:
-    """Join the shots step by step; then settle by single shooting, or on shots of their own if the plant runs away."""
-    for experiment, pieces in zip(problem.experiments, problem.segments, strict=True):
-        longest = max(piece.n for piece in pieces)
-        check_shots(experiment, longest, method.segments, f"MultipleShooting(segments={method.segments})")
-    start, _ = best_start(problem, method)
-    plain = replace(problem, band_hz=None, loss=Linear())
-    z = start.z
-    if method.search and (not np.isfinite(start.cost) or explains_little(problem, start)):
-        held = held_start(problem, z, method.max_iterations)
-        z = z if held is None else held
-    z, ends, sigma = _joined(plain, z, method, callback)
-    single = problem.evaluate(_with_initial(problem, z, ends))
-    if np.isfinite(single.cost):
-        settled = settle(problem, single, method.max_iterations, callback)
-        if settled.solution.status == "converged" and _explains(settled, sigma):
-            return settled
-    return _apart(problem, params, method, z, ends, callback)
-
-
-def _apart(
-    problem: Residuals, params: ParameterSet, method: MultipleShooting, z: Float[np.ndarray, " n"],
-    ends: tuple[tuple[Shots, ...], ...], callback: Callback | None,
+def _settle_apart(
+    problem: Residuals, method: MultipleShooting, z: Float[np.ndarray, " n"], shots: ShotsByExperiment,
+    callback: Callback | None,
 ) -> Solved:  # fmt: skip
     """Settle on shots that keep initial states of their own, for a plant that runs away in one go."""
-    experiments = tuple(replace(e, shots=e.shots * method.segments) for e in problem.experiments)
-    unknowns = collect(experiments, params, band_hz=problem.band_hz)
-    segments = tuple(tuple(e.segments(problem.holdout)) for e in experiments)
-    apart = replace(problem, experiments=experiments, unknowns=unknowns, segments=segments)
-    for e, experiment in enumerate(experiments):
-        settle_rows, longest = apart.weights(e).settle, max(piece.n for piece in segments[e])
+    cut = {e.name: replace(e.data, shots=e.data.shots * method.segments) for e in problem.experiments}
+    apart, values = problem.rebuild(problem.params, z, cut)
+    for experiment in apart.experiments:
+        settle_rows, longest = experiment.weights.settle, experiment.longest
         if longest <= 2 * settle_rows:
             raise EstimationError(
                 f"experiment {experiment.name}: the plant runs away in simulation, and its shots have {longest} "
                 f"samples, of which the band filter takes {settle_rows} to settle; use fewer segments or no band_hz"
             )
-    values = unknowns.start.copy()
-    for name, value in zip(problem.unknowns.names, z, strict=True):
-        if name in unknowns.names:
-            values[unknowns.names.index(name)] = value
-    for e, places in enumerate(unknowns.locals_of):
-        nodes = _nodes_by_row(problem.experiments[e], ends[e])
-        for slots, piece in zip(places.initial, experiments[e].pieces, strict=True):
-            for slot, value in zip(slots, nodes.get(piece.start, ()), strict=False):
+    for old, new in zip(problem.experiments, apart.experiments, strict=True):
+        nodes = _find_nodes_by_row(old.data, shots[old.name])
+        for segment, piece in zip(new.segments, new.data.pieces, strict=True):
+            for slot, value in zip(segment.initial, nodes.get(piece.start, ()), strict=False):
                 if slot.index is not None:
                     values[slot.index] = float(value)
-    found = settle(apart, apart.evaluate(values), method.max_iterations, callback)
-    told = f"{found.solution.message}; the plant runs away in one go: shots keep initial states of their own"
-    return replace(found, solution=replace(found.solution, message=told))
+    solved = settle(apart, apart.evaluate(values), method.max_iterations, callback)
+    message = f"{solved.solution.message}; the plant runs away in one go: shots keep initial states of their own"
+    return replace(solved, solution=replace(solved.solution, message=message))
 
 
-def _nodes_by_row(experiment: Experiment, shots: tuple[Shots, ...]) -> dict[int, Float[np.ndarray, " nx"]]:
+def _find_nodes_by_row(experiment: Experiment, shots: tuple[Shots, ...]) -> dict[int, Float[np.ndarray, " nx"]]:
     """Return the nodes by the row of the log at which they stand."""
     return {
         piece.start + int(edge): node
@@ -267,109 +304,111 @@ def _nodes_by_row(experiment: Experiment, shots: tuple[Shots, ...]) -> dict[int,
     }
 
 
-def _joined(
+def _join(
     problem: Residuals, z: Float[np.ndarray, " n"], method: MultipleShooting, callback: Callback | None
-) -> tuple[Float[np.ndarray, " n"], tuple[tuple[Shots, ...], ...], tuple[Float[np.ndarray, " _"], ...]]:
-    """Return unknowns, shots and sigmas after the joints have closed, as far as they do."""
-    shots = _first_shots(problem, z, method.segments)
+) -> tuple[Residuals, Float[np.ndarray, " n"], ShotsByExperiment]:
+    """Return the problem with its sigmas, unknowns and shots after the joints have closed, as far as they do."""
+    shots = _make_shots(problem, z, method.segments)
     low, high = problem.unknowns.low, problem.unknowns.high
-    scale = _weights(Shooting(problem=problem, shots=shots), z)
+    scale = _weigh_nodes(problem, Shooting(problem=problem, first_shots=shots).evaluate(z))
     for number in range(len(STIFFNESS) + MULTIPLIER_ROUNDS):
         stiff = STIFFNESS[min(number, len(STIFFNESS) - 1)]
-        shots = tuple(
-            tuple(replace(shot, weight=stiff * own) for shot, own in zip(row, rows, strict=True))
-            for row, rows in zip(shots, scale, strict=True)
-        )
-        shooting = Shooting(problem=problem, shots=shots)
-        found = minimise(shooting.evaluate, z, low, high, max_iterations=method.max_iterations, callback=callback)
-        last = found.evaluation
-        if not isinstance(last, ShotEvaluation) or not np.isfinite(last.cost):
+        shots = {
+            name: tuple(replace(one, weight=stiff * size) for one, size in zip(row, scale[name], strict=True))
+            for name, row in shots.items()
+        }
+        shooting = Shooting(problem=problem, first_shots=shots)
+        solution = minimise(shooting, z, low, high, max_iterations=method.max_iterations, callback=callback)
+        last = solution.evaluation
+        if not np.isfinite(last.cost):
             break
-        z, shots = found.z, last.shots
-        problem = problem.with_sigma(estimated_sigma(problem, last))
-        worst = 0.0
-        for row, gaps in zip(shots, last.gaps, strict=True):
-            for shot, gap in zip(row, gaps, strict=True):
-                size = np.maximum(np.max(np.abs(shot.nodes), axis=0), 1e-300)
-                worst = max(worst, float(np.max(np.abs(gap) / size, initial=0.0)))
+        z, shots = solution.z, last.shots
+        problem = problem.with_sigma(estimate_sigma(problem, last.power, z))
         if number >= len(STIFFNESS) - 1:
-            if worst < JOINED:
+            if _measure_gaps(last) < JOINED:
                 break
-            shots = tuple(
-                tuple(replace(shot, shift=shot.shift + gap) for shot, gap in zip(row, gaps, strict=True))
-                for row, gaps in zip(shots, last.gaps, strict=True)
-            )
-    return z, shots, problem.sigma
+            shots = {
+                name: tuple(replace(part.shots, shift=part.shots.shift + part.gaps) for part in row)
+                for name, row in last.segments.items()
+            }
+    return problem, z, shots
 
 
-def _explains(settled: Solved, sigma: tuple[Float[np.ndarray, " _"], ...]) -> bool:
+def _measure_gaps(model: CondensedModel) -> float:
+    """Return the widest gap at a joint, over the largest value of its state."""
+    worst = 0.0
+    for row in model.segments.values():
+        for part in row:
+            size = np.maximum(np.max(np.abs(part.shots.nodes), axis=0), 1e-300)
+            worst = max(worst, float(np.max(np.abs(part.gaps) / size, initial=0.0)))
+    return worst
+
+
+def _explains_as_much(solved: Solved, joined: Residuals) -> bool:
     """Tell whether single shooting leaves no more than the joined shots do; where the plant runs away it does not."""
-    plain = replace(settled.problem, band_hz=None, loss=Linear(), sigma=sigma)  # as the shots were joined
-    for row in errors(plain, settled.solution.z):
-        weighted = np.concatenate([error.weighted for error in row])
+    plain = solved.problem.with_each(band_hz=None, loss=Squares())  # as the shots were joined
+    plain = plain.with_sigma({experiment.name: experiment.sigma for experiment in joined.experiments})
+    for residuals in compute_residuals(plain, solved.solution.z).values():
+        weighted = residuals.weighted
         used = np.maximum(np.count_nonzero(weighted, axis=0), 1)
         # The level is left free: a band that leaves out 0 Hz does not see it.
         power = np.sum(weighted**2, axis=0) / used - (np.sum(weighted, axis=0) / used) ** 2
-        if not np.all(power < WORSE):
+        if not np.all(power < ANOTHER_FIT):
             return False
     return True
 
 
 @np.errstate(all="ignore")
-def _weights(shooting: Shooting, z: Float[np.ndarray, " n"]) -> list[list[Float[np.ndarray, " nx"]]]:
+def _weigh_nodes(problem: Residuals, model: CondensedModel) -> dict[str, list[Float[np.ndarray, " nx"]]]:
     """Return, for each segment, what the log says of a node: the median diagonal of its information."""
-    found = shooting.evaluate(z)
-    rows: list[list[Float[np.ndarray, " nx"]]] = []
-    for e, (passes, shots) in enumerate(zip(found.passes, found.shots, strict=True)):
-        row: list[Float[np.ndarray, " nx"]] = []
-        for one, shot in zip(passes, shots, strict=True):
-            nx = shot.nodes.shape[1]
-            first = one.last.shape[2] - nx
+    scale: dict[str, list[Float[np.ndarray, " nx"]]] = {}
+    for experiment in problem.experiments:
+        scale[experiment.name] = []
+        for part in model.segments[experiment.name]:
+            passes, nx = part.passes, part.shots.nodes.shape[1]
+            first = passes.last.shape[2] - nx
             information = sum(
-                one.gram[:, o, first : first + nx, first : first + nx] / shooting.problem.sigma[e][o] ** 2
-                for o in range(one.gram.shape[1])
+                passes.gram[:, o, first : first + nx, first : first + nx] / sigma**2
+                for o, sigma in enumerate(experiment.sigma)
             )
             diagonal = np.median(np.diagonal(np.asarray(information), axis1=1, axis2=2), axis=0)
-            size = np.maximum(np.std(shot.nodes, axis=0), 1e-300)
+            size = np.maximum(np.std(part.shots.nodes, axis=0), 1e-300)
             ruling = float(np.max(np.where(np.isfinite(diagonal), diagonal, 0.0) * size**2))
-            row.append(max(ruling, 1.0) / size**2)
-        rows.append(row)
-    return rows
+            scale[experiment.name].append(max(ruling, 1.0) / size**2)
+    return scale
 
 
-def _first_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> tuple[tuple[Shots, ...], ...]:
+def _make_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> ShotsByExperiment:
     """Return shots whose nodes are where a filter that hardly trusts the plant sees the state."""
-    watched = with_observers(problem, z, follows=False)
-    rows: list[tuple[Shots, ...]] = []
-    for e, pieces in enumerate(problem.segments):
-        row: list[Shots] = []
-        nx = problem.unknowns.models[e].nx
-        for s, piece in enumerate(pieces):
-            edges = shot_edges(piece.n, count)
-            shots = len(edges) - 1
-            nodes = np.zeros((shots, nx))
-            if watched is not None:
-                states = watched.run(e, s, z, sums=False, states=True).states
-                assert states is not None
-                nodes = states[edges[:-1]].copy() if np.all(np.isfinite(states)) else nodes
-            fixed = all(slot.index is None for slot in problem.unknowns.locals_of[e].initial[s])
-            if fixed:
-                nodes[0] = problem.start(e, s, z)
-            row.append(
-                Shots(edges=edges, nodes=nodes, shift=np.zeros((shots - 1, nx)), weight=np.ones(nx), fixed=fixed)
-            )
-        rows.append(tuple(row))
-    return tuple(rows)
+    predicting = add_predictors(problem, z, follows=False)
+    experiments = (problem if predicting is None else predicting).experiments
+    return {e.name: tuple(_make_segment_shots(e, segment, z, count) for segment in e.segments) for e in experiments}
 
 
-def _with_initial(
-    problem: Residuals, z: Float[np.ndarray, " n"], shots: tuple[tuple[Shots, ...], ...]
+def _make_segment_shots(
+    experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], count: int
+) -> Shots:
+    edges, nx = shot_edges(segment.samples.n, count), experiment.model.nx
+    shots = len(edges) - 1
+    nodes = np.zeros((shots, nx))
+    if experiment.predictor is not None:
+        states = experiment.run(segment, z, sums=False, states=True).states
+        assert states is not None
+        nodes = states[edges[:-1]].copy() if np.all(np.isfinite(states)) else nodes
+    fixed = all(slot.index is None for slot in segment.initial)
+    if fixed:
+        nodes[0] = segment.start(z)
+    return Shots(edges=edges, nodes=nodes, shift=np.zeros((shots - 1, nx)), weight=np.ones(nx), fixed=fixed)
+
+
+def _with_first_nodes(
+    problem: Residuals, z: Float[np.ndarray, " n"], shots: ShotsByExperiment
 ) -> Float[np.ndarray, " n"]:
     """Return the unknowns with each segment's first node as its initial state."""
     z = z.copy()
-    for places, row in zip(problem.unknowns.locals_of, shots, strict=True):
-        for slots, shot in zip(places.initial, row, strict=True):
-            for slot, value in zip(slots, shot.nodes[0], strict=True):
+    for experiment in problem.experiments:
+        for segment, one in zip(experiment.segments, shots[experiment.name], strict=True):
+            for slot, value in zip(segment.initial, one.nodes[0], strict=True):
                 if slot.index is not None:
                     z[slot.index] = value
     return z

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.normal_equations import inverse
-from seaopt.estimation.problem.residuals import WATCHED, Evaluation, Residuals
+from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
+from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.problem.residuals import Evaluation, Residuals
 from seaopt.records import record
 from seaopt.simulation import Pass
 
@@ -44,71 +45,75 @@ class Check:
     substeps: int
 
 
-Checks = tuple[Check | None, ...]  # one an experiment
+Checks = Mapping[str, Check]  # by experiment, those that are known
 
 
-def started(problem: Residuals, start: Evaluation) -> tuple[Residuals, Evaluation]:
+def choose_first_steps(problem: Residuals, start: Evaluation) -> tuple[Residuals, Evaluation]:
     """Return the problem with steps that do for a first search, and its evaluation there."""
     while True:
-        finer = tuple(problem.map(lambda e, p=problem, here=start: _first_steps(p, e, here)))
-        if finer == problem.substeps:
+        finer = problem.map(lambda experiment, here=start: _choose_first_steps(experiment, here))
+        if finer == [experiment.substeps for experiment in problem.experiments]:
             return problem, start
-        problem = replace(problem, substeps=finer)
+        problem = _with_substeps(problem, finer)
         start = problem.evaluate(start.z)
 
 
-def _first_steps(problem: Residuals, e: int, here: Evaluation) -> int:
+def _choose_first_steps(experiment: FitExperiment, here: Evaluation) -> int:
     """Return the steps that an experiment's first samples ask for."""
-    if problem.unknowns.models[e].linear:
-        return problem.substeps[e]
-    halved, fine = _halved(problem, e), []
-    for s, piece in enumerate(problem.segments[e]):
-        edges = np.array([0, min(piece.n, WATCHED)])
-        fine.append(halved.run(e, s, here.origin, edges=edges, sums=False, outputs=True))
-    error = _output_error(problem, e, here.origin, here.passes[e], fine)
-    return _steps(problem.substeps[e], StepError(output=error), FIRST_STEP_ERROR)
+    if experiment.model.linear:
+        return experiment.substeps
+    z, halved, fine = here.passes.z, _halve_steps(experiment), []
+    for segment in experiment.segments:
+        edges = np.array([0, min(segment.samples.n, FIRST_SAMPLES)])
+        fine.append(halved.run(segment, z, edges=edges, sums=False, outputs=True))
+    error = _measure_output_error(experiment, z, here.passes.by_experiment[experiment.name], fine)
+    return _choose_steps(experiment.substeps, StepError(output=error), FIRST_STEP_ERROR)
 
 
-def refined(problem: Residuals, here: Evaluation, checks: Checks) -> tuple[Residuals, Evaluation, Checks]:
+def refine_steps(problem: Residuals, here: Evaluation, checks: Checks) -> tuple[Residuals, Evaluation, Checks]:
     """Return the problem with steps whose error is small, its evaluation there, and the errors that are known there.
 
     That of a step that was made finer is not: order four says how fine it must be, and the next minimum is looked at.
     """
     while True:
-        checks = checked(problem, here, checks)
-        errors = [check.error for check in checks if check is not None]
-        finer = tuple(_steps(m, error, STEP_ERROR_SIGMA) for m, error in zip(problem.substeps, errors, strict=True))
-        if finer == problem.substeps:
+        checks = check_steps(problem, here, checks)
+        substeps = [experiment.substeps for experiment in problem.experiments]
+        finer = [_choose_steps(e.substeps, checks[e.name].error, STEP_ERROR_SIGMA) for e in problem.experiments]
+        if finer == substeps:
             return problem, here, checks
-        trusted = all(new < MUCH_FINER * old for new, old in zip(finer, problem.substeps, strict=True))
-        problem = replace(problem, substeps=finer)
+        trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
+        problem = _with_substeps(problem, finer)
         here = problem.evaluate(here.z)
         if trusted:
             return problem, here, checks
 
 
-def checked(problem: Residuals, here: Evaluation, checks: Checks) -> Checks:
+def check_steps(problem: Residuals, here: Evaluation, checks: Checks) -> Checks:
     """Return the step error of every experiment: known still, where neither its step nor the minimum has changed."""
 
-    def look(e: int) -> Check:
-        known = checks[e]
-        if known is not None and known.substeps == problem.substeps[e]:
+    def check(experiment: FitExperiment) -> Check:
+        known = checks.get(experiment.name)
+        if known is not None and known.substeps == experiment.substeps:
             moved = here.z - known.z
             if moved @ here.hessian @ moved < NEARBY**2:
                 return known
-        return Check(error=step_error(problem, e, here), z=here.z, substeps=problem.substeps[e])
+        return Check(error=measure_step_error(problem, experiment, here), z=here.z, substeps=experiment.substeps)
 
-    return tuple(problem.map(look))
+    return {e.name: made for e, made in zip(problem.experiments, problem.map(check), strict=True)}
 
 
-def worst_of(checks: Checks) -> StepError:
+def find_worst(checks: Checks) -> StepError:
     """Return the largest of all experiments' errors."""
-    known = [check.error for check in checks if check is not None]
-    return StepError(output=max(error.output for error in known), parameter=max(error.parameter for error in known))
+    errors = [check.error for check in checks.values()]
+    return StepError(output=max(error.output for error in errors), parameter=max(error.parameter for error in errors))
 
 
-def _steps(steps: int, error: StepError, allowed: float) -> int:
-    """Return how many steps a sample an error asks for."""
+def _with_substeps(problem: Residuals, substeps: Sequence[int]) -> Residuals:
+    return problem.with_values("substeps", {e.name: m for e, m in zip(problem.experiments, substeps, strict=True)})
+
+
+def _choose_steps(steps: int, error: StepError, allowed: float) -> int:
+    """Return how many steps per sample an error asks for."""
     over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
     if over <= 1.0 or not np.isfinite(over):
         return steps
@@ -117,41 +122,45 @@ def _steps(steps: int, error: StepError, allowed: float) -> int:
 
 
 @np.errstate(all="ignore")
-def step_error(problem: Residuals, e: int, here: Evaluation) -> StepError:
-    """Return the integration error of experiment e, from steps of half the length (order four: 16/15 of the change).
+def measure_step_error(problem: Residuals, experiment: FitExperiment, here: Evaluation) -> StepError:
+    """Return the integration error of an experiment, from steps of half the length (order four: 16/15 of the change).
 
     In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
     below the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's
     first samples.
     """
-    if problem.unknowns.models[e].linear:
+    if experiment.model.linear:
         return StepError()
-    fine = _halved(problem, e).passes_of(e, here.origin)
-    worst = _output_error(problem, e, here.origin, here.passes[e], fine)
-    sigma = np.maximum(problem.sigma[e], EXACT * problem.spread[e])
-    weighted = problem.with_sigma(tuple(sigma if i == e else own for i, own in enumerate(problem.sigma)))
-    coarse, gradient = weighted.normal(e, here.passes[e]), weighted.normal(e, fine)[0, 1:]
-    gradient, hessian = gradient - coarse[0, 1:], coarse[1:, 1:] + np.diag(problem.unknowns.precision)
+    z, passes, n = here.passes.z, here.passes.by_experiment[experiment.name], here.z.size
+    fine = _halve_steps(experiment).run_all(z)
+    worst = _measure_output_error(experiment, z, passes, fine)
+    weighted = replace(experiment, sigma=_floored_sigma(experiment))
+    coarse = weighted.normal(passes, n)
+    gradient = weighted.normal(fine, n)[0, 1:] - coarse[0, 1:]
+    hessian = coarse[1:, 1:] + np.diag(problem.unknowns.precision)
     if not (np.isfinite(worst) and np.all(np.isfinite(hessian)) and np.all(np.isfinite(gradient))):
         return StepError(output=np.inf, parameter=np.inf)
-    back, _ = inverse(hessian)
+    inverse, _ = invert(hessian)
     p = problem.unknowns.shared
-    std = np.sqrt(np.maximum(np.diag(back)[:p], 1e-300))
-    moved = np.abs(back @ gradient)[:p] * 16.0 / 15.0 / std
+    std = np.sqrt(np.maximum(np.diag(inverse)[:p], 1e-300))
+    moved = np.abs(inverse @ gradient)[:p] * 16.0 / 15.0 / std
     return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
-def _halved(problem: Residuals, e: int) -> Residuals:
-    """Return the problem with steps of half the length in experiment e."""
-    return replace(problem, substeps=tuple(2 * m if i == e else m for i, m in enumerate(problem.substeps)))
+def _halve_steps(experiment: FitExperiment) -> FitExperiment:
+    return replace(experiment, substeps=2 * experiment.substeps)
+
+
+def _floored_sigma(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:
+    return np.maximum(experiment.sigma, EXACT * experiment.spread)
 
 
 @np.errstate(all="ignore")
-def _output_error(
-    problem: Residuals, e: int, z: Float[np.ndarray, " n"], coarse: Sequence[Pass], fine: Sequence[Pass]
+def _measure_output_error(
+    experiment: FitExperiment, z: Float[np.ndarray, " n"], coarse: Sequence[Pass], fine: Sequence[Pass]
 ) -> float:
-    """Return the largest integration error in an output of experiment e, in sigma; see `step_error`."""
-    scale = problem.point(e, z).gain / np.maximum(problem.sigma[e], EXACT * problem.spread[e])
+    """Return the largest integration error in an output of an experiment, in sigma; see `measure_step_error`."""
+    scale = experiment.point(z).gain / _floored_sigma(experiment)
     worst = 0.0
     for one, two in zip(coarse, fine, strict=True):
         assert one.outputs is not None and two.outputs is not None

@@ -24,22 +24,22 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.correlation import autocorrelation
-from seaopt.estimation.problem.losses import Linear, pull_of
-from seaopt.estimation.problem.normal_equations import inverse
-from seaopt.estimation.problem.residual_statistics import Errors, column_chunks
+from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment
+from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
 from seaopt.estimation.problem.residuals import Residuals
-from seaopt.estimation.result.covariance import Covariance, robust_bread
+from seaopt.estimation.result.covariance import Covariance, compute_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.formatting import html_text
 from seaopt.records import record
 from seaopt.units import unit_after
 
-LEAST = 20  # draws, below which a covariance says nothing
+FEWEST_DRAWS = 20  # draws, below which a covariance says nothing
 
 
 @record(eq=False, repr=False)
@@ -124,7 +124,7 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     seed : int
         Of the draws.
     refit : bool
-        Make a fit a draw, from the minimum, instead of one Gauss-Newton step: slower; it shows what bends.
+        Make a fit for each draw, from the minimum, instead of one Gauss-Newton step: slower; it shows what bends.
     block : int, optional
         Length of the blocks in samples; from the residuals' correlation if left out.
 
@@ -146,51 +146,51 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     >>> plant, truth = so.plants.high_impedance(), so.plants.thor()
     >>> log = virtual_log(plant, truth, PAPER_STAND, duration_s=20, rate_hz=400, seed=1,
     ...                   sensors=Sensors(noise_std={"F1": 2.0, "F2": 2.0}))
-    >>> found = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1", "F2"))], truth.free("J", "b_r"))
-    >>> 0.7 < bootstrap(found).std("J") / found.covariance.std("J") < 1.3
+    >>> fit = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1", "F2"))], truth.free("J", "b_r"))
+    >>> 0.7 < bootstrap(fit).std("J") / fit.covariance.std("J") < 1.3
     True
 
     """
-    minimum = fit.at_minimum("bootstrap")
+    minimum = fit.require_minimum("bootstrap")
     problem = minimum.problem
     _check(fit, problem, draws, refit, block)
-    left = minimum.errors()
+    residuals = minimum.residuals()
     rng = np.random.default_rng(seed)
     names = problem.unknowns.names[: problem.unknowns.shared]
-    lengths = [_length(problem, left, e, block) for e in range(len(problem.experiments))]
-    found = (_refits if refit else _steps)(minimum, left, lengths, draws, rng)
+    lengths = {name: _choose_length(own, block) for name, own in residuals.items()}
+    values = (_draw_refits if refit else _draw_steps)(minimum, residuals, lengths, draws, rng)
     return Bootstrap(
         names=names, units=tuple(fit.parameters[name].unit for name in names), estimates=minimum.z[: len(names)],
-        draws=found, blocks={e.name: n for e, n in zip(problem.experiments, lengths, strict=True)}, refit=refit,
-        reference=fit.covariance,
+        draws=values, blocks=lengths, refit=refit, reference=fit.covariance,
     )  # fmt: skip
 
 
 def _check(fit: Fit, problem: Residuals, draws: int, refit: bool, block: int | None) -> None:
-    if draws < LEAST:
-        raise EstimationError(f"bootstrap: draws = {draws} are too few for a covariance; give {LEAST} or more")
+    if draws < FEWEST_DRAWS:
+        raise EstimationError(f"bootstrap: draws = {draws} are too few for a covariance; give {FEWEST_DRAWS} or more")
     if block is not None and block < 1:
         raise EstimationError(f"bootstrap: block = {block} samples; give 1 or more, or leave it out")
     if fit.identifiability.rank < fit.identifiability.free:
         raise EstimationError(f"bootstrap: {fit.message}")
-    if refit and problem.observers is not None:
+    if refit and problem.predicts:
         raise EstimationError(
             "bootstrap: refit=True needs a simulation's residuals, and this fit has errors of prediction: leave it out"
         )
 
 
-def _length(problem: Residuals, left: list[list[Errors]], e: int, block: int | None) -> int:
-    rows = _rows(left[e])
-    length = block_length(np.concatenate([error.weighted[r] for error, r in zip(left[e], rows, strict=True)]))
+def _choose_length(residuals: ExperimentResiduals, block: int | None) -> int:
+    rows = _find_used_rows(residuals)
+    used = [segment.weighted[r] for segment, r in zip(residuals.segments, rows, strict=True)]
+    length = estimate_block_length(np.concatenate(used))
     return min(block or length, max(sum(int(np.sum(r)) for r in rows) // 2, 1))
 
 
-def _rows(row: list[Errors]) -> list[Any]:
+def _find_used_rows(residuals: ExperimentResiduals) -> list[Bool[np.ndarray, "..."]]:
     """Return which samples of each segment counted in some output."""
-    return [np.any(error.weighted != 0.0, axis=1) for error in row]
+    return [np.any(segment.weighted != 0.0, axis=1) for segment in residuals.segments]
 
 
-def block_length(residual: Float[np.ndarray, "n ny"]) -> int:
+def estimate_block_length(residual: Float[np.ndarray, "n ny"]) -> int:
     """Return the length of blocks that leaves the colour of a residual, of the output that needs the longest."""
     n = len(residual)
     quiet, most = max(5, int(np.sqrt(np.log10(max(n, 10))))), min(int(3.0 * np.sqrt(n)), n // 3)
@@ -210,14 +210,7 @@ def block_length(residual: Float[np.ndarray, "n ny"]) -> int:
     return int(min(np.ceil(longest), max(most, 1)))
 
 
-def _drawn(
-    pool: Float[np.ndarray, "m ny"], starts: Int[np.ndarray, " b"], length: int, rows: Int[np.ndarray, " n"]
-) -> Float[np.ndarray, "n ny"]:
-    """Return the residuals that a draw puts at `rows`."""
-    return pool[(starts[rows // length] + rows % length) % len(pool)]
-
-
-def _pool(values: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "m ny"]:
+def _make_pool(values: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "m ny"]:
     """Return residuals to draw from: without their mean, and without what is missing, which is made up for in size."""
     whole = np.concatenate(values)
     present = np.isfinite(whole) & (whole != 0.0)
@@ -226,77 +219,112 @@ def _pool(values: list[Float[np.ndarray, "_ ny"]]) -> Float[np.ndarray, "m ny"]:
     return np.where(present, whole - mean, 0.0) / np.sqrt(share)
 
 
-def _starts(problem: Residuals, lengths: list[int], pools: list[Any], draws: int, rng: np.random.Generator):  # noqa: ANN202
-    """Return, for each experiment, where each draw's blocks start."""
-    totals = [sum(piece.n for piece in pieces) for pieces in problem.segments]
-    return [
-        rng.integers(0, len(pool), size=(draws, -(-total // length)))
-        for pool, total, length in zip(pools, totals, lengths, strict=True)
-    ]
+@record(eq=False)
+class _Blocks:
+    """What an experiment's draws are made of: residuals to draw from, the length of blocks, and where they start."""
+
+    pool: Float[np.ndarray, "m ny"]
+    length: int
+    starts: Int[np.ndarray, "draws b"]
+
+    def draw(self, d: int, rows: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n ny"]:
+        """Return the residuals that draw d puts at `rows`."""
+        return self.pool[(self.starts[d][rows // self.length] + rows % self.length) % len(self.pool)]
 
 
-def _steps(
-    minimum: Minimum, left: list[list[Errors]], lengths: list[int], draws: int, rng: np.random.Generator
-) -> Float[np.ndarray, "draws p"]:
-    """Return one Gauss-Newton step a draw."""
+def _draw_blocks(
+    problem: Residuals, lengths: Mapping[str, int], pools: Mapping[str, Float[np.ndarray, "_ ny"]], draws: int,
+    rng: np.random.Generator,
+) -> dict[str, _Blocks]:  # fmt: skip
+    """Return the blocks of each experiment."""
+    blocks: dict[str, _Blocks] = {}
+    for experiment in problem.experiments:
+        pool, length = pools[experiment.name], lengths[experiment.name]
+        total = sum(segment.samples.n for segment in experiment.segments)
+        starts = rng.integers(0, len(pool), size=(draws, -(-total // length)))
+        blocks[experiment.name] = _Blocks(pool=pool, length=length, starts=starts)
+    return blocks
+
+
+def _draw_steps(
+    minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "draws p"]:  # fmt: skip
+    """Return one Gauss-Newton step per draw."""
     problem, z = minimum.problem, minimum.z
     p, prior = problem.unknowns.shared, problem.unknowns.prior_std**-1.0
     hessian = problem.evaluate(z).hessian
-    if not isinstance(problem.loss, Linear):
-        hessian = robust_bread(problem, z) + np.diag(prior**2)
-    back = inverse(hessian)[0][:, :p]
-    pulls = [[pull_of(problem.loss, error.weighted) for error in row] for row in left]
-    pools = [_pool([r[use] for r, use in zip(row, _rows(e), strict=True)]) for row, e in zip(pulls, left, strict=True)]
-    starts = _starts(problem, lengths, pools, draws, rng)
-    moved = (rng.normal(size=(draws, z.size)) * prior) @ back
-    for e, row in enumerate(left):
+    if not problem.loss.quadratic:
+        hessian = compute_bread(problem, z) + np.diag(prior**2)
+    inverse = invert(hessian)[0][:, :p]
+    pools = {
+        name: _make_pool(
+            [problem.loss.slope(s.weighted)[r] for s, r in zip(own.segments, _find_used_rows(own), strict=True)]
+        )
+        for name, own in residuals.items()
+    }
+    blocks = _draw_blocks(problem, lengths, pools, draws, rng)
+    moved = (rng.normal(size=(draws, z.size)) * prior) @ inverse
+    for experiment in problem.experiments:
         first = 0
-        for s, error in enumerate(row):
-            for rows, columns, used in column_chunks(problem, e, s, z):
-                influence = _influence(problem, e, s, columns, back) * used[:, :, None]
+        for segment in experiment.segments:
+            for rows, columns, used in stream_columns(experiment, segment, z):
+                influence = _compute_influence(experiment, segment, columns, inverse) * used[:, :, None]
                 flat = influence.reshape(-1, p)
                 at = first + np.arange(rows.start, rows.start + len(columns))
                 for d in range(draws):
-                    moved[d] += _drawn(pools[e], starts[e][d], lengths[e], at).ravel() @ flat
-            first += len(error.weighted)
+                    moved[d] += blocks[experiment.name].draw(d, at).ravel() @ flat
+            first += segment.samples.n
     return z[:p] - moved
 
 
-def _influence(
-    problem: Residuals, e: int, s: int, columns: Float[np.ndarray, "m ny nc"], back: Float[np.ndarray, "n p"]
-) -> Float[np.ndarray, "m ny p"]:
+def _compute_influence(
+    experiment: FitExperiment, segment: FitSegment, columns: Float[np.ndarray, "m ny nc"],
+    inverse: Float[np.ndarray, "n p"],
+) -> Float[np.ndarray, "m ny p"]:  # fmt: skip
     """Return how much each residual, in sigma, moves each parameter."""
-    found = np.empty((*columns.shape[:2], back.shape[1]))
-    for o, places in enumerate(problem.columns(e, s)):
+    influence = np.empty((*columns.shape[:2], inverse.shape[1]))
+    for o, places in enumerate(experiment.columns(segment)):
         used = np.flatnonzero(places >= 0)
-        found[:, o] = columns[:, o, 1 + used] @ (back[places[used]] / problem.sigma[e][o])
-    return found
+        influence[:, o] = columns[:, o, 1 + used] @ (inverse[places[used]] / experiment.sigma[o])
+    return influence
 
 
-def _refits(
-    minimum: Minimum, left: list[list[Errors]], lengths: list[int], draws: int, rng: np.random.Generator
-) -> Float[np.ndarray, "draws p"]:
-    """Return one fit a draw, of the model's outputs with the drawn residuals, from the minimum."""
+def _draw_refits(
+    minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "draws p"]:  # fmt: skip
+    """Return one fit per draw, of the model's outputs with the drawn residuals, from the minimum."""
     problem, z = minimum.problem, minimum.z
     unknowns, p = problem.unknowns, problem.unknowns.shared
-    pools = [_pool([error.raw[use] for error, use in zip(row, _rows(row), strict=True)]) for row in left]
-    starts = _starts(problem, lengths, pools, draws, rng)
-    found: list[Any] = []
+    pools = {
+        name: _make_pool([s.raw[used] for s, used in zip(own.segments, _find_used_rows(own), strict=True)])
+        for name, own in residuals.items()
+    }
+    blocks = _draw_blocks(problem, lengths, pools, draws, rng)
+    values: list[Float[np.ndarray, " p"]] = []
     for d in range(draws):
-        segments: list[Any] = []
-        for e, pieces in enumerate(problem.segments):
-            rows = np.concatenate([error.raw for error in left[e]])
-            new = _drawn(pools[e], starts[e][d], lengths[e], np.arange(len(rows)))
-            first, row = 0, []
-            for piece, error in zip(pieces, left[e], strict=True):
-                y = np.column_stack(piece.y) + error.raw - new[first : first + piece.n]
-                row.append(replace(piece, y=tuple(np.ascontiguousarray(column) for column in y.T)))
-                first += piece.n
-            segments.append(tuple(row))
+        experiments = tuple(
+            _with_drawn(experiment, residuals[experiment.name], blocks[experiment.name], d)
+            for experiment in problem.experiments
+        )
         shift = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0) * rng.normal(size=z.size)
-        trial = replace(problem, segments=tuple(segments), unknowns=replace(unknowns, start=z + shift))
-        solution = minimise(trial.evaluate, z, unknowns.low, unknowns.high)
+        trial = replace(problem, experiments=experiments, unknowns=replace(unknowns, start=z + shift))
+        solution = minimise(trial, z, unknowns.low, unknowns.high)
         if not np.isfinite(solution.evaluation.cost):
             raise EstimationError(f"bootstrap: draw {d} overflows the simulation; use refit = False")
-        found.append(solution.z[:p])
-    return np.array(found)
+        values.append(solution.z[:p])
+    return np.array(values)
+
+
+def _with_drawn(experiment: FitExperiment, residuals: ExperimentResiduals, blocks: _Blocks, d: int) -> FitExperiment:
+    """Return the experiment as if the model's outputs with the residuals of a draw had been measured."""
+    total = sum(segment.samples.n for segment in experiment.segments)
+    drawn, first, segments = blocks.draw(d, np.arange(total)), 0, []
+    for segment, row in zip(experiment.segments, residuals.segments, strict=True):
+        samples = segment.samples
+        y = np.column_stack(samples.y) + row.raw - drawn[first : first + samples.n]
+        measured = tuple(np.ascontiguousarray(column) for column in y.T)
+        segments.append(replace(segment, samples=replace(samples, y=measured)))
+        first += samples.n
+    return replace(experiment, segments=tuple(segments))

@@ -15,7 +15,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.normal_equations import eliminated, inverse
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.normal_equations import eliminate, invert
 from seaopt.estimation.result.fit_result import Minimum
 from seaopt.records import record
 
@@ -30,34 +31,31 @@ class Leverage:
     whole: float
 
 
-def leverage(minimum: Minimum) -> dict[str, Leverage]:
+def measure_leverage(minimum: Minimum) -> dict[str, Leverage]:
     """Return the share of each experiment, and of the priors where there are some."""
     problem, unknowns, p = minimum.problem, minimum.problem.unknowns, minimum.problem.unknowns.shared
-    parts = {
-        experiment.name: _information(minimum, e) for e, experiment in enumerate(problem.experiments)
-    }  # fmt: skip
+    parts = {experiment.name: _compute_information(minimum, experiment) for experiment in problem.experiments}
     prior = unknowns.precision[:p]
     if np.any(prior > 0.0):
         parts[PRIORS] = np.diag(prior)
-    whole = np.sum(list(parts.values()), axis=0)
-    back, _ = inverse(whole, 1e-10)
-    found: dict[str, Leverage] = {}
+    inverse, _ = invert(np.sum(list(parts.values()), axis=0), 1e-10)
+    leverage: dict[str, Leverage] = {}
     for name, part in parts.items():
-        shares = np.diag(back @ part @ back) / np.maximum(np.diag(back), 1e-300)
-        found[name] = Leverage(
+        shares = np.diag(inverse @ part @ inverse) / np.maximum(np.diag(inverse), 1e-300)
+        leverage[name] = Leverage(
             parameters=dict(zip(unknowns.names[:p], shares.tolist(), strict=True)),
-            whole=float(np.trace(part @ back)) / p,
+            whole=float(np.trace(part @ inverse)) / p,
         )
-    return found
+    return leverage
 
 
-def _information(minimum: Minimum, e: int) -> Float[np.ndarray, "p p"]:
+def _compute_information(minimum: Minimum, experiment: FitExperiment) -> Float[np.ndarray, "p p"]:
     """Return an experiment's information on the plants' parameters, its own unknowns eliminated."""
-    problem, p = minimum.problem, minimum.problem.unknowns.shared
-    passes = problem.passes_of(e, minimum.z)
-    hessian = problem.normal(e, passes)[1:, 1:]
-    touched = np.unique(np.concatenate([places for s in range(len(passes)) for places in problem.columns(e, s)]))
-    rest = touched[touched >= p]
-    hessian[rest, rest] += problem.unknowns.precision[rest]
-    kept = np.concatenate([np.arange(p), rest])
-    return eliminated(hessian[np.ix_(kept, kept)], p)
+    unknowns, z = minimum.problem.unknowns, minimum.z
+    hessian = experiment.normal(experiment.run_all(z), z.size)[1:, 1:]
+    columns = (places for segment in experiment.segments for places in experiment.columns(segment))
+    touched = np.unique(np.concatenate(list(columns)))
+    rest = touched[touched >= unknowns.shared]
+    hessian[rest, rest] += unknowns.precision[rest]
+    kept = np.concatenate([np.arange(unknowns.shared), rest])
+    return eliminate(hessian[np.ix_(kept, kept)], unknowns.shared)

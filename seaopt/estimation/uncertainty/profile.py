@@ -22,20 +22,19 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import EstimationError, suggestion
-from seaopt.estimation.problem.losses import Linear
-from seaopt.estimation.problem.normal_equations import inverse, solved
-from seaopt.estimation.result.covariance import robust_bread
+from seaopt.estimation.problem.normal_equations import invert, solve_seen
+from seaopt.estimation.result.covariance import compute_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.formatting import html_text
 from seaopt.records import record
 from seaopt.units import unit_after
 
-CLOSE = 2e-3  # of tau: near enough for an end of the interval to be interpolated
-MOST = 40  # refits an end
-FAR = 1e4  # std from the estimate: an end beyond is nowhere
-BETTER = 1e-3  # fall of the cost below the fit's that is no rounding
-BEYOND = 0.15  # of the interval, that the curve shows on either side
+CLOSE_TO_END = 2e-3  # of tau: near enough for an end of the interval to be interpolated
+MOST_REFITS = 40  # per end
+NOWHERE = 1e4  # std from the estimate: an end beyond is nowhere
+BETTER_COST = 1e-3  # fall of the cost below the fit's that is no rounding
+MARGIN = 0.15  # of the interval, that the curve shows on either side
 
 
 @record(eq=False, repr=False)
@@ -144,13 +143,13 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
     >>> plant, truth = so.plants.high_impedance(), so.plants.thor()
     >>> log = virtual_log(plant, truth, PAPER_STAND, duration_s=20, rate_hz=400, seed=1,
     ...                   sensors=Sensors(noise_std={"F1": 2.0, "F2": 2.0}))
-    >>> found = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1", "F2"))], truth.free("J", "b_r"))
-    >>> low, high = profile(found, "J", points=0).interval
+    >>> fit = so.fit([so.Experiment(plant=plant, log=log, outputs=("F1", "F2"))], truth.free("J", "b_r"))
+    >>> low, high = profile(fit, "J", points=0).interval
     >>> low < 3.31e-6 < high
     True
 
     """
-    minimum = fit.at_minimum("profile")
+    minimum = fit.require_minimum("profile")
     names = minimum.problem.unknowns.names[: minimum.problem.unknowns.shared]
     if name not in names:
         raise EstimationError(f'profile: "{name}" is not a free parameter of the plants; {suggestion(name, names)}')
@@ -160,10 +159,10 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
         raise EstimationError(f"profile: points = {points} is negative; give 0 or more")
     from scipy.special import erfinv  # deferred: scipy is slow to load
 
-    scale, std = _scale(fit, minimum, name, coloured)
+    scale, std = _measure_scale(fit, minimum, name, coloured)
     reach = float(np.sqrt(2.0) * erfinv(level))
-    curve = _Curve(minimum, names.index(name), scale, std)
-    (low, shut_low), (high, shut_high) = curve.end(-reach), curve.end(reach)
+    curve = _ProfileCurve(minimum, names.index(name), scale, std)
+    (low, shut_low), (high, shut_high) = curve.find_end(-reach), curve.find_end(reach)
     curve.fill(low, high, points)
     order = np.argsort(curve.values)
     estimate = float(minimum.z[curve.index])
@@ -171,22 +170,22 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
         name=name, unit=fit.parameters[name].unit, estimate=estimate, level=level, interval=(low, high),
         closed=(shut_low, shut_high), wald=(estimate - reach * std, estimate + reach * std),
         values=np.array(curve.values)[order], rises=np.array(curve.rises)[order], scale=scale,
-        refits=len(curve.values) - 1, message=curve.message(name),
+        refits=len(curve.values) - 1, message=curve.warn(name),
     )  # fmt: skip
 
 
-def _scale(fit: Fit, minimum: Minimum, name: str, coloured: bool) -> tuple[float, float]:
+def _measure_scale(fit: Fit, minimum: Minimum, name: str, coloured: bool) -> tuple[float, float]:
     """Return the variance over what the cost's curvature says, and the std; 1 where the variance is not known."""
     std = (fit.covariance if coloured else fit.white_covariance).std(name)
     curved, problem = fit.white_covariance.std(name), minimum.problem
-    if not isinstance(problem.loss, Linear):
-        bread = robust_bread(problem, minimum.z) + np.diag(problem.unknowns.precision)
-        curved = float(np.sqrt(inverse(bread)[0][(problem.unknowns.names.index(name),) * 2]))
+    if not problem.loss.quadratic:
+        bread = compute_bread(problem, minimum.z) + np.diag(problem.unknowns.precision)
+        curved = float(np.sqrt(invert(bread)[0][(problem.unknowns.names.index(name),) * 2]))
     known = np.isfinite(curved) and np.isfinite(std) and curved > 0.0 and std > 0.0
     return (std / curved) ** 2 if known else 1.0, std
 
 
-class _Curve:
+class _ProfileCurve:
     """Collects refits one by one; lives only inside `profile`."""
 
     def __init__(self, minimum: Minimum, index: int, scale: float, std: float) -> None:
@@ -194,26 +193,26 @@ class _Curve:
         here = self.problem.evaluate(minimum.z)
         self.cost = here.cost
         self.values, self.rises, self.points = [float(minimum.z[index])], [0.0], [minimum.z]
-        self.along = _direction(here.hessian, index)
+        self.along = _find_direction(here.hessian, index)
         known = np.isfinite(std) and std > 0.0
         self.step = std if known else 0.1 * max(abs(self.values[0]), 1e-300)
 
-    def rise(self, value: float) -> float:
+    def refit_at(self, value: float) -> float:
         """Refit the others with the parameter at `value`, from the nearest refit, and return the scaled rise."""
         nearest = int(np.argmin(np.abs(np.array(self.values) - value)))
         start = self.points[nearest] + self.along * (value - self.values[nearest])
         start[self.index] = value
         low, high = self.problem.unknowns.low.copy(), self.problem.unknowns.high.copy()
         low[self.index] = high[self.index] = value
-        found = minimise(self.problem.evaluate, np.clip(start, low, high), low, high)
-        rise = (found.evaluation.cost - self.cost) / self.scale
+        solution = minimise(self.problem, np.clip(start, low, high), low, high)
+        rise = (solution.evaluation.cost - self.cost) / self.scale
         if np.isfinite(rise):
             self.values.append(value)
             self.rises.append(float(rise))
-            self.points.append(found.z)
+            self.points.append(solution.z)
         return float(rise)
 
-    def end(self, target: float) -> tuple[float, bool]:
+    def find_end(self, target: float) -> tuple[float, bool]:
         """Return where tau reaches the target, and whether it does before the parameter's bound.
 
         The value is smooth in tau, nearly straight: each trial is where the parabola through the nearest three points
@@ -223,29 +222,29 @@ class _Curve:
         limit = float((self.problem.unknowns.high if target > 0.0 else self.problem.unknowns.low)[self.index])
         taus, values = [0.0], [estimate]
         trial, outer = estimate + target * self.step, None
-        for _ in range(MOST):
+        for _ in range(MOST_REFITS):
             trial = min(trial, limit) if target > 0.0 else max(trial, limit)
-            rise = self.rise(trial)
+            rise = self.refit_at(trial)
             tau = np.sign(target) * np.sqrt(2.0 * max(rise, 0.0))
             if np.isfinite(rise):
                 taus.append(float(tau))
                 values.append(trial)
-            if abs(tau - target) <= CLOSE * abs(target):
-                return _reached(taus, values, target), True
+            if abs(tau - target) <= CLOSE_TO_END * abs(target):
+                return _interpolate_end(taus, values, target), True
             if abs(tau) < abs(target) and trial == limit:
                 return limit, False
             if abs(tau) > abs(target):
                 outer = trial if outer is None else min(outer, trial, key=lambda v: abs(v - estimate))
-            elif abs(trial - estimate) > FAR * self.step:
+            elif abs(trial - estimate) > NOWHERE * self.step:
                 break
-            trial = self._trial(taus, values, target, outer)
+            trial = self._choose_trial(taus, values, target, outer)
         return (float(np.copysign(np.inf, target)), False) if outer is None else (trial, True)
 
-    def _trial(self, taus: list[float], values: list[float], target: float, outer: float | None) -> float:
+    def _choose_trial(self, taus: list[float], values: list[float], target: float, outer: float | None) -> float:
         """Return the next value to try: inside what brackets the target, or at most three times as far as yet."""
         inner = max(abs(v - values[0]) for t, v in zip(taus, values, strict=True) if abs(t) < abs(target))
         far = max(3.0 * inner, 0.1 * self.step) if outer is None else abs(outer - values[0])
-        wanted = abs(_reached(taus, values, target) - values[0]) if len(taus) > 1 else 0.5 * far
+        wanted = abs(_interpolate_end(taus, values, target) - values[0]) if len(taus) > 1 else 0.5 * far
         if not inner < wanted < far:
             wanted = far if outer is None else 0.5 * (inner + far)
         return values[0] + float(np.sign(target)) * wanted
@@ -253,29 +252,29 @@ class _Curve:
     def fill(self, low: float, high: float, points: int) -> None:
         """Refit at evenly spaced values over the interval and a little beyond."""
         low, high = (end if np.isfinite(end) else far(self.values) for end, far in ((low, min), (high, max)))
-        margin = BEYOND * (high - low)
+        margin = MARGIN * (high - low)
         bounds = self.problem.unknowns.low[self.index], self.problem.unknowns.high[self.index]
         for value in np.unique(np.clip(np.linspace(low - margin, high + margin, points), *bounds)):
             if value not in self.values:
-                self.rise(float(value))
+                self.refit_at(float(value))
 
-    def message(self, name: str) -> str:
-        """Say whether a refit is better than the fit, or whether an end was not found."""
+    def warn(self, name: str) -> str:
+        """Return a warning where a refit is better than the fit; empty otherwise."""
         best = int(np.argmin(self.rises))
-        if self.rises[best] * self.scale < -BETTER:
+        if self.rises[best] * self.scale < -BETTER_COST:
             return f"a refit at {name} = {self.values[best]:.6g} is better than the fit: fit again from there"
         return ""
 
 
-def _direction(hessian: Float[np.ndarray, "n n"], index: int) -> Float[np.ndarray, " n"]:
+def _find_direction(hessian: Float[np.ndarray, "n n"], index: int) -> Float[np.ndarray, " n"]:
     """Return how the others follow when one unknown moves by one: to first order, their best values."""
     others = np.arange(len(hessian)) != index
     step = np.ones(len(hessian))
-    step[others] = -solved(hessian[np.ix_(others, others)], hessian[others, index], 1e-12)
+    step[others] = -solve_seen(hessian[np.ix_(others, others)], hessian[others, index], 1e-12)
     return step
 
 
-def _reached(taus: list[float], values: list[float], target: float) -> float:
+def _interpolate_end(taus: list[float], values: list[float], target: float) -> float:
     """Return where tau reaches the target on the parabola, or the line, through the nearest three points."""
     near = np.argsort(np.abs(np.array(taus) - target))[:3]
     t, v = np.array(taus)[near], np.array(values)[near]

@@ -21,16 +21,16 @@ from seaopt.simulation import Model, Point, transition
 from seaopt.simulation.discretisation import expm_with_derivatives
 
 DOUBLINGS = 60
-LEAK = 1e-6  # a sample: what drifts and is hardly seen is forgotten in the end
+LEAK = 1e-6  # per sample: what drifts and is hardly seen is forgotten in the end
 HORIZON = 12  # doublings: samples over which an output may show a state
-UNSEEN = 1e-8  # singular values below this part of the largest belong to what no output shows
+UNOBSERVABLE = 1e-8  # singular values below this part of the largest belong to what no output shows
 DISTRUST = float(np.log(0.1))  # process noise, over each state's size, of a filter that hardly trusts the plant
-RATE_LIMIT = 0.3  # a sample: dry friction at rest looks like a damping that would forget the speed within a sample
+RATE_LIMIT = 0.3  # per sample: dry friction at rest looks like a damping that would forget the speed within a sample
 NEIGHBOUR = 1e-6  # relative step of the differences
 
 
 @record(eq=False)
-class Observer:
+class SteadyStateFilter:
     """What the gain of one experiment's filter follows from, besides parameters and noise.
 
     Parameters
@@ -64,22 +64,22 @@ class Observer:
         steps = NEIGHBOUR * np.where(np.arange(base.size) < point.theta.size, np.abs(base), 1.0)
         steps[steps == 0.0] = NEIGHBOUR
         trials = np.vstack([base, base + np.diag(steps)]) if self.follows else base[None]
-        a, c = self.plants(model, point, trials[:, : point.theta.size])
+        a, c = self.linearise(model, point, trials[:, : point.theta.size])
         level = trials[:, point.theta.size :] if noise.size else np.full((len(trials), model.nx), DISTRUST)
         q = (self.size * np.exp(level)) ** 2
         gains = kalman_gain(a, c * self.gain[:, None], q, self.sensors**2)
-        found = np.zeros((1 + base.size + free_delay, model.nx, model.ny))
-        found[0] = gains[0]
+        correction = np.zeros((1 + base.size + free_delay, model.nx, model.ny))
+        correction[0] = gains[0]
         if self.follows:
             slopes = (gains[1:] - gains[0]) / steps[:, None, None]
-            found[1 : 1 + point.theta.size] = slopes[: point.theta.size]
-            found[1 + point.theta.size + free_delay :] = slopes[point.theta.size :]
-        return found
+            correction[1 : 1 + point.theta.size] = slopes[: point.theta.size]
+            correction[1 + point.theta.size + free_delay :] = slopes[point.theta.size :]
+        return correction
 
-    def plants(
+    def linearise(
         self, model: Model, point: Point, thetas: Float[np.ndarray, "t np"]
     ) -> tuple[Float[np.ndarray, "t nx nx"], Float[np.ndarray, "t ny nx"]]:
-        """Return A and C at each theta."""
+        """Return A and C, over one sample, at each theta."""
         nx, clock = model.nx, replace(point.clock, delay_free=False)
         a, c = np.empty((len(thetas), nx, nx)), np.empty((len(thetas), model.ny, nx))
         for i, theta in enumerate(thetas):
@@ -105,9 +105,9 @@ class Observer:
         f, h = model.functions[key](0.0, self.places[:, :nx].T, self.places[:, nx:].T, p)
         rates, limit = np.array(f).reshape(nx, m, nx), RATE_LIMIT / period
         mean = rates.mean(axis=1)
-        own = np.clip(rates[np.arange(nx), :, np.arange(nx)], -limit, limit)
+        diagonal = np.clip(rates[np.arange(nx), :, np.arange(nx)], -limit, limit)
         # What is to hold the plant to the log wherever it is must do so where it is damped least.
-        mean[np.diag_indices(nx)] = own.mean(axis=1) if self.follows else own.max(axis=1)
+        mean[np.diag_indices(nx)] = diagonal.mean(axis=1) if self.follows else diagonal.max(axis=1)
         return mean, np.array(h).reshape(model.ny, m, nx).mean(axis=1)
 
 
@@ -125,33 +125,33 @@ def kalman_gain(
     a, c : arrays
         The plants over one sample.
     q, r : arrays
-        Variances of the process noise, one a state, and of the measurement noise, one an output.
+        Variances of the process noise per state, and of the measurement noise per output.
 
     """
     with np.errstate(all="ignore"):
-        told = c / np.sqrt(r)[:, None]
-        if not np.all(np.isfinite(a)) or not np.all(np.isfinite(told)):
+        scaled = c / np.sqrt(r)[:, None]
+        if not np.all(np.isfinite(a)) or not np.all(np.isfinite(scaled)):
             return np.full((len(a), a.shape[1], c.shape[1]), np.nan)
-        to, back = _seen(a, told)
+        to, back = _reduce_to_seen(a, scaled)
         noise = (to * q[:, None, :]) @ to.transpose(0, 2, 1)
-        return back @ _observable_gain(to @ a @ back, c @ back, noise, r)
+        return back @ _solve_riccati(to @ a @ back, c @ back, noise, r)
 
 
-def _seen(
+def _reduce_to_seen(
     a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
 ) -> tuple[Float[np.ndarray, "t m nx"], Float[np.ndarray, "t nx m"]]:
     """Return the map of each plant's states to those that the outputs show, and a map back; m is the first plant's."""
-    _, values, _ = _shown(a[:1], c[:1])
-    rank = max(int(np.count_nonzero(values[0] > UNSEEN * values[0, 0])), 1)
+    _, values, _ = _decompose_observability(a[:1], c[:1])
+    rank = max(int(np.count_nonzero(values[0] > UNOBSERVABLE * values[0, 0])), 1)
     if rank == a.shape[1]:
         one = np.broadcast_to(np.eye(rank), a.shape)
         return one, one
-    scale, _, vectors = _shown(a, c)
+    scale, _, vectors = _decompose_observability(a, c)
     chosen = vectors[:, :rank]
     return chosen * scale[:, None, :], (chosen / scale[:, None, :]).transpose(0, 2, 1)
 
 
-def _shown(
+def _decompose_observability(
     a: Float[np.ndarray, "t nx nx"], c: Float[np.ndarray, "t ny nx"]
 ) -> tuple[Float[np.ndarray, "t nx"], Float[np.ndarray, "t m"], Float[np.ndarray, "t nx nx"]]:
     """Return how much the outputs of 2^HORIZON samples show of each state, and, of states so scaled, the directions."""
@@ -167,7 +167,7 @@ def _shown(
     return scale, values, vectors
 
 
-def _observable_gain(
+def _solve_riccati(
     a: Float[np.ndarray, "t m m"], c: Float[np.ndarray, "t ny m"], q: Float[np.ndarray, "t m m"],
     r: Float[np.ndarray, " ny"],
 ) -> Float[np.ndarray, "t m ny"]:  # fmt: skip
@@ -176,7 +176,7 @@ def _observable_gain(
     for _ in range(DOUBLINGS):
         if not np.all(np.isfinite(h)) or not np.all(np.isfinite(g)):
             return np.full((len(a), a.shape[1], c.shape[1]), np.nan)
-        w = _inverse(one + g @ h)
+        w = _invert_each(one + g @ h)
         after = h + x.transpose(0, 2, 1) @ h @ w @ x
         g = g + x @ w @ g @ x.transpose(0, 2, 1)
         x = x @ w @ x
@@ -185,10 +185,10 @@ def _observable_gain(
         if done:
             break
     cross = a @ h @ c.transpose(0, 2, 1)
-    return cross @ _inverse(c @ h @ c.transpose(0, 2, 1) + np.diag(r))
+    return cross @ _invert_each(c @ h @ c.transpose(0, 2, 1) + np.diag(r))
 
 
-def _inverse(matrices: Float[np.ndarray, "t n n"]) -> Float[np.ndarray, "t n n"]:
+def _invert_each(matrices: Float[np.ndarray, "t n n"]) -> Float[np.ndarray, "t n n"]:
     """Return the inverses; not finite if one of them has none."""
     try:
         return np.linalg.inv(matrices)

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING
 from seaopt.estimation import diagnose
-from seaopt.estimation.advice.score_test import held_parameters
+from seaopt.estimation.advice.score_test import run_score_tests
 from seaopt.files import to_json
 
 NOISE = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
@@ -31,7 +31,7 @@ def regression(u, v, y, c, **options):
     bench = so.Experiment(plant=SUM, log=log, initial_state="rest", offset=False, **options)
     params = so.ParameterSet.of(a=(1.0, "-"), c=(c, "-")).free("a")
     fit = so.fit([bench], params, method=so.OutputError(search=False))
-    return held_parameters(fit.minimum, fit)["c"]
+    return run_score_tests(fit.minimum, fit)["c"]
 
 
 def test_a_regression_has_the_textbooks_multiplier():

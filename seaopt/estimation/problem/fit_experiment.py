@@ -1,0 +1,324 @@
+"""An experiment as a fit sees it: its data and model, the slots of its unknowns, and the weights of its residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from seaopt.estimation.problem.band import design_filter, sees_level
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.losses import Loss
+from seaopt.estimation.problem.normal_equations import add_gram
+from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
+from seaopt.estimation.problem.unknowns import Slot, Slots
+from seaopt.records import record
+from seaopt.simulation import Clock, Model, Pass, Point, Segment, Weights, run_passes, stream
+
+CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
+FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
+
+
+@record(eq=False)
+class FitSegment:
+    """A stretch of an experiment that is simulated from a state of its own.
+
+    Parameters
+    ----------
+    samples : Segment
+        The data.
+    initial : tuple of Slot
+        The state at the first sample.
+    columns, predictor_columns : tuple of arrays of int, one per output
+        Which unknown each derivative column of a pass is, -1 for none: without and with a filter's correction.
+
+    """
+
+    samples: Segment
+    initial: tuple[Slot, ...]
+    columns: tuple[Int[np.ndarray, " nc"], ...]
+    predictor_columns: tuple[Int[np.ndarray, " nd"], ...]
+
+    def start(self, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nx"]:
+        """Return the state at the first sample."""
+        return np.array([slot.at(z) for slot in self.initial])
+
+    def mark_counted(self, settle: int, rows: slice | None = None) -> Bool[np.ndarray, "n ny"]:
+        """Return which samples take part in the cost, after those that a filter takes to settle."""
+        chosen = rows if rows is not None else slice(0, self.samples.n)
+        present = np.column_stack([np.isfinite(channel[chosen]) for channel in self.samples.y])
+        if self.samples.keep:
+            present &= np.column_stack([mask[chosen] > 0 for mask in self.samples.keep])
+        present[: max(settle - chosen.start, 0)] = False
+        return present
+
+    def count_weighted(self) -> Int[np.ndarray, " ny"]:
+        """Return how many samples of each output are there and have a weight."""
+        present = [np.isfinite(channel) for channel in self.samples.y]
+        if self.samples.keep:
+            present = [there & (mask > 0) for there, mask in zip(present, self.samples.keep, strict=True)]
+        return np.array([np.count_nonzero(there) for there in present])
+
+    @property
+    def has_start(self) -> bool:
+        """Whether the initial state can be told: not where all samples are held out, which then tell nothing."""
+        return not self.samples.keep or bool(np.any(self.samples.keep[0]))
+
+
+@record(eq=False)
+class ResidualPower:
+    """Weighted sum of squares and count of each output's residuals."""
+
+    squares: Float[np.ndarray, " ny"]
+    counts: Float[np.ndarray, " ny"]
+
+    @property
+    def rms(self) -> Float[np.ndarray, " ny"]:
+        """The root of the mean square of each output."""
+        return np.sqrt(self.squares / np.maximum(self.counts, 1.0))
+
+
+@record(eq=False)
+class FitExperiment:
+    """One experiment of a fit.
+
+    Parameters
+    ----------
+    data : Experiment
+        As the user gave it.
+    segments : tuple of FitSegment
+        What is simulated.
+    model : Model
+        The plant, in its own free parameters.
+    theta : array of int, shape (np,)
+        Where those stand among the unknowns.
+    slots : Slots
+        Its other unknowns.
+    sigma : array, shape (ny,)
+        Of the filtered residual of each output.
+    spread : array, shape (ny,)
+        Standard deviation of each measured output.
+    loss : Squares, Huber or SoftL1
+        Applied to residuals in sigma.
+    band_hz : (low, high) or None
+        Residuals are filtered to this band.
+    holdout : float
+        Last fraction of the log that gets no weight.
+    substeps : int
+        Integration steps per sample.
+    predictor : SteadyStateFilter or None
+        With one, the residual is the error of the prediction one sample ahead.
+
+    """
+
+    data: Experiment
+    segments: tuple[FitSegment, ...]
+    model: Model
+    theta: Int[np.ndarray, " np"]
+    slots: Slots
+    sigma: Float[np.ndarray, " ny"]
+    spread: Float[np.ndarray, " ny"]
+    loss: Loss
+    band_hz: tuple[float, float] | None = None
+    holdout: float = 0.0
+    substeps: int = 1
+    predictor: SteadyStateFilter | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the experiment."""
+        return self.data.name
+
+    @property
+    def period(self) -> float:
+        """Of the samples, in s."""
+        return self.data.log.period
+
+    @property
+    def outputs(self) -> tuple[FitOutput, ...]:
+        """Each measured output."""
+        return tuple(FitOutput(experiment=self, index=o, name=name) for o, name in enumerate(self.data.outputs))
+
+    @property
+    def longest(self) -> int:
+        """Samples of the longest segment."""
+        return max(segment.samples.n for segment in self.segments)
+
+    @property
+    def weights(self) -> Weights:
+        """The filter and the loss."""
+        sections, settle = design_filter(self.band_hz, self.period)
+        knee = self.loss.threshold * self.sigma
+        return Weights(sections=sections, settle=settle, knee=knee, loss=self.loss.kind)
+
+    @property
+    def level_unseen(self) -> bool:
+        """Whether offsets are wanted that the band does not show: they are then what is left over on average."""
+        return self.data.offset is True and not sees_level(self.band_hz)
+
+    def point(self, z: Float[np.ndarray, " n"]) -> Point:
+        """Return where the passes are made."""
+        slots = self.slots
+        point = Point(
+            theta=z[self.theta],
+            offset=np.array([slot.at(z) for slot in slots.offset]),
+            gain=np.array([slot.at(z) for slot in slots.gain]),
+            drift=np.array([[slot.at(z) for slot in row] for row in slots.drift]),
+            clock=Clock(
+                period=self.period,
+                hold=self.data.hold,
+                delay_s=slots.delay.at(z),
+                delay_free=slots.delay.index is not None,
+            ),
+            substeps=self.substeps,
+        )
+        if self.predictor is None:
+            return point
+        noise = np.array([slot.at(z) for slot in slots.noise])
+        return replace(point, correction=self.predictor.correction(self.model, point, noise))
+
+    def columns(self, segment: FitSegment) -> tuple[Int[np.ndarray, " nc"], ...]:
+        """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""
+        return segment.columns if self.predictor is None else segment.predictor_columns
+
+    def run(self, segment: FitSegment, z: Float[np.ndarray, " n"], **keep: Any) -> Pass:
+        """Run the pass of one segment."""
+        start = segment.start(z)[None]
+        return run_passes(self.model, segment.samples, self.point(z), start, self.weights, **keep)
+
+    def run_all(self, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
+        """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples."""
+        point, weights = self.point(z), self.weights
+        shown = 0 if self.model.linear else FIRST_SAMPLES
+        return tuple(
+            run_passes(
+                self.model, segment.samples, point, segment.start(z)[None], weights, outputs=shown > 0, shown=shown
+            )
+            for segment in self.segments
+        )  # fmt: skip
+
+    def stream(
+        self, segment: FitSegment, z: Float[np.ndarray, " n"], point: Point, *, columns: bool, chunk: int
+    ) -> Iterator[tuple[slice, Pass]]:
+        """Yield rows of a segment and their part of a pass, chunk by chunk."""
+        first = 0
+        for part in stream(
+            self.model, segment.samples, point, segment.start(z), self.weights, chunk=chunk, columns=columns
+        ):
+            assert part.outputs is not None
+            rows = slice(first, first + len(part.outputs))
+            first = rows.stop
+            yield rows, part
+
+    def normal(self, passes: Sequence[Pass], n: int) -> Float[np.ndarray, "n1 n1"]:
+        """Return the normal matrix of [residual, n unknowns], in sigma, of the passes of every segment."""
+        total = np.zeros((1 + n,) * 2)
+        for segment, one in zip(self.segments, passes, strict=True):
+            for o, places in enumerate(self.columns(segment)):
+                add_gram(total, one.gram[0, o] / self.sigma[o] ** 2, places)
+        return total
+
+    def cost(self, passes: Sequence[Pass]) -> float:
+        """Return the loss of the passes of every segment, in sigma."""
+        return sum(float(np.sum(one.loss[0] / self.sigma**2)) for one in passes)
+
+    def power(self, passes: Sequence[Pass], moved: Float[np.ndarray, " n"]) -> ResidualPower:
+        """Return the power of the residuals after unknowns in which they are straight have moved."""
+        squares, counts = np.zeros(len(self.sigma)), np.zeros(len(self.sigma))
+        for segment, one in zip(self.segments, passes, strict=True):
+            for o, places in enumerate(self.columns(segment)):
+                step = np.concatenate([[1.0], np.where(places >= 0, moved[places], 0.0)])
+                squares[o] += max(float(step @ one.gram[0, o] @ step), 0.0)
+                counts[o] += one.count[0, o]
+        return ResidualPower(squares=squares, counts=counts)
+
+
+@record(eq=False)
+class FitOutput:
+    """One measured output of one experiment; `index` is its place among them."""
+
+    experiment: FitExperiment
+    index: int
+    name: str
+
+    @property
+    def label(self) -> str:
+        """EXPERIMENT.OUTPUT, for results and messages."""
+        return f"{self.experiment.name}.{self.name}"
+
+    @property
+    def unit(self) -> str:
+        """Of the output."""
+        return self.experiment.data.plant.outputs[self.name]
+
+    @property
+    def sigma(self) -> float:
+        """Of the filtered residual."""
+        return float(self.experiment.sigma[self.index])
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the measured samples."""
+        return float(self.experiment.spread[self.index])
+
+    @property
+    def measured(self) -> list[Float[np.ndarray, "..."]]:
+        """The samples of each segment."""
+        return [segment.samples.y[self.index] for segment in self.experiment.segments]
+
+
+def make_fit_experiment(
+    data: Experiment, model: Model, slots: Slots, names: Sequence[str], *, loss: Loss,
+    band_hz: tuple[float, float] | None, holdout: float,
+) -> FitExperiment:  # fmt: skip
+    """Return an experiment in the unknowns of these names; a sigma that is not given is the output's spread."""
+    theta = [names.index(name) for name in model.free]
+    spread = [measure_spread(data.log[name]) for name in data.outputs]
+    sigma = [data.sigma.get(name, size or 1.0) for name, size in zip(data.outputs, spread, strict=True)]
+    return FitExperiment(
+        data=data, segments=make_segments(data, slots, theta, holdout), model=model, theta=np.array(theta, dtype=int),
+        slots=slots, sigma=np.array(sigma), spread=np.array(spread), loss=loss, band_hz=band_hz, holdout=holdout,
+    )  # fmt: skip
+
+
+def make_segments(data: Experiment, slots: Slots, theta: Sequence[int], holdout: float) -> tuple[FitSegment, ...]:
+    """Return the segments of an experiment, with the unknowns of their passes' columns."""
+    shared = [*theta, *_indices([slots.delay] if slots.delay.index is not None else [])]
+    noise = _indices([slot for slot in slots.noise if slot.index is not None])
+    sensors = [
+        _indices([offset, *drift, gain])
+        for offset, drift, gain in zip(slots.offset, slots.drift, slots.gain, strict=True)
+    ]
+    every = [index for row in sensors for index in row]
+    segments: list[FitSegment] = []
+    for samples, initial in zip(data.segments(holdout), slots.initial, strict=True):
+        state = _indices(initial)
+        together = np.array([*shared, *noise, *state, *every], dtype=int)
+        segments.append(
+            FitSegment(
+                samples=samples, initial=initial, predictor_columns=(together,) * len(sensors),
+                columns=tuple(np.array([*shared, *state, *row], dtype=int) for row in sensors),
+            )
+        )  # fmt: skip
+    return tuple(segments)
+
+
+def _indices(slots: Sequence[Slot]) -> list[int]:
+    return [-1 if slot.index is None else slot.index for slot in slots]
+
+
+def measure_spread(values: Float[np.ndarray, " n"]) -> float:
+    """Return the standard deviation of the samples that are there, in the memory of a chunk."""
+    first = float(values[np.argmax(np.isfinite(values))])
+    count, total, square = 0, 0.0, 0.0
+    for start in range(0, values.size, CACHED_SAMPLES):
+        part = values[start : start + CACHED_SAMPLES] - first
+        level = float(np.sum(part))
+        if not np.isfinite(level):
+            part = part[np.isfinite(part)]
+            level = float(np.sum(part))
+        count, total, square = count + part.size, total + level, square + float(np.einsum("m,m->", part, part))
+    return float(np.sqrt(max(square / count - (total / count) ** 2, 0.0)))

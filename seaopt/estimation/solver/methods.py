@@ -1,0 +1,161 @@
+"""How a plant is compared with a log: the methods of `fit`, as objects with their own options that solve a problem."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.estimation.problem.residuals import Evaluation, Residuals
+from seaopt.estimation.solver.first_guess import guess_from_responses
+from seaopt.estimation.solver.least_squares import Callback
+from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
+from seaopt.estimation.solver.settle import Solved, explains_little, settle
+from seaopt.records import record
+
+FURTHER = 5  # guesses of the frequency responses that are tried at most
+
+
+@record
+class Method(ABC):
+    """What all methods have: a limit of iterations, a search for a start, and a way to solve a problem."""
+
+    key: ClassVar[str]
+    models_noise: ClassVar[bool] = False  # with process noise among the unknowns, in place of a band
+    remedy: ClassVar[str] = ""  # where it ends badly
+
+    max_iterations: int = 120
+    search: bool = True
+    seed: int = 0
+
+    @abstractmethod
+    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+        """Return the minimum, and the problem with the sigma and the step with which it was found."""
+
+
+@record
+class OutputError(Method):
+    """Single shooting: the plant is simulated over each segment from its initial state.
+
+    Parameters
+    ----------
+    max_iterations : int
+        Of least squares.
+    search : bool
+        Look for a start: from the logs' frequency responses, over two decades around the given values, and, where that
+        ends badly, by predicting sample by sample with an observer that holds the simulation to the log. The given
+        values are kept where they explain the logs better.
+    seed : int
+        Of that search.
+
+    """
+
+    key: ClassVar[str] = "output_error"
+    remedy: ClassVar[str] = "the simulation may run away: try PredictionError() or MultipleShooting()"
+
+    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+        """Settle from the best start that can be found."""
+        best, guesses = find_start(problem, self)
+        solved = settle(problem, best, self.max_iterations, callback) if np.isfinite(best.cost) else None
+        if solved is not None and not (self.search and _is_doubtful(solved, guesses)):
+            return solved
+        for start in _further_starts(problem, best, guesses, self) if self.search else ():
+            other = settle(problem, problem.evaluate(start), self.max_iterations, callback)
+            solved = other if solved is None else _better(solved, other)
+            if not _is_doubtful(solved, guesses):
+                break
+        return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
+
+
+@record
+class PredictionError(Method):
+    """The residual is the error of the prediction one sample ahead, by a steady-state Kalman filter.
+
+    For plants that noise drives, not only sensors: process noise (one strength per state) over the measurement noise is
+    estimated with the parameters, and the filter's gain follows from it and from the plant. The measurement noise is
+    taken from the outputs' third differences; together they are scaled by the size of the prediction errors. A band is
+    refused: the filter is itself a model of the noise.
+
+    Parameters
+    ----------
+    max_iterations : int
+        Of least squares.
+    search : bool
+        Start from the logs' frequency responses where they explain the logs better than the given values.
+    seed : int
+        Of that search.
+
+    """
+
+    key: ClassVar[str] = "prediction_error"
+    models_noise: ClassVar[bool] = True
+
+    max_iterations: int = 240
+
+    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+        """Settle with a filter that hardly trusts the plant, then with one whose noise is estimated."""
+        best, _ = find_start(problem, self)
+        solved: Solved | None = None
+        for start in (*([best.z] if np.isfinite(best.cost) else []), problem.unknowns.start):
+            z = find_predicting_start(problem, start, self.max_iterations)
+            predicting = None if z is None else add_predictors(problem, z, follows=True)
+            if z is None or predicting is None:
+                continue
+            one = settle(predicting, predicting.evaluate(z), self.max_iterations, callback)
+            again = add_predictors(one.problem, one.solution.z, follows=True)
+            if again is not None and not problem.all_linear:
+                one = settle(again, again.evaluate(one.solution.z), self.max_iterations, callback)
+            solved = one if solved is None else _better(solved, one)
+            if solved.solution.status == "converged":
+                break
+        return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
+
+
+def find_start(problem: Residuals, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
+    """Return the better of the given values and the best guess of the frequency responses, and all the guesses.
+
+    A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
+    a little off is out of phase after some periods. Held to the log, such a guess finds the mode.
+    """
+    if not method.search:
+        return problem.evaluate(problem.unknowns.start), []
+    rng = np.random.default_rng(method.seed)
+    guesses, matched = guess_from_responses(problem, rng)
+    guessed = problem.evaluate(guesses[0]) if guesses else None
+    if guessed is not None and matched and not explains_little(problem, guessed.power):
+        return guessed, guesses
+    given = problem.evaluate(problem.unknowns.start)
+    best = given if guessed is None or guessed.cost > given.cost else guessed
+    if matched and explains_little(problem, best.power):
+        predicting = find_predicting_start(problem, guesses[0], method.max_iterations)
+        other = None if predicting is None else problem.evaluate(predicting)
+        best = other if other is not None and other.cost < best.cost else best
+    return best, guesses
+
+
+def _better(one: Solved, other: Solved) -> Solved:
+    return other if other.misfit < one.misfit else one
+
+
+def _is_doubtful(solved: Solved, guesses: list[Float[np.ndarray, " n"]]) -> bool:
+    """Tell whether another start is worth trying: it did not converge, or a nonlinear plant explains little."""
+    evaluation = solved.solution.evaluation
+    if solved.solution.status != "converged" or not np.isfinite(evaluation.cost):
+        return True
+    if guesses and solved.problem.all_linear:
+        return False
+    return explains_little(solved.problem, evaluation.power)
+
+
+def _further_starts(
+    problem: Residuals, best: Evaluation, guesses: list[Float[np.ndarray, " n"]], method: Method
+) -> Iterator[Float[np.ndarray, " n"]]:
+    """Yield further starts: predicting from the given values and from the best, then the other guesses."""
+    for start in (problem.unknowns.start, best.z):
+        predicting = find_predicting_start(problem, start, method.max_iterations)
+        if predicting is not None:
+            yield predicting
+    yield from guesses[1:FURTHER]

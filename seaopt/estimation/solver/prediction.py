@@ -1,0 +1,118 @@
+"""Filters that hold a plant to its log, and starts found by predicting with them.
+
+A plant that is far off runs away in simulation, or is out of phase after some periods; its predictions one sample
+ahead by a filter that hardly trusts it are only bad, so that least squares of their errors finds its way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
+from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.problem.residuals import Residuals
+from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
+from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.solver.settle import estimate_sigma
+from seaopt.estimation.solver.step_size import EXACT
+from seaopt.simulation import Point, Segment, run_passes
+
+PREDICTION_RADIUS = 100.0  # a plant that is held to the log may be moved far at once
+PLACES = 48  # over which a nonlinear plant is linearised for its filter
+
+
+def find_predicting_start(
+    problem: Residuals, start: Float[np.ndarray, " n"], iterations: int
+) -> Float[np.ndarray, " n"] | None:
+    """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log.
+
+    The filter does not trust the plant, so that a plant that is far off predicts badly but cannot run away; its gain
+    is made anew from where the state has been, a few times. None where that finds nothing finite.
+    """
+    problem = problem.with_each(substeps=1, loss=Squares(), band_hz=None)
+    z = start.copy()
+    for _ in range(4):
+        predicting = add_predictors(problem, z, follows=False)
+        if predicting is None:
+            return None
+        low, high = problem.unknowns.low, problem.unknowns.high
+        solution = minimise(predicting, z, low, high, first_radius=PREDICTION_RADIUS, max_iterations=iterations)
+        if not np.isfinite(solution.evaluation.cost):
+            return None
+        last, z = z, solution.z
+        problem = problem.with_sigma(estimate_sigma(predicting, solution.evaluation.power, z))
+        if np.allclose(z, last, rtol=1e-3, atol=0.0):
+            break
+    return z
+
+
+def add_predictors(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: bool) -> Residuals | None:
+    """Return the problem whose residuals are errors of prediction; None where the filter finds no finite state."""
+    predictors: dict[str, SteadyStateFilter] = {}
+    for experiment in problem.experiments:
+        predictor = _make_predictor(experiment, z)
+        if predictor is None:
+            return None
+        predictors[experiment.name] = replace(predictor, follows=follows)
+    return problem.with_values("predictor", predictors)
+
+
+def _estimate_noise(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:
+    """Return the standard deviation of white noise on each output, from its first samples that are not held out."""
+    samples, noise = experiment.segments[0].samples, []
+    for o, spread in enumerate(experiment.spread):
+        y = samples.y[o][:FIRST_SAMPLES]
+        noise.append(measure_noise(y[samples.keep[o][:FIRST_SAMPLES] > 0] if samples.keep else y, float(spread)))
+    return np.array(noise)
+
+
+def measure_noise(y: Float[np.ndarray, " n"], spread: float) -> float:
+    """Return the standard deviation of white noise on a smooth signal: the median third difference, over sqrt(20)."""
+    third = np.abs(np.diff(y[np.isfinite(y)], 3))
+    noise = 1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0
+    return max(noise, EXACT * spread, 1e-300)
+
+
+@np.errstate(all="ignore")
+def _make_predictor(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> SteadyStateFilter | None:
+    """Return a filter whose sizes and places come from its own estimates of the state, after a few rounds."""
+    model, samples, point = experiment.model, experiment.segments[0].samples, experiment.point(z)
+    places = np.zeros((PLACES, model.nx + model.nu))
+    size, sensors = _guess_state_size(experiment, point), _estimate_noise(experiment)
+    predictor = SteadyStateFilter(size=size, sensors=sensors, places=places, gain=point.gain, follows=False)
+    rows = np.linspace(0, min(samples.n, FIRST_SAMPLES) - 1, PLACES).astype(int)
+    u, y, keep = (tuple(c[:FIRST_SAMPLES] for c in channels) for channels in (samples.inputs, samples.y, samples.keep))
+    short = Segment(u=u, y=y, keep=keep, start_s=samples.start_s)
+    still = replace(point, clock=replace(point.clock, delay_free=False))
+    for _ in range(3):
+        correction = predictor.correction(model, still, np.zeros(0))
+        if not np.all(np.isfinite(correction)):
+            return None
+        settings = replace(still, correction=correction)
+        states = run_passes(model, short, settings, np.zeros((1, model.nx)), sums=False, states=True).states
+        assert states is not None
+        if not np.all(np.isfinite(states)):
+            return None
+        places = np.column_stack([states[rows], *(channel[rows] for channel in short.u)])
+        size = np.maximum(np.std(states, axis=0), 1e-9 * np.max(np.abs(size)))
+        predictor = replace(predictor, size=size, places=places)
+    return predictor
+
+
+def _guess_state_size(experiment: FitExperiment, point: Point) -> Float[np.ndarray, " nx"]:
+    """Return the size of each state that would show as the outputs' spread within ten samples."""
+    model = experiment.model
+    unit = SteadyStateFilter(
+        size=np.ones(model.nx), sensors=np.ones(model.ny), places=np.zeros((1, model.nx + model.nu)),
+        gain=np.ones(model.ny),
+    )  # fmt: skip
+    a, c = unit.linearise(model, point, point.theta[None])
+    rows, power = [], np.eye(model.nx)
+    for _ in range(10):
+        rows.append(np.max(np.abs(c[0] @ power) / experiment.spread[:, None], axis=0))
+        power = a[0] @ power
+    seen = np.max(rows, axis=0)
+    return 1.0 / np.where(np.isfinite(seen) & (seen > 0.0), seen, 1.0)

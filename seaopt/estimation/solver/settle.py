@@ -1,0 +1,117 @@
+"""From a start to the minimum: rounds of least squares, of estimating sigma, and of refining the integration step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.estimation.problem.fit_experiment import ResidualPower
+from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
+from seaopt.estimation.problem.residuals import Evaluation, Residuals
+from seaopt.estimation.solver.least_squares import DECREMENT, Callback, Solution, minimise
+from seaopt.estimation.solver.step_size import (
+    Checks,
+    StepError,
+    check_steps,
+    choose_first_steps,
+    find_worst,
+    refine_steps,
+)
+from seaopt.records import record
+
+MAX_ROUNDS = 12  # of estimating sigma and choosing the step
+UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
+ROUGH = 1.0  # squared standard deviations to the minimum, near enough to tell the sigmas
+NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
+
+
+@record(eq=False)
+class Solved:
+    """A minimum, and the problem with the sigma and the step with which it was found."""
+
+    problem: Residuals
+    solution: Solution[Evaluation]
+    step_error: StepError
+
+    @property
+    def misfit(self) -> float:
+        """A likelihood that does not depend on the sigmas that were assumed; infinite where the plant overflows."""
+        evaluation = self.solution.evaluation
+        if not np.isfinite(evaluation.cost):
+            return np.inf
+        rows = [(power.squares, power.counts) for power in evaluation.power.values()]
+        return float(sum(np.sum(n * np.log(np.maximum(s, 1e-300) / np.maximum(n, 1.0))) for s, n in rows))
+
+
+def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
+    """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
+    unknowns, iterations = problem.unknowns, 0
+    if not np.isfinite(start.cost):
+        solution = minimise(problem, start, unknowns.low, unknowns.high)
+        return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
+    problem, here = choose_first_steps(problem, start)
+    decrement = NOISE_DECREMENT if problem.predicts else DECREMENT
+    checks: Checks = {}
+    rough, before = problem.straight and not explains_little(problem, here.power), 0.0
+    if rough:  # as good a start tells the sigmas well enough to come near the minimum, and there they are told well
+        problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
+        here = problem.assemble(here.passes)
+    for attempt in range(MAX_ROUNDS):
+        solution = minimise(
+            problem, here, unknowns.low, unknowns.high, decrement=ROUGH if rough else decrement,
+            max_iterations=max(max_iterations - iterations, 1), callback=callback,
+            follow=problem.follow if problem.straight and attempt else None, before=before,  # in true sigmas
+        )  # fmt: skip
+        here, iterations = solution.evaluation, iterations + solution.iterations
+        if not np.isfinite(here.cost):
+            solution = replace(solution, iterations=iterations)
+            return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
+        sigma = estimate_sigma(problem, here.power, here.z)
+        settled = all(np.allclose(sigma[e.name], e.sigma, rtol=5e-3) for e in problem.experiments)
+        before_refining = problem = problem.with_sigma(sigma)
+        if problem.loss.quadratic:
+            here = problem.assemble(here.passes, here.z)  # other sigmas need no other passes
+        elif not settled:
+            here = problem.evaluate(here.z)
+        problem, here, checks = refine_steps(problem, here, checks if settled else {})
+        done, spent = settled and not rough and problem is before_refining, iterations >= max_iterations
+        rough, before = False, solution.before
+        if done or spent or attempt == MAX_ROUNDS - 1:
+            solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
+            if not done and spent:
+                message = f"still moving after {iterations} iterations; raise max_iterations or start closer"
+                solution = replace(solution, status="max_iterations", message=message)
+            elif not done:
+                message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
+                solution = replace(solution, status="stalled", message=message)
+            return Solved(problem=problem, solution=solution, step_error=find_worst(check_steps(problem, here, checks)))
+    raise AssertionError  # the last attempt returns
+
+
+def explains_little(problem: Residuals, power: Mapping[str, ResidualPower]) -> bool:
+    """Tell whether the residual of some output is a large part of its spread."""
+    return not all(np.all(power[e.name].rms <= UNEXPLAINED * e.spread) for e in problem.experiments)
+
+
+def estimate_sigma(
+    problem: Residuals, power: Mapping[str, ResidualPower], z: Float[np.ndarray, " n"]
+) -> dict[str, Float[np.ndarray, " ny"]]:
+    """Return the rms of each residual where sigma is not given; never less than rounding of the signal."""
+    sigma: dict[str, Float[np.ndarray, " ny"]] = {}
+    for experiment in problem.experiments:
+        rms = power[experiment.name].rms
+        if not problem.loss.quadratic:  # the standard deviation of Gaussian noise under outliers
+            weighted = compute_experiment_residuals(experiment, z).weighted
+            scales = [1.4826 * float(np.median(np.abs(r[r != 0.0]))) for r in weighted.T]
+            rms = np.array(scales) * experiment.sigma
+        # A constant output has no size of its own.
+        floor = np.maximum(1e-9 * np.where(experiment.spread > 0.0, experiment.spread, 1.0), 1e-300)
+        estimated = np.maximum(rms, floor)
+        given = experiment.data.sigma
+        sigma[experiment.name] = np.array(
+            [given.get(name, float(s)) for name, s in zip(experiment.data.outputs, estimated, strict=True)]
+        )
+    return sigma
