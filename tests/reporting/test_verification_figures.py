@@ -67,5 +67,5 @@ def test_the_table_says_how_large_and_how_far_off(stand, swing, thor):
     error = 50.0 - found.replay(row).outputs["F1"][0, -800:].mean()
     line = next(line for line in repr(found).splitlines() if "step" in line and "passed" in line)
     assert "50 N" in line and f"{error:.3g}" in line.split()
-    assert f"swing follows from {low:.3g} to " in repr(found)
+    assert f"swing tracks references between {low:.3g} and " in repr(found)
     assert "draw 1 on swing: I_p = 0.3" in repr(found)

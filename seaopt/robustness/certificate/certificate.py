@@ -82,7 +82,7 @@ class MonteCarlo:
         )
 
     def _repr_html_(self) -> str:
-        return draws_html(self)
+        return format_draws(self)
 
 
 @record
@@ -355,7 +355,7 @@ class Certificate:
         return lines
 
     def _repr_html_(self) -> str:
-        return certificate_html(self)
+        return format_certificate(self)
 
 
 def _require_simulations(simulations: Simulated) -> list[Requirement]:
@@ -419,46 +419,47 @@ _PLANT_HEAD = (
 )  # fmt: skip
 
 
-def certificate_html(found: Certificate) -> str:
-    """Return the plants, the draws, every requirement with what decides it, and what was simulated."""
-    verdict = html_paragraph(f"Certificate: {'passed' if found.passed else 'FAILED'}")
-    plants = html_table(_PLANT_HEAD, [_plant_row(found, name) for name in found.plants])
+def format_certificate(certificate: Certificate) -> str:
+    """Return as HTML the plants, the draws, every requirement with what decides it, and what was simulated."""
+    verdict = html_paragraph(f"Certificate: {'passed' if certificate.passed else 'FAILED'}")
+    plants = html_table(_PLANT_HEAD, [_format_plant(certificate, name) for name in certificate.plants])
     required = html_table(
         ("requirement", "where", "value", "limit", "met"),
         [
-            (
-                item.name,
-                item.where,
-                format_figure(item.value),
-                f"{item.sense} {format_figure(item.limit)}",
-                "yes" if item.met else "NO",
-            )
-            for item in sorted(found.requirements, key=lambda item: item.met)
+            (row.name, row.where, format_figure(row.value), f"{row.sense} {format_figure(row.limit)}",
+             "yes" if row.met else "NO")
+            for row in sorted(certificate.requirements, key=lambda row: row.met)
         ],
-    )
-    varied = html_paragraph(f"varied: {'; '.join(map(str, found.varied))}") if found.varied else ""
-    simulated = html_list(found.simulated.lines()) if found.simulated is not None else ""
-    return verdict + html_list(found.notes) + plants + varied + draws_html(found.monte_carlo) + required + simulated
-
-
-def draws_html(found: MonteCarlo) -> str:
-    """Return the numbers of draws and failures, and the bound."""
-    shown = [(field.name.replace("_", " "), getattr(found, field.name)) for field in fields(found)]
-    return html_table(
-        ("draws", ""), [(name, f"{value:.7g}") for name, value in shown if isinstance(value, (int, float))]
-    )
-
-
-def _plant_row(found: Certificate, name: str) -> tuple[str, ...]:
-    item, worst, margins = found.plants[name], found.worst[name], found.margins[name]
-    band, late = item.tracking_band_hz, margins.sampled_delay_s
+    )  # fmt: skip
+    varied = html_paragraph(f"varied: {'; '.join(map(str, certificate.varied))}") if certificate.varied else ""
+    simulated = html_list(certificate.simulated.lines()) if certificate.simulated is not None else ""
     return (
-        name, "yes" if item.stable else "NO", *map(format_figure, (item.ms, item.mt, worst.ms, worst.mt)),
-        format_figure(item.gain_margin_db, "dB"), format_figure(item.phase_margin_deg, "deg"),
-        format_figure(None if late is None else 1e3 * late, "ms"), format_figure(item.disk_margin),
-        "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", _where(worst.parameters),
+        verdict
+        + html_list(certificate.notes)
+        + plants
+        + varied
+        + format_draws(certificate.monte_carlo)
+        + required
+        + simulated
+    )
+
+
+def format_draws(draws: MonteCarlo) -> str:
+    """Return as HTML the numbers of draws and failures, and the bound."""
+    rows = [(field.name.replace("_", " "), f"{getattr(draws, field.name):.7g}") for field in fields(draws)]
+    return html_table(("draws", ""), rows)
+
+
+def _format_plant(certificate: Certificate, name: str) -> tuple[str, ...]:
+    figures, worst, margins = certificate.plants[name], certificate.worst[name], certificate.margins[name]
+    band, late = figures.tracking_band_hz, margins.sampled_delay_s
+    return (
+        name, "yes" if figures.stable else "NO", *map(format_figure, (figures.ms, figures.mt, worst.ms, worst.mt)),
+        format_figure(figures.gain_margin_db, "dB"), format_figure(figures.phase_margin_deg, "deg"),
+        format_figure(None if late is None else 1e3 * late, "ms"), format_figure(figures.disk_margin),
+        "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", _format_place(worst.parameters),
     )  # fmt: skip
 
 
-def _where(parameters: Mapping[str, float]) -> str:
+def _format_place(parameters: Mapping[str, float]) -> str:
     return ", ".join(f"{name} = {value:.4g}" for name, value in parameters.items()) or "–"

@@ -96,11 +96,11 @@ class Verification:
         lines: list[str] = []
         for name, band in self.follows_hz.items():
             if band is None:
-                lines.append(f"{name} follows no reference within 3 dB: steps do not come to theirs")
+                lines.append(f"{name} tracks no reference within 3 dB: a step does not reach its reference")
             elif band[0] > 0.0:
                 lines.append(
-                    f"{name} follows from {band[0]:.3g} to {band[1]:.3g} Hz only (within 3 dB): steps do not come to "
-                    "their reference, and need not"
+                    f"{name} tracks references between {band[0]:.3g} and {band[1]:.3g} Hz (within 3 dB); below "
+                    "that the swinging output prevents it"
                 )
         return lines
 
