@@ -94,11 +94,10 @@ def swing_peak_hz(drive: str, thor: so.ParameterSet, inertia: float) -> float:
     """Return the frequency of the largest abs(F1/F_m) of the moving output above the dip."""
     plant = so.plants.moving_output(drive=drive)
     model = plant.linearize(thor.update(I_p=inertia))
-    near = 0.0  # of two grids, the second of 0.005 Hz about the first one's largest
-    for low, high, points in ((2.0, 40.0, 381), (-0.1, 0.1, 41)):
-        f = near + np.linspace(low, high, points)
-        near = float(f[np.argmax(np.abs(model(2j * np.pi * f)[0, 0]))])
-    return near
+    f = np.linspace(2.0, 40.0, 7601)
+    coarse = 20 * int(np.argmax(np.abs(model(2j * np.pi * f[::20])[0, 0])))
+    near = f[max(coarse - 20, 0) : coarse + 21]
+    return float(near[np.argmax(np.abs(model(2j * np.pi * near)[0, 0]))])
 
 
 def inertia_for(drive: str, peak_hz: float, thor: so.ParameterSet) -> float:
