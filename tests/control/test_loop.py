@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, current_per_force, sample
-from seaopt.control.loops.response import bracketed
+from seaopt.control.loops.response import find_zeros
 
 
 def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains):
@@ -182,5 +182,5 @@ def test_zeros_in_brackets_are_found_to_rounding():
         return (x - roots[i]) * (1 + x**2)
 
     low, high, every = roots - 0.7, roots + 1.9, np.arange(4)
-    found = bracketed(curve, low, high, curve(low, every), curve(high, every), 1e-15)
+    found = find_zeros(curve, low, high, curve(low, every), curve(high, every), 1e-15)
     np.testing.assert_allclose(found, roots, rtol=1e-12, atol=1e-15)

@@ -417,6 +417,6 @@ def test_the_nu_gap_of_two_light_modes_is_that_of_a_grid_laid_about_them(hz, zet
 
 def test_peaks_that_are_not_proved_are_not_stated(monkeypatch):
     """With no round allowed, nothing is proved."""
-    monkeypatch.setattr(peaks, "MAX_ROUNDS", 0)
+    monkeypatch.setattr(peaks, "MAX_PROOF_ROUNDS", 0)
     with pytest.raises(ControlError, match="cannot be stated"):
         modal([(20.0, 0.7, 1.0)]).figures()

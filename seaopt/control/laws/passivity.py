@@ -44,7 +44,7 @@ from jaxtyping import Complex, Float
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.crossings import crossings, with_minima
+from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import Frequencies, Port, Response, held, port_of, sight
 from seaopt.control.loops.sampled_plant import DigitalPlant, hold
@@ -180,7 +180,7 @@ def passivity(
     port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
     law = controller.measurement
     impedance, angle = _curves(port, law, ts, controller.delay_samples)
-    f = with_minima(angle, with_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
+    f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
     stable = held_stable(port, law, ts, controller.delay_samples)
     bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
@@ -203,7 +203,7 @@ def measure_port(
 ) -> PortFigures:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, where it is, and whether the held loop is stable."""
     _, angle = _curves(port, law, sample_time_s, delay_samples)
-    f = with_minima(angle, _grid(port, law, sample_time_s, *band_hz))
+    f = add_minima(angle, _grid(port, law, sample_time_s, *band_hz))
     cosine = angle(f)
     least = int(np.argmin(cosine))
     stable = held_stable(port, law, sample_time_s, delay_samples)
@@ -292,7 +292,7 @@ def _bands(
     curve: Callable[[Frequencies], Frequencies], f: Frequencies
 ) -> tuple[tuple[tuple[float, float], ...], float | None]:
     """Return where the curve is not negative, and where it first is."""
-    edges = np.concatenate([f[:1], crossings(curve, f), f[-1:]])
+    edges = np.concatenate([f[:1], find_crossings(curve, f), f[-1:]])
     good = curve(np.sqrt(edges[:-1] * edges[1:])) >= 0.0
     bands: list[tuple[float, float]] = []
     for low, high, fine in zip(edges[:-1], edges[1:], good, strict=True):
@@ -309,5 +309,5 @@ def _limit(port: Port, f: Frequencies) -> float | None:
         response = port.response(x)
         return np.real(response.motor_to_port * np.conj(response.motor_to_feedback))
 
-    found = crossings(alike, f)
+    found = find_crossings(alike, f)
     return float(found[0]) if found.size else None

@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.peaks import HALF_POWER, TRACKING, measured
+from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes
 from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
-LOWEST_HZ = 1e-3
+GRID_LOWEST_HZ = 1e-3
 # A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
 # nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
 # takes longer than 11 days at 1 kHz.
@@ -111,7 +111,7 @@ class Loop:
 
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
-        base = np.geomspace(LOWEST_HZ, self.plant.nyquist_hz, 1200)
+        base = np.geomspace(GRID_LOWEST_HZ, self.plant.nyquist_hz, 1200)
         poles = np.concatenate([np.linalg.eigvals(self.plant.a), self.eigenvalues()])
         return np.union1d(base, self.about(poles))
 
@@ -122,7 +122,7 @@ class Loop:
         width = np.maximum(np.abs(1.0 - np.abs(poles)) * nyquist / np.pi, 1e-9 * nyquist)
         fan = np.concatenate([[0.0], *[[-x, x] for x in np.geomspace(0.05, 30.0, 20)]])
         near = (f0[:, None] + width[:, None] * fan).ravel()
-        return near[(near > LOWEST_HZ) & (near < nyquist)]
+        return near[(near > GRID_LOWEST_HZ) & (near < nyquist)]
 
     def figures(self) -> LoopFigures:
         """Return the loop's figures."""
@@ -134,12 +134,12 @@ class Loop:
                 sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
                 gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0, disk_margin=0.0, noise_gain=np.inf,
             )  # fmt: skip
-        found = measured(system)
+        extremes = find_extremes(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
-        (ms, mt, skew, noise, reference), ms_at = found.peaks, found.at[0]
-        crossovers, slow, below = found.crossovers, found.sensitivity_edges, found.bandwidth_edges
-        quiet = abs(found.ends[0, 0]) < HALF_POWER
-        band = _tracking_band(system, found.band_edges)
+        (ms, mt, skew, noise, reference), ms_at = extremes.peaks, extremes.at[0]
+        crossovers, slow, below = extremes.crossovers, extremes.sensitivity_edges, extremes.bandwidth_edges
+        quiet = abs(extremes.ends[0, 0]) < HALF_POWER
+        band = _tracking_band(system, extremes.band_edges)
         return LoopFigures(
             stable=True,
             spectral_radius=radius,
@@ -150,10 +150,10 @@ class Loop:
             ms=float(ms),
             mt=float(mt),
             ms_hz=float(ms_at) / per_hz,
-            reference_peak=float(reference) / found.static if found.static else np.inf,
-            gain_margin_db=_least(found.gains_db),
-            phase_margin_deg=_least(found.lags_deg),
-            delay_margin_s=_least(found.delays * self.plant.sample_time_s),
+            reference_peak=float(reference) / extremes.static if extremes.static else np.inf,
+            gain_margin_db=_least(extremes.gains_db),
+            phase_margin_deg=_least(extremes.lags_deg),
+            delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
         )

@@ -21,9 +21,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.crossings import with_minima
+from seaopt.control.loops.crossings import add_minima
 from seaopt.control.loops.loop import GROWING, STABLE, Loop
-from seaopt.control.loops.peaks import measured
+from seaopt.control.loops.peaks import find_extremes
 from seaopt.errors import ControlError
 from seaopt.records import record
 
@@ -111,23 +111,23 @@ def margins(loop: Loop) -> Margins:
             gain_up_db=0.0, gain_down_db=0.0, phase_deg=0.0, phase_hz=None, delay_s=0.0, delay_hz=None,
             gain_crossings=(), phase_crossings=(), disks={},
         )  # fmt: skip
-    found = measured(system)
+    extremes = find_extremes(system)
     hz = 1.0 / (2 * np.pi * loop.plant.sample_time_s)
-    gains, lag, delays = found.gains_db, found.lags_deg, found.delays * loop.plant.sample_time_s
+    gains, lag, delays = extremes.gains_db, extremes.lags_deg, extremes.delays * loop.plant.sample_time_s
     least, soonest = (int(np.argmin(x)) if x.size else None for x in (np.abs(lag), delays))
     disks = {
-        kind: disk(skew, float(found.at[curve]), system.sensitivity(found.at[curve : curve + 1])[0], hz)
+        kind: disk(skew, float(extremes.at[curve]), system.sensitivity(extremes.at[curve : curve + 1])[0], hz)
         for kind, (skew, curve) in SKEWS.items()
     }
     return Margins(
         gain_up_db=float(np.min(gains[gains > 0.0])) if np.any(gains > 0.0) else None,
         gain_down_db=float(np.max(gains[gains < 0.0])) if np.any(gains < 0.0) else None,
         phase_deg=None if least is None else float(lag[least]),
-        phase_hz=None if least is None else float(found.crossovers[least]) * hz,
+        phase_hz=None if least is None else float(extremes.crossovers[least]) * hz,
         delay_s=None if soonest is None else float(delays[soonest]),
-        delay_hz=None if soonest is None else float(found.crossovers[soonest]) * hz,
-        gain_crossings=_pairs(found.gain_angles * hz, found.gain_factors),
-        phase_crossings=_pairs(found.crossovers * hz, lag),
+        delay_hz=None if soonest is None else float(extremes.crossovers[soonest]) * hz,
+        gain_crossings=_pairs(extremes.gain_angles * hz, extremes.gain_factors),
+        phase_crossings=_pairs(extremes.crossovers * hz, lag),
         disks=disks,
     )
 
@@ -198,7 +198,7 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > GROWING)) for loop in (first, second)]
     if winding != outside[0] - outside[1]:
         return 1.0, None
-    f = with_minima(lambda x: -_chord(first, second, x), f)
+    f = add_minima(lambda x: -_chord(first, second, x), f)
     chord = _chord(first, second, f)
     worst = int(np.argmax(chord))
     return float(chord[worst]), float(f[worst])

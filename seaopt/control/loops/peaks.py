@@ -11,23 +11,24 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.loops.response import ClosedLoop, Indices, arcs, bracketed, sign_changes
+from seaopt.control.loops.response import ClosedLoop, Indices, find_arcs, find_sign_changes, find_zeros
 from seaopt.errors import ControlError
 from seaopt.records import record
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PROOF = 1e-7
-BASE = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
+COARSE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
 CURVES = 5
 SENSITIVITY, TRACKING = 0, 4
-REFINED = 3  # local maxima refined of each curve before the proof
-MAX_ROUNDS = 20
-BESIDE = 1e-5  # how near a pole of L on the circle -1/L is that pole's: a double one is known to the root of rounding
-RESOLVED = 1e-9
+REFINED_PER_CURVE = 3  # local maxima of each curve that are refined before the proof
+MAX_PROOF_ROUNDS = 20
+# Nearer to a pole of L on the circle -1/L is that pole's: a double one is known to the root of rounding.
+POLE_DISTANCE = 1e-5
+SMALLEST_FACTOR = 1e-9
 
 
 @record(eq=False)
-class Measured:
+class Extremes:
     """Peaks, crossings and ends of a closed loop; angles in radians a sample, ascending.
 
     Parameters
@@ -77,7 +78,7 @@ class Measured:
         return np.mod(self.crossover_phases, 2 * np.pi) / self.crossovers
 
 
-def measured(system: ClosedLoop) -> Measured:
+def find_extremes(system: ClosedLoop) -> Extremes:
     """Return the peaks and crossings of a stable closed loop.
 
     Raises
@@ -86,7 +87,7 @@ def measured(system: ClosedLoop) -> Measured:
         A peak cannot be proved.
 
     """
-    peaks, at = _candidates(system)
+    peaks, at = _find_candidates(system)
     ends = system.curves(np.array([0.0, np.pi]))
     static = float(np.abs(ends[TRACKING, 0]))
     static = static if static > 1e-9 * peaks[TRACKING] else 0.0
@@ -95,8 +96,8 @@ def measured(system: ClosedLoop) -> Measured:
     present = np.flatnonzero(peaks > 0.0)
     proofs = [system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, present)]
     pencils = [system.equal(), system.real(), *(system.modulus(k, level) for k, level in levels)]
-    edges = arcs([*pencils, *proofs])
-    peaks, at = _proved(system, peaks, at, present, edges[len(pencils) :])
+    edges = find_arcs([*pencils, *proofs])
+    peaks, at = _prove(system, peaks, at, present, edges[len(pencils) :])
     own = system.sensitivity(at[:3])
     peaks[:3] = np.abs([own[0], 1.0 - own[1], 2.0 * own[2] - 1.0])
 
@@ -106,24 +107,25 @@ def measured(system: ClosedLoop) -> Measured:
         rows += [np.abs(values[k] / level) ** 2 - 1.0 for k, level in levels]
         return np.array(rows)[which, np.arange(theta.size)]
 
-    found = sign_changes(function, edges[: len(pencils)])
-    turns = np.concatenate([[0.0], found[1], [np.pi]])
+    crossings = find_sign_changes(function, edges[: len(pencils)])
+    turns = np.concatenate([[0.0], crossings[1], [np.pi]])
     factors, angles = _gain_factors(system, turns)
-    return Measured(
-        peaks=peaks, at=at, ends=ends, static=static, crossovers=found[0], crossover_phases=_phases(system, found[0]),
-        gain_factors=factors, gain_angles=angles, sensitivity_edges=found[2],
-        bandwidth_edges=found[5] if static else np.empty(0), band_edges=np.sort(np.concatenate(found[3:5])),
+    return Extremes(
+        peaks=peaks, at=at, ends=ends, static=static,
+        crossovers=crossings[0], crossover_phases=_phases(system, crossings[0]),
+        gain_factors=factors, gain_angles=angles, sensitivity_edges=crossings[2],
+        bandwidth_edges=crossings[5] if static else np.empty(0), band_edges=np.sort(np.concatenate(crossings[3:5])),
     )  # fmt: skip
 
 
-def crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def find_crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return where abs(L) = 1, and the phase of -L there (rad); the loop need not be stable."""
 
     def function(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
         return 2.0 * system.curves(theta)[0].real - 1.0
 
-    (found,) = sign_changes(function, arcs([system.equal()]))
-    return found, _phases(system, found)
+    (angles,) = find_sign_changes(function, find_arcs([system.equal()]))
+    return angles, _phases(system, angles)
 
 
 def _phases(system: ClosedLoop, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
@@ -143,18 +145,18 @@ def _gain_factors(
     with np.errstate(divide="ignore", invalid="ignore"):
         factors = -np.real(system.sensitivity(turns) / system.curves(turns)[1])
     poles = system.opened
-    beside = np.abs(np.exp(1j * turns)[:, None] - poles) < BESIDE
+    beside = np.abs(np.exp(1j * turns)[:, None] - poles) < POLE_DISTANCE
     if np.any(beside):
         beside &= np.abs(np.abs(poles) - 1.0) <= system.resolution()
     infinite = np.any(beside, axis=1)
-    crossing = (factors > RESOLVED) & (factors < 1.0 / RESOLVED) & ~infinite
+    crossing = (factors > SMALLEST_FACTOR) & (factors < 1.0 / SMALLEST_FACTOR) & ~infinite
     return factors[crossing], turns[crossing]
 
 
-def _candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:
+def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:
     """Return the largest values on a coarse grid and at the poles, the best of each curve refined."""
     modes = np.abs(np.angle(system.poles))
-    theta = np.unique(np.concatenate([BASE, modes[modes > 1e-9]]))
+    theta = np.unique(np.concatenate([COARSE_ANGLES, modes[modes > 1e-9]]))
     values, slopes = np.abs(system.curves(theta)), system.slopes(theta)
     best = np.argmax(values, axis=1)
     peaks, at = values[np.arange(CURVES), best], theta[best]
@@ -162,11 +164,11 @@ def _candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float[np.n
     height = np.maximum(values[curve, cell], values[curve, cell + 1])
     order = np.lexsort((-height, curve))
     rank = np.arange(curve.size) - np.searchsorted(curve[order], curve[order])
-    kept = order[rank < REFINED]
-    return _climbed(system, peaks, at, curve[kept], theta[cell[kept]], theta[cell[kept] + 1])
+    kept = order[rank < REFINED_PER_CURVE]
+    return _climb(system, peaks, at, curve[kept], theta[cell[kept]], theta[cell[kept] + 1])
 
 
-def _climbed(
+def _climb(
     system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curve: Indices,
     low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
 ) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
@@ -178,7 +180,7 @@ def _climbed(
         return system.slopes(theta)[curve[which], np.arange(theta.size)]
 
     every = np.arange(curve.size)
-    top = bracketed(slope, low, high, slope(low, every), slope(high, every), 1e-8)
+    top = find_zeros(slope, low, high, slope(low, every), slope(high, every), 1e-8)
     value = np.abs(system.curves(top)[curve, every])
     peaks, at = peaks.copy(), at.copy()
     for k in range(CURVES):
@@ -189,7 +191,7 @@ def _climbed(
     return peaks, at
 
 
-def _proved(
+def _prove(
     system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curves: Int[np.ndarray, " c"],
     edges: list[Float[np.ndarray, " _"]],
 ) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
@@ -201,7 +203,7 @@ def _proved(
         That does not come to an end.
 
     """
-    for _ in range(MAX_ROUNDS):
+    for _ in range(MAX_PROOF_ROUNDS):
         own = np.repeat(curves, [row.size - 1 for row in edges])
         low, high = np.concatenate([row[:-1] for row in edges]), np.concatenate([row[1:] for row in edges])
         middle = 0.5 * (low + high)
@@ -215,10 +217,10 @@ def _proved(
                 peaks[k], at[k] = value, theta
         every = np.arange(own.size)
         rising = (system.slopes(low)[own, every] > 0.0) & (system.slopes(high)[own, every] < 0.0)
-        peaks, at = _climbed(system, peaks, at, own[rising], low[rising], high[rising])
+        peaks, at = _climb(system, peaks, at, own[rising], low[rising], high[rising])
         curves = np.unique(own)
-        edges = arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])
+        edges = find_arcs([system.modulus(k, peaks[k] * (1.0 + PROOF)) for k in map(int, curves)])
     raise ControlError(
-        f"the peaks of this loop are still rising after {MAX_ROUNDS} rounds, so that they cannot be stated; look at "
-        "modes of the plant or the law that lie closer to the unit circle than rounding resolves"
+        f"the peaks of this loop are still rising after {MAX_PROOF_ROUNDS} rounds, so that they cannot be stated; look "
+        "at modes of the plant or the law that lie closer to the unit circle than rounding resolves"
     )

@@ -40,11 +40,11 @@ from seaopt.records import record
 
 SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
 SAME_ROOT = 1e-7
-NEAR = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction
-STRAIGHT = 1e-6  # what is left of a function, of its value at the ends of that, where it is a straight line there
-MAX_STEPS = 100
+CROSSING_DISTANCE = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction of the angle
+STRAIGHT_RESIDUE = 1e-6  # of its value at both ends: less is left at the zero of the line through them if f is straight
+MAX_ZERO_STEPS = 100
 ROUNDINGS = 100 * float(np.finfo(float).eps)  # error of a sampled plant or a law, as a fraction
-LARGEST = 1e100  # entry of a loop's matrices: beyond, its eigenvalues cannot be computed
+LARGEST_ENTRY = 1e100  # entry of a loop's matrices: beyond, its eigenvalues cannot be computed
 
 Pencil = tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]
 Indices = Int[np.ndarray, " m"]
@@ -85,7 +85,7 @@ class ClosedLoop:
 
     def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "5 m"]:
         """Return S, T, S - T, C_y S and F/F_ref at angles (rad) on the unit circle."""
-        return self._named(self._solved(np.exp(1j * theta), self.right[:, :, None]), direct=True)
+        return self._combine(self._solve(np.exp(1j * theta), self.right[:, :, None]), direct=True)
 
     def sensitivity(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
@@ -106,13 +106,13 @@ class ClosedLoop:
         It has the sign of the curve's own slope, and about a resonance it is close to a straight line.
         """
         z = np.exp(1j * theta)
-        x = self._solved(z, self.right[:, :, None])
-        values: Any = self._named(x, direct=True)
-        turned: Any = self._named(self._solved(z, x), direct=False) * (-1j * z)
+        x = self._solve(z, self.right[:, :, None])
+        values: Any = self._combine(x, direct=True)
+        turned: Any = self._combine(self._solve(z, x), direct=False) * (-1j * z)
         size = np.maximum(values.real**2 + values.imag**2, 1e-150)
         return (values.real * turned.real + values.imag * turned.imag) / size**2
 
-    def _solved(self, z: Complex[np.ndarray, " m"], rhs: Complex[np.ndarray, "n 2 k"]) -> Complex[np.ndarray, "n 2 m"]:
+    def _solve(self, z: Complex[np.ndarray, " m"], rhs: Complex[np.ndarray, "n 2 k"]) -> Complex[np.ndarray, "n 2 m"]:
         """Return (zI - A)^-1 rhs in the Schur basis, by back substitution."""
         n = self.triangle.shape[0]
         x = np.zeros((n, 2, z.size), dtype=complex)
@@ -122,7 +122,7 @@ class ClosedLoop:
             x[i] = (rhs[i] + known.reshape(2, -1)) / (z - self.triangle[i, i])
         return x
 
-    def _named(self, x: Complex[np.ndarray, "n 2 m"], direct: bool) -> Complex[np.ndarray, "5 m"]:
+    def _combine(self, x: Complex[np.ndarray, "n 2 m"], direct: bool) -> Complex[np.ndarray, "5 m"]:
         """Return the five transfer functions of a state, with or without their direct terms."""
         n, _, count = x.shape
         out = (self.left @ x.reshape(n, 2 * count)).reshape(2, 2, count)
@@ -186,7 +186,7 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     c, d = np.stack([c_m, c_u]), np.stack([d_m, d_u])
     opened = np.full(n + m, np.inf + 0j)
     whole = np.block([[a, b], [c, np.zeros((2, 2))]])
-    if not np.max(np.abs(whole)) < LARGEST:
+    if not np.max(np.abs(whole)) < LARGEST_ENTRY:
         gone = np.diag(opened)
         return ClosedLoop(
             a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, ak)
@@ -195,9 +195,9 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
         scale = scale[: n + m] / np.sqrt(scale[-2] * scale[-1])
         balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
-    if all(np.all(np.isfinite(item)) for item in balanced):
+    if all(np.all(np.isfinite(matrix)) for matrix in balanced):
         a, b, c = balanced
-    triangle, basis = (np.asarray(item) for item in schur(a, output="complex")[:2])
+    triangle, basis = (np.asarray(matrix) for matrix in schur(a, output="complex")[:2])
     opened = np.concatenate([np.linalg.eigvals(ap), np.linalg.eigvals(ak)]).astype(complex)
     return ClosedLoop(
         a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened,
@@ -212,7 +212,7 @@ def _resolution(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
     if not a.size:
         return np.empty(0)
     balanced: Any = matrix_balance(a, permute=False)[0]
-    values, left, right = (np.asarray(item) for item in eig(balanced, left=True, right=True))
+    values, left, right = (np.asarray(part) for part in eig(balanced, left=True, right=True))
     with np.errstate(divide="ignore"):  # of a defective eigenvalue the two vectors are at right angles
         errors = ROUNDINGS * np.linalg.norm(balanced) / np.abs(np.sum(left.conj() * right, axis=0))
     order = np.argmin(np.abs(np.linalg.eigvals(a)[:, None] - values), axis=1)
@@ -225,7 +225,7 @@ def law_state_space(
     """Return C_r and C_y on shared states: x+ = a x + b (r, -m), u = c x + d (r, -m), in observer form."""
     den, num_r, num_y = _common(reference, measurement)
     n = max(den.size, num_r.size, num_y.size) - 1
-    den, num_r, num_y = (np.pad(item, (0, n + 1 - item.size)) for item in (den, num_r, num_y))
+    den, num_r, num_y = (np.pad(row, (0, n + 1 - row.size)) for row in (den, num_r, num_y))
     a, c = np.zeros((n, n)), np.zeros(n)
     if n:
         a[:, 0] -= den[1:]
@@ -252,7 +252,7 @@ def _common(
     return np.convolve(den_y, rest_r), np.convolve(reference.num, rest_y), np.convolve(measurement.num, rest_r)
 
 
-def arcs(pencils: Sequence[Pencil]) -> list[Float[np.ndarray, " _"]]:
+def find_arcs(pencils: Sequence[Pencil]) -> list[Float[np.ndarray, " _"]]:
     """Return, for each pencil, the angles from 0 to pi that separate where its function is positive and negative."""
     whole = _on_circle(np.stack([p[0] for p in pencils]), np.stack([p[1] for p in pencils]))
     rows = [_on_circle(m[None], k[None]) for m, k in pencils] if whole is None else list(whole[:, None])
@@ -264,15 +264,15 @@ def _on_circle(m: Float[np.ndarray, "p k k"], k: Float[np.ndarray, "p k k"]) -> 
     """Return the angles of the pencils' eigenvalues; None where one is singular, its function being constant."""
     for shift in SHIFTS:
         try:
-            found: Any = np.linalg.eigvals(np.linalg.solve(m - shift * k, k)).astype(complex)
+            inverse: Any = np.linalg.eigvals(np.linalg.solve(m - shift * k, k)).astype(complex)
         except np.linalg.LinAlgError:
             continue
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.abs(np.angle(shift + 1.0 / found))
+            return np.abs(np.angle(shift + 1.0 / inverse))
     return None
 
 
-def sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]]:
+def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]]:
     """Return, for each set of arcs, the angles at which its function changes sign.
 
     `function(theta, which)` is the function number `which` of each angle; rounding about zero has no sign.
@@ -284,24 +284,24 @@ def sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) ->
     kept = np.abs(values) > 1e-13
     theta, end, which, values = theta[kept], end[kept], which[kept], values[kept]
     flips = np.flatnonzero((values[:-1] * values[1:] < 0.0) & (which[:-1] == which[1:]))
-    own, near = which[flips], end[flips]
-    low, high = near * (1.0 - NEAR), near * (1.0 + NEAR)
-    at_low, at_high = np.split(function(np.concatenate([low, high]), np.concatenate([own, own])), 2)
+    flipped, edge = which[flips], end[flips]
+    low, high = edge * (1.0 - CROSSING_DISTANCE), edge * (1.0 + CROSSING_DISTANCE)
+    at_low, at_high = np.split(function(np.concatenate([low, high]), np.concatenate([flipped, flipped])), 2)
     tight = at_low * at_high < 0.0
-    found = low.copy()
-    found[tight] += ((high - low) * at_low / (at_low - at_high))[tight]
-    bent = tight & (np.abs(function(found, own)) > STRAIGHT * np.maximum(np.abs(at_low), np.abs(at_high)))
+    zeros = low.copy()
+    zeros[tight] += ((high - low) * at_low / (at_low - at_high))[tight]
+    bent = tight & (np.abs(function(zeros, flipped)) > STRAIGHT_RESIDUE * np.maximum(np.abs(at_low), np.abs(at_high)))
     left = np.flatnonzero(~tight | bent)  # the eigenvalue is not quite where the function is zero, or a mode is narrow
     before, after = flips[left], flips[left] + 1
     close_by, ends = bent[left], (theta[before], theta[after], values[before], values[after])
     low, high, at_low, at_high = (
         np.where(close_by, inner[left], outer) for inner, outer in zip((low, high, at_low, at_high), ends, strict=True)
     )
-    found[left] = bracketed(lambda x, i: function(x, own[left[i]]), low, high, at_low, at_high, 1e-13)
-    return [found[own == row] for row in range(len(edges))]
+    zeros[left] = find_zeros(lambda x, i: function(x, flipped[left[i]]), low, high, at_low, at_high, 1e-13)
+    return [zeros[flipped == row] for row in range(len(edges))]
 
 
-def bracketed(
+def find_zeros(
     function: Indexed, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"], at_low: Float[np.ndarray, " m"],
     at_high: Float[np.ndarray, " m"], tolerance: float,
 ) -> Float[np.ndarray, " m"]:  # fmt: skip
@@ -310,11 +310,12 @@ def bracketed(
     `function(x, i)` is evaluated at x for the brackets number i only. A bracket is done when it, or the function
     in it, is smaller than `tolerance` as a fraction of where it is, or of what it was.
     """
+    # scipy's elementwise.find_root gives the same zeros; its overhead would make `margins` of a loop 70 % slower.
     a, b, c = high.copy(), low.copy(), high.copy()  # b is the newest, a across the zero from it, c the one before
     fa, fb, fc = at_high.copy(), at_low.copy(), at_high.copy()
     fraction, small = np.full(a.size, 0.5), tolerance * np.minimum(np.abs(at_low), np.abs(at_high))
     live = np.arange(a.size)
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_ZERO_STEPS):
         if not live.size:
             break
         x = b[live] + fraction[live] * (a[live] - b[live])

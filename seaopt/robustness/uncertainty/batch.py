@@ -19,7 +19,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.loops.response import LARGEST, law_state_space
+from seaopt.control.loops.response import LARGEST_ENTRY, law_state_space
 from seaopt.control.loops.sampled_plant import DELAY, Linear, conditions, conditions_of, hold, linearised
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -155,7 +155,7 @@ def _close_piece(
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
     count = d.size
     whole = np.concatenate([a.reshape(count, -1), b, c, d[:, None]], axis=1)
-    finite = np.max(np.abs(whole), axis=1) < LARGEST  # not so of nan
+    finite = np.max(np.abs(whole), axis=1) < LARGEST_ENTRY  # not so of nan
     a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (m.ndim - 1)), m, 0.0) for m in (a, b, c, d))
     loops = compute_products(controller, a, b, c, d)
     radius = np.where(finite, np.max(np.abs(loops.closed), axis=1), np.inf)

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.loops.peaks import crossovers
+from seaopt.control.loops.peaks import find_crossovers
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -137,7 +137,7 @@ def _delay_loop(controller: Controller, plant: Plant, params: ParameterSet, part
     before = params[DELAY].value * factor(params[DELAY].unit, "s") if DELAY in params else 0.0
     delay = Parameter(name=DELAY, value=before + part * controller.sample_time_s, unit="s")
     system = controller.close(plant, params.with_parameters(delay)).system()
-    angles, phases = crossovers(system)
+    angles, phases = find_crossovers(system)
     nyquist = system.curves(np.array([np.pi]))[0, 0]
     return _DelayedLoop(
         part=part, angles=angles, phases=np.mod(phases, FULL_TURN), loud=bool(nyquist.real < 0.5),
