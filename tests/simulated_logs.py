@@ -213,33 +213,9 @@ def write_ros1(folder: Path) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(POSE, "turtlesim/msg/Pose"))
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
-    types = store.types
-    twist, vector = types["geometry_msgs/msg/Twist"], types["geometry_msgs/msg/Vector3"]
-    begin = 1_396_293_887_844_783_943
-
-    def transform(t):
-        header = types["std_msgs/msg/Header"](seq=0, stamp=types["builtin_interfaces/msg/Time"](sec=int(t), nanosec=0),
-                                              frame_id="world")  # fmt: skip
-        turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(t / 2), w=np.cos(t / 2))
-        body = types["geometry_msgs/msg/Transform"](translation=vector(x=t, y=0.0, z=0.0), rotation=turn)
-        stamped = types["geometry_msgs/msg/TransformStamped"](header=header, child_frame_id="turtle", transform=body)
-        return types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
-
-    def pose(t):
-        return types["turtlesim/msg/Pose"](x=np.float32(np.cos(t)), y=np.float32(np.sin(t)), theta=np.float32(t),
-                                           linear_velocity=np.float32(1), angular_velocity=np.float32(1))  # fmt: skip
-
-    def command(t):
-        return twist(linear=vector(x=np.sin(t), y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=t))
-
-    make = {
-        "/turtle1/pose": ("turtlesim/msg/Pose", 0.0, pose),
-        "/turtle1/cmd_vel": ("geometry_msgs/msg/Twist", 1.0, command),
-        "/tf": ("tf2_msgs/msg/TFMessage", 0.0, transform),
-        "/turtle1/color_sensor": ("std_msgs/msg/UInt8", 0.0, lambda t: types["std_msgs/msg/UInt8"](data=int(t))),
-    }  # fmt: skip
+    topics = turtle_topics(store.types)
     rows = []
-    for topic, (kind, delay, message) in make.items():
+    for topic, (kind, delay, message) in topics.items():
         times = delay + np.arange(COUNTS[topic]) * (20.0 - delay) / COUNTS[topic]
         rows += [(int(1e9 * t), topic, bytes(store.serialize_ros1(message(t), kind))) for t in times.tolist()]
     rows.sort(key=lambda row: row[0])
@@ -249,20 +225,48 @@ def write_ros1(folder: Path) -> None:
             writer.set_compression(Writer.CompressionFormat[packing])
         with writer:
             connections = {
-                topic: writer.add_connection(topic, kind, typestore=store) for topic, (kind, *_) in make.items()
+                topic: writer.add_connection(topic, kind, typestore=store) for topic, (kind, *_) in topics.items()
             }
             for stamp, topic, raw in rows:
-                writer.write(connections[topic], begin + stamp, raw)
+                writer.write(connections[topic], 1_396_293_887_844_783_943 + stamp, raw)
     with Writer(folder / "example-unsorted-chunks.bag") as writer:
         connection = writer.add_connection("foo", "std_msgs/msg/UInt8", typestore=store)
         for stamp in (3, 1, 2):
-            raw = store.serialize_ros1(types["std_msgs/msg/UInt8"](data=stamp), "std_msgs/msg/UInt8")
+            raw = store.serialize_ros1(store.types["std_msgs/msg/UInt8"](data=stamp), "std_msgs/msg/UInt8")
             writer.write(connection, stamp * 1_000_000_000, raw)
             writer.write_chunk(writer.chunks[-1])
     with Writer(folder / "no-messages.bag"):
         pass
     (folder / "empty-file.bag").write_bytes(b"")
     (folder / "asci-file.txt").write_text("this is not a bag\n")
+
+
+def turtle_topics(types) -> dict:
+    """Return type, first instant and message at an instant of each topic: a turtle that turns in a circle."""
+    twist, vector = types["geometry_msgs/msg/Twist"], types["geometry_msgs/msg/Vector3"]
+    stamp, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+
+    def pose(t):
+        one = np.float32(1)
+        return types["turtlesim/msg/Pose"](x=np.float32(np.cos(t)), y=np.float32(np.sin(t)), theta=np.float32(t),
+                                           linear_velocity=one, angular_velocity=one)  # fmt: skip
+
+    def command(t):
+        return twist(linear=vector(x=np.sin(t), y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=t))
+
+    def transform(t):
+        turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(t / 2), w=np.cos(t / 2))
+        body = types["geometry_msgs/msg/Transform"](translation=vector(x=t, y=0.0, z=0.0), rotation=turn)
+        head = header(seq=0, stamp=stamp(sec=int(t), nanosec=0), frame_id="world")
+        stamped = types["geometry_msgs/msg/TransformStamped"](header=head, child_frame_id="turtle", transform=body)
+        return types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
+
+    return {
+        "/turtle1/pose": ("turtlesim/msg/Pose", 0.0, pose),
+        "/turtle1/cmd_vel": ("geometry_msgs/msg/Twist", 1.0, command),
+        "/tf": ("tf2_msgs/msg/TFMessage", 0.0, transform),
+        "/turtle1/color_sensor": ("std_msgs/msg/UInt8", 0.0, lambda t: types["std_msgs/msg/UInt8"](data=int(t))),
+    }
 
 
 BASIC = [

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIGNAL = "#5b6570"
-GAP, STUCK, CLIPPED, MISSING, WILD, HUM = "#e69f00", "#cc79a7", "#d55e00", "#0072b2", "#009e73", "#d55e00"
+SIGNAL_COLOUR = "#5b6570"
+GAP_COLOUR, STUCK_COLOUR, MISSING_COLOUR, OUTLIER_COLOUR = "#e69f00", "#cc79a7", "#0072b2", "#009e73"
+CLIPPED_COLOUR = HUM_COLOUR = "#d55e00"
 MOST_MARKS = 200  # marks of a kind in a panel: more are a blur
 BINS = 600  # of time, each drawn as its least and largest value
 PANEL_HEIGHT = 1.75  # inches
@@ -96,9 +97,9 @@ def _draw_steps(axis: Axes, time: Float[np.ndarray, " n"], quality: Quality) -> 
     clock, step = quality.clock, np.diff(time)
     step = np.where(np.abs(step) > 3.0 * clock.period, np.nan, step)
     _draw_range(axis, time[1:], 1e3 * step, clock.gaps - 1)
-    axis.axhline(1e3 * clock.period, color=MISSING, linewidth=0.8, label="period")
+    axis.axhline(1e3 * clock.period, color=MISSING_COLOUR, linewidth=0.8, label="period")
     _mark_gaps(axis, time, clock)
-    _mark_lines(axis, time, np.concatenate([clock.repeated, clock.backwards]), CLIPPED, "repeated or backwards")
+    _mark_lines(axis, time, np.concatenate([clock.repeated, clock.backwards]), CLIPPED_COLOUR, "repeated or backwards")
     # A perfect clock is drawn as a line, not as its rounding.
     spread = max(1.2e3 * float(np.nanmax(np.abs(step - clock.period), initial=0.0)), 20.0 * clock.period)
     axis.set_ylim(1e3 * clock.period - spread, 1e3 * clock.period + spread)
@@ -117,10 +118,10 @@ def _draw_excitation(axis: Axes, quality: Quality) -> None:
     for name, excitation in quality.excitation.items():
         middle = [float(np.sqrt(band.low_hz * band.high_hz)) for band in excitation.bands]
         height = [band.coherence if band.coherence is not None else np.nan for band in excitation.bands]
-        axis.plot(middle, height, color=SIGNAL, linewidth=1.2, drawstyle="steps-mid")
+        axis.plot(middle, height, color=SIGNAL_COLOUR, linewidth=1.2, drawstyle="steps-mid")
         if excitation.usable_hz is not None:
             label = f"{name}: band that identifies a model"
-            axis.axvspan(*excitation.usable_hz, color=MISSING, alpha=0.12, linewidth=0.0, label=label)
+            axis.axvspan(*excitation.usable_hz, color=MISSING_COLOUR, alpha=0.12, linewidth=0.0, label=label)
 
 
 def _draw_in_time(
@@ -132,15 +133,15 @@ def _draw_in_time(
 ) -> None:
     _draw_range(axis, time, values, quality.clock.gaps)
     _mark_gaps(axis, time, quality.clock)
-    _mark_spans(axis, time, channel.missing, MISSING, "missing")
-    _mark_spans(axis, time, channel.stuck, STUCK, "stuck")
+    _mark_spans(axis, time, channel.missing, MISSING_COLOUR, "missing")
+    _mark_spans(axis, time, channel.stuck, STUCK_COLOUR, "stuck")
     for rail in channel.rails:
-        axis.axhline(rail.value, color=CLIPPED, linewidth=1.0, linestyle="--", label="flat top")
+        axis.axhline(rail.value, color=CLIPPED_COLOUR, linewidth=1.0, linestyle="--", label="flat top")
     rows = channel.outliers[:MOST_MARKS]
     if rows.size:
-        axis.plot(time[rows], values[rows], "o", color=WILD, markersize=4, fillstyle="none", label="outlier")
+        axis.plot(time[rows], values[rows], "o", color=OUTLIER_COLOUR, markersize=4, fillstyle="none", label="outlier")
     if channel.counter is not None:
-        _mark_lines(axis, time, channel.counter.rows, GAP, "lost, by the counter")
+        _mark_lines(axis, time, channel.counter.rows, GAP_COLOUR, "lost, by the counter")
     axis.set_ylabel(f"{channel.name} [{channel.unit}]" if channel.unit else channel.name)
 
 
@@ -153,7 +154,7 @@ def _draw_range(
         if last - first < 2:
             continue
         low, high, at = envelope(values[first:last], time[first:last], max(2, BINS * (last - first) // time.size))
-        axis.fill_between(at, low, high, color=SIGNAL, linewidth=0.8)
+        axis.fill_between(at, low, high, color=SIGNAL_COLOUR, linewidth=0.8)
 
 
 def _mark_spans(axis: Axes, time: Float[np.ndarray, " n"], runs: RowRanges, colour: str, label: str) -> None:
@@ -164,7 +165,7 @@ def _mark_spans(axis: Axes, time: Float[np.ndarray, " n"], runs: RowRanges, colo
 
 
 def _mark_gaps(axis: Axes, time: Float[np.ndarray, " n"], clock: ClockQuality) -> None:
-    _mark_spans(axis, time, RowRanges(start=clock.gaps - 1, stop=clock.gaps + 1), GAP, "gap")
+    _mark_spans(axis, time, RowRanges(start=clock.gaps - 1, stop=clock.gaps + 1), GAP_COLOUR, "gap")
 
 
 def _mark_lines(
@@ -186,7 +187,7 @@ def _draw_in_frequency(axis: Axes, channel: ChannelQuality, quality: Quality) ->
     f, n = spectra.frequency_hz[1:], 2 * (spectra.frequency_hz.size - 1)
     density = np.sqrt(2.0 * spectra.power(channel.name)[1:] * spectra.period / (0.375 * n))  # Hann's mean square is 3/8
     top = float(np.max(density))
-    axis.plot(f, np.maximum(density, 1e-12 * top), color=SIGNAL, linewidth=0.9)
+    axis.plot(f, np.maximum(density, 1e-12 * top), color=SIGNAL_COLOUR, linewidth=0.9)
     axis.set_ylim(max(float(np.min(density)), 1e-6 * top) / 2.0, 3.0 * top)
     for line in channel.hum.lines_hz if channel.hum is not None else ():
-        axis.axvline(line, color=HUM, linewidth=0.8, linestyle=":", label="mains")
+        axis.axvline(line, color=HUM_COLOUR, linewidth=0.8, linestyle=":", label="mains")

@@ -34,8 +34,8 @@ def table(log, time=None, **changed):
     return Table(time=log.time.copy() if time is None else time, signals=signals, source="test")
 
 
-def grave(found):
-    return [(item.kind, item.channel) for item in found.findings if item.severity in GRAVE]
+def grave(quality):
+    return [(item.kind, item.channel) for item in quality.findings if item.severity in GRAVE]
 
 
 def test_a_clean_log_has_no_fault(short_log):
@@ -70,34 +70,34 @@ def test_the_clock_s_faults_are_counted(short_log):
     time[1500] = np.nan
     time[3000:] += 0.1  # 40 samples
     time[6000:] += 0.025  # 10 samples
-    found = assess_quality(table(short_log, time))
-    assert found.of("duplicate")[0].count == 1
-    assert found.of("duplicate")[0].where_s[0][0] == pytest.approx(time[500])
-    assert found.of("backwards")[0].count == 1
-    assert found.of("time_missing")[0].count == 1
-    gap = max(found.of("gap"), key=lambda item: item.value)
+    quality = assess_quality(table(short_log, time))
+    assert quality.of("duplicate")[0].count == 1
+    assert quality.of("duplicate")[0].where_s[0][0] == pytest.approx(time[500])
+    assert quality.of("backwards")[0].count == 1
+    assert quality.of("time_missing")[0].count == 1
+    gap = max(quality.of("gap"), key=lambda item: item.value)
     assert gap.value >= 50
     assert (time[2999], time[3000]) in gap.where_s and (time[5999], time[6000]) in gap.where_s
-    assert found.clock.lost[list(found.clock.gaps).index(3000)] == 40
+    assert quality.clock.lost[list(quality.clock.gaps).index(3000)] == 40
 
 
 def test_jitter_is_measured(short_log):
     rng = np.random.default_rng(0)
     shaken = short_log.time + 0.0025 * rng.uniform(-0.1, 0.1, len(short_log))
-    found = assess_quality(table(short_log, shaken))
+    quality = assess_quality(table(short_log, shaken))
     step = np.diff(shaken)
-    assert found.clock.jitter_rms == pytest.approx(np.std(step), rel=1e-3)
-    assert found.clock.jitter_max == pytest.approx(np.max(np.abs(step - 0.0025)), rel=1e-2)
-    assert not found.clock.rounded_only
-    assert "log.resample(rate_hz=400)" in found.of("jitter")[0].sentence
+    assert quality.clock.jitter_rms == pytest.approx(np.std(step), rel=1e-3)
+    assert quality.clock.jitter_max == pytest.approx(np.max(np.abs(step - 0.0025)), rel=1e-2)
+    assert not quality.clock.rounded_only
+    assert "log.resample(rate_hz=400)" in quality.of("jitter")[0].sentence
 
 
 @pytest.mark.parametrize("how", [np.round, np.floor])
 def test_rounded_timestamps_are_told_from_jitter(short_log, how):
-    found = assess_quality(table(short_log, how(short_log.time * 1000) / 1000))
-    assert found.clock.rounded_only
-    assert found.clock.rounding == pytest.approx(1e-3)
-    assert "log.restamp()" in found.of("jitter")[0].sentence
+    quality = assess_quality(table(short_log, how(short_log.time * 1000) / 1000))
+    assert quality.clock.rounded_only
+    assert quality.clock.rounding == pytest.approx(1e-3)
+    assert "log.restamp()" in quality.of("jitter")[0].sentence
 
 
 def test_small_jitter_is_no_finding(short_log):
@@ -153,21 +153,21 @@ def test_a_held_channel_says_its_own_rate(short_log):
 def test_clipping_is_found_and_measured(short_log, share, sides):
     limit = share * np.max(np.abs(short_log["F1"]))
     clipped = np.clip(short_log["F1"], -limit if sides == "both" else -np.inf, limit)
-    found = assess_quality(table(short_log, F1=clipped))
-    assert {rail.side for rail in found.channels["F1"].rails} == ({"low", "high"} if sides == "both" else {"high"})
-    assert all(rail.clear for rail in found.channels["F1"].rails)
-    assert found.channels["F1"].saturated == np.count_nonzero(np.abs(clipped) == limit)
-    assert {item.severity for item in found.of("clipping")} == {"warning"}
-    assert not found.of("stuck")
+    quality = assess_quality(table(short_log, F1=clipped))
+    assert {rail.side for rail in quality.channels["F1"].rails} == ({"low", "high"} if sides == "both" else {"high"})
+    assert all(rail.clear for rail in quality.channels["F1"].rails)
+    assert quality.channels["F1"].saturated == np.count_nonzero(np.abs(clipped) == limit)
+    assert {item.severity for item in quality.of("clipping")} == {"warning"}
+    assert not quality.of("stuck")
 
 
 def test_clipping_is_found_behind_an_outlier_and_a_converter(short_log):
     limit = 0.7 * np.max(np.abs(short_log["F1"]))
     clipped = 0.25 * np.round(np.clip(short_log["F1"], -limit, limit) / 0.25)
     clipped[1000] = 3 * limit
-    found = assess_quality(table(short_log, F1=clipped)).channels["F1"]
-    assert [rail.clear for rail in found.rails] == [True, True]
-    assert found.outliers.tolist() == [1000]
+    quality = assess_quality(table(short_log, F1=clipped)).channels["F1"]
+    assert [rail.clear for rail in quality.rails] == [True, True]
+    assert quality.outliers.tolist() == [1000]
 
 
 @pytest.mark.parametrize("kind", ["sine", "square", "rest"])
@@ -185,9 +185,9 @@ def test_what_is_no_clipping(kind):
 @pytest.mark.parametrize("step", [0.5, 7.0, 1e-3])
 def test_the_quantisation_step_is_found(short_log, step):
     rounded = step * np.round(short_log["F1"] / step) + 0.3
-    found = assess_quality(table(short_log, F1=rounded))
-    assert found.channels["F1"].quantum == pytest.approx(step, rel=1e-6)
-    assert found.channels["F2"].quantum == 0.0
+    quality = assess_quality(table(short_log, F1=rounded))
+    assert quality.channels["F1"].quantum == pytest.approx(step, rel=1e-6)
+    assert quality.channels["F2"].quantum == 0.0
 
 
 def test_outliers_are_found_where_they_are(short_log):
@@ -200,11 +200,11 @@ def test_outliers_are_found_where_they_are(short_log):
 def test_hum_is_measured(stand_log, mains):
     t = stand_log.time
     hum = 5.0 * np.sin(2 * np.pi * mains * t) + 3.0 * np.sin(2 * np.pi * 3 * mains * t + 1)
-    found = assess_quality(table(stand_log, F1=stand_log["F1"] + hum)).channels
-    assert found["F1"].hum.mains_hz == mains
-    assert found["F1"].hum.lines_hz == (mains, 3 * mains)
-    assert found["F1"].hum.rms == pytest.approx(np.sqrt((25 + 9) / 2), rel=0.1)
-    assert found["F2"].hum is None
+    quality = assess_quality(table(stand_log, F1=stand_log["F1"] + hum)).channels
+    assert quality["F1"].hum.mains_hz == mains
+    assert quality["F1"].hum.lines_hz == (mains, 3 * mains)
+    assert quality["F1"].hum.rms == pytest.approx(np.sqrt((25 + 9) / 2), rel=0.1)
+    assert quality["F2"].hum is None
 
 
 @pytest.mark.parametrize("delay", [-3.0, 0.4, 2.3, 40.75])
@@ -222,9 +222,9 @@ def test_delays_are_found_to_a_fraction_of_a_sample(delay):
 
 
 def test_a_sign_flip_is_an_error(short_log):
-    found = assess_quality(table(short_log, F2=-short_log["F2"]))
-    assert found.of("sign")[0].severity == "error"
-    assert "opposite sign" in found.of("sign")[0].sentence
+    quality = assess_quality(table(short_log, F2=-short_log["F2"]))
+    assert quality.of("sign")[0].severity == "error"
+    assert "opposite sign" in quality.of("sign")[0].sentence
 
 
 def test_excitation_says_what_it_reaches(stand, thor):
@@ -264,10 +264,10 @@ def test_a_counter_shows_lost_samples(recorded):
 def test_a_swung_pendulum_s_encoder_is_not_stuck(recorded):
     rows = np.genfromtxt(recorded("ak80") / "data_measured.csv", delimiter=",", skip_header=1)
     log = so.Log.from_arrays(time=rows[:, 0], position=rows[:, 1], velocity=rows[:, 2], torque=rows[:, 3])
-    found = assess_quality(log, inputs=["torque"])
-    assert grave(found) == []
-    assert found.channels["position"].quantum == pytest.approx(0.0029145, rel=1e-4)
-    assert found.clock.rate_hz == pytest.approx(500, rel=1e-3)
+    quality = assess_quality(log, inputs=["torque"])
+    assert grave(quality) == []
+    assert quality.channels["position"].quantum == pytest.approx(0.0029145, rel=1e-4)
+    assert quality.clock.rate_hz == pytest.approx(500, rel=1e-3)
 
 
 def test_a_two_mass_drive_is_clean_and_its_load_angle_turned_around(recorded):
@@ -276,20 +276,20 @@ def test_a_two_mass_drive_is_clean_and_its_load_angle_turned_around(recorded):
         time=content["time"], I=content["iq_adx"], motor=content["theta_mx"], load=content["theta_my"],
         units={"time": "us", "I": "A", "motor": "rad", "load": "rad"},
     )  # fmt: skip
-    found = log.quality
-    assert grave(found) == []
-    assert next(item for item in found.pairs if item.first == "motor").correlation < -0.8
+    quality = log.quality
+    assert grave(quality) == []
+    assert next(item for item in quality.pairs if item.first == "motor").correlation < -0.8
 
 
 def test_the_report_is_strict_json(short_log):
     broken = short_log["F1"].copy()
     broken[:30] = np.nan
-    found = assess_quality(table(short_log, F1=broken, F2=np.full(len(short_log), np.nan)))
-    content = json.loads(to_json(found.to_dict()))
+    quality = assess_quality(table(short_log, F1=broken, F2=np.full(len(short_log), np.nan)))
+    content = json.loads(to_json(quality.to_dict()))
     assert content["schema"] == "seaopt/quality/1"
     assert content["channels"]["F1"]["missing"] == 30
     assert content["counts"]["error"] == 1
-    assert "missing" in repr(found) and "<table>" in found._repr_html_()
+    assert "missing" in repr(quality) and "<table>" in quality._repr_html_()
 
 
 @pytest.mark.parametrize(
@@ -333,8 +333,8 @@ def test_whatever_the_numbers_a_report_or_a_seaopt_error(seed, pool, steps, n):
         "F2": Signal(name="F2", values=np.repeat(rng.choice(np.array(pool), -(-n // 3)), 3)[:n], unit="N"),
     }
     try:
-        found = assess_quality(Table(time=time, signals=signals, source="any"))
+        quality = assess_quality(Table(time=time, signals=signals, source="any"))
     except LogError:
         return
-    json.loads(to_json(found.to_dict()))
-    assert repr(found)
+    json.loads(to_json(quality.to_dict()))
+    assert repr(quality)

@@ -105,6 +105,7 @@ def _walk_variable(file: Any, node: Any, path: Path, name: str, depth: int) -> F
     import h5py
 
     if isinstance(node, h5py.Group):
+        # A struct array keeps, per field, references to the values of its elements.
         if any(_is_struct_array(child) for child in node.values()):
             for key, child in node.items():
                 for number, reference in enumerate(child[()].ravel()[:MAX_FIELDS], start=1):

@@ -73,6 +73,7 @@ def find_layout(path: Path) -> TextLayout:
         raise LogError(f"{path}: the file holds no data, only comments or blank lines; record the log again")
     sample = [line for _, line in filled[-SAMPLE_LINES:]]
     delimiter, comma = _find_delimiter(sample, filled[0][1])
+    # The usual number of cells is the number of columns; a short row lacks its last cells.
     width = Counter(len(split_cells(line, delimiter)) for line in sample).most_common(1)[0][0]
     first = next((at for at, line in filled if _is_data(line, delimiter, comma, width)), None)
     if first is None:  # the header is the first line, and text stands in every row below it

@@ -54,6 +54,7 @@ def decimate(
             f"{log.source}: decimation by {factor} needs {taps.size + factor + 1} samples without a gap and the "
             f"longest stretch has {longest}; decimate by less"
         )
+    # The filter has linear phase: an output stands for the middle of its taps.
     time = np.concatenate([log.time[piece.start + half : piece.stop - half : factor] for piece in pieces])
     values = {
         name: np.concatenate([_filter(signal.values[piece], taps, factor) for piece in pieces])

@@ -79,6 +79,7 @@ def restamp(log: Recording, period: float) -> tuple[Float[np.ndarray, " n"], str
     for stretch in split_at_gaps(log.time, GAP * period):
         stamps = log.time[stretch]
         line = period * np.arange(stamps.size)
+        # Rounding moves a stamp by at most half a step, so all of them lie within one step; two allow for the period.
         deviations = stamps - line
         if np.ptp(deviations) > 2.0 * resolution + 1e-9 * period:
             raise LogError(

@@ -81,6 +81,7 @@ def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     onward = step[step > 0.0]
     if not onward.size:
         raise LogError(f"{source}: time never increases; name the column that is the clock")
+    # The mean is insensitive to rounded stamps, the median only tells the gaps.
     period = float(np.mean(onward[onward <= GAP * np.median(onward)]))
     across = step > GAP * period
     inside = step[(step > 0.0) & ~across]
@@ -120,6 +121,7 @@ def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
     """
     step = np.diff(time[:ROUNDING_STEPS])
     noise = 16.0 * np.finfo(float).eps * float(np.max(np.abs(time[: step.size + 1])))
+    # Differences of rounded stamps are whole multiples of the rounding step, up to the noise of floats.
     kinds = np.unique(step)
     apart = np.diff(kinds)
     apart = apart[apart > noise]

@@ -126,12 +126,14 @@ def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) ->
     # Gains are all of one output, or they could not be compared.
     loudest = max(answering, key=lambda name: float(power @ coherences[name]), default=None)
     gains = np.abs(spectra.cross(channel, loudest)[1:]) / np.maximum(power, 1e-300) if loudest is not None else None
+    # Third octaves with the lowest line at the middle of the first.
     count = int(np.ceil(3.0 * np.log2(f[-1] / f[0]))) + 1
     edges = f[0] * 2.0 ** ((np.arange(count + 1) - 0.5) / 3.0)
     places = np.digitize(f, edges) - 1
     rows = [np.flatnonzero(places == k) for k in range(count)]
     sums = np.array([np.sum(power[row]) for row in rows])
     densities = np.array([np.mean(power[row]) if row.size else 0.0 for row in rows])
+    # A sine fills one line of a wide band, noise all of it: judged by power and by density, each counts as excited.
     with np.errstate(divide="ignore"):
         levels = 10.0 * np.log10(np.maximum(sums / np.max(sums), densities / np.max(densities)))
     bands: list[ThirdOctave] = []

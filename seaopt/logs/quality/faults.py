@@ -118,6 +118,7 @@ def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
     apart = np.diff(kinds)
     apart = apart[apart > 1e-9 * float(kinds[-1] - kinds[0])]
     least = float(np.min(apart))
+    # The least difference may be several steps where a level next to another never occurs.
     for parts in (1, 2, 3, 4, 5):
         step = least / parts
         counts = np.round(apart / step)
@@ -139,6 +140,7 @@ def find_outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.nda
     some = np.arange(0, values.size, max(1, values.size // FEW_WINDOWS))
     usual = _distances(values, some)[1]
     floor = max(OUTLYING * 1.4826 * float(np.median(usual)), 2.0 * quantum) if usual.size else np.inf
+    # A cheap test first: nearly every sample lies near the line between its neighbours.
     bend = np.abs(values[1:-1] - 0.5 * (values[2:] + values[:-2]))
     bent = bend > 0.25 * floor  # an outlier is, by its height, and its neighbours by half of that
     near = np.zeros(values.size, dtype=bool)
@@ -178,6 +180,7 @@ def find_rails(values: Float[np.ndarray, " n"], quantum: float, still: float) ->
         return []
     flat_edges: list[Rail] = []
     low, high = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))
+    # Samples at the edge are compared with those on the four levels below it, where a smooth signal has as many.
     level = quantum if quantum else 1e-3 * (high - low)
     alike = max(0.01 * quantum, 1e-12 * (high - low))
     for side, edge in (("low", low), ("high", high)):
@@ -255,6 +258,7 @@ def find_counter_losses(values: Float[np.ndarray, " n"]) -> CounterLosses | None
     if changes.size < 8:
         return None
     up = step[changes - 1]
+    # A counter that wraps falls by its modulus: the range of the log itself, or that of an integer type.
     for modulus in (np.ptp(values) + 1.0, 2.0**8, 2.0**16, 2.0**32):
         turned = np.where(up < 0.0, up + modulus, up)
         if np.all(turned > 0.0) and np.mean(turned == 1.0) >= REGULAR:

@@ -56,12 +56,14 @@ def correlate_channels(spectra: Spectra, first: str, second: str) -> ChannelPair
     if min(powers) <= 0.0:
         return None
     cross = spectra.cross(first, second)
+    # Zeros above the Nyquist frequency interpolate the correlation between samples.
     fine = 2 * (cross.size - 1) * LAGS_PER_SAMPLE
     rho = LAGS_PER_SAMPLE * np.fft.irfft(cross, fine) / np.sqrt(powers[0] * powers[1])
     reach = rho.size // 4
     lags = np.arange(-reach, reach + 1)
     near = rho[lags]  # negative lags are at the end
     best = int(np.argmax(np.abs(near)))
+    # The vertex of the parabola through the three lags around the largest: a fraction of a fine lag.
     shift = 0.0
     if 0 < best < near.size - 1:
         below, top, above = np.sign(near[best]) * near[best - 1 : best + 2]

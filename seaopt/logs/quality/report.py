@@ -170,6 +170,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     clock = assess_clock(data.time, data.source)
     channels = {name: assess_channel(signal) for name, signal in data.signals.items()}
     channels = {name: _judge_stuck_runs(channel, channels, data) for name, channel in channels.items()}
+    # A constant has no spectrum, and a counter one that means nothing.
     varying = {name: data.signals[name].values for name, channel in channels.items() if _varies(channel)}
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
     spectra = compute_spectra(varying, _stretches(clock, len(data)), clock.period)

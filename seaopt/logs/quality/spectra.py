@@ -90,6 +90,7 @@ def compute_spectra(
     if starts.size > MOST_STRETCHES:
         starts = starts[np.linspace(0, starts.size - 1, MOST_STRETCHES).astype(int)]
     cuts = {name: np.stack([values[start : start + length] for start in starts]) for name, values in channels.items()}
+    # A channel with holes everywhere is left out; then a stretch with a hole in any other channel.
     holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED_SHARE for name, cut in cuts.items()}
     kept = [name for name in cuts if np.mean(holed[name]) <= 0.5]
     whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(starts.size, dtype=bool)
@@ -132,8 +133,10 @@ def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
         return None
     square = np.abs(spectra.channels[name]) ** 2
     steady = np.median(square, axis=0)
+    # What an input is coherent with is the plant's answer, not hum.
     coherences = [spectra.coherence(other, name) for other in inputs if other in spectra.channels and other != name]
     incoherent = 1.0 - np.max(coherences, axis=0) if coherences else np.ones(f.size)
+    # The fewer averages, the further a bin of noise alone stands out.
     limit = LINE_HEIGHT * (1.0 + 2.0 / np.sqrt(spectra.averages))
     for mains in MAINS_HZ:
         lines: list[tuple[float, float, float]] = []

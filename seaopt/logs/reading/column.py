@@ -100,6 +100,7 @@ def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> in
     16
 
     """
+    # Small numbers of either sign leave the middle half of the unsigned range empty.
     bits = next((bits for bits in (8, 16, 32) if 0.75 * 2**bits <= high < 2**bits and 0 <= low < 0.25 * 2**bits), None)
     if bits is None:
         return None

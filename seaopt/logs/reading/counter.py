@@ -91,6 +91,7 @@ def _count_losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.nd
     """Return where each count but the first begins, and how many samples are missing before it."""
     starts = np.flatnonzero(np.diff(values)) + 1
     skipped = (np.diff(values)[starts - 1].astype(int) - 1) * each
+    # A count that was held for fewer samples than usual lost the others.
     lengths = np.diff(np.concatenate([[0], starts]))
     missing = np.maximum(each - lengths, 0)
     missing[:1] = 0  # the recording may begin within a count

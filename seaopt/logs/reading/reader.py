@@ -37,7 +37,7 @@ def read_table(
     Parameters
     ----------
     path : path, or several
-        CSV and other text, MAT, HDF5, Parquet, NPZ, JSON, ROS bags, MCAP, MDF or TDMS, told by content.
+        CSV and other text, MAT, HDF5, Parquet, NPZ, JSON, ROS bags, MCAP, MDF or TDMS, recognised by content.
     time : str or Column, optional
         The clock: a column, or in a bag a topic. Where it is left out, the format's own clock, or the one column that
         is named like a time.
@@ -170,6 +170,7 @@ def _read_channels(
         notes.append(note)
     arrays |= _separate_arrays(on_clock, columns)
     others = [channel.clock for channel in chosen.channels.values() if channel.clock != chosen.clock]
+    # Each other clock is read once, for all of its channels.
     for other in dict.fromkeys(others):
         group = {name: channel for name, channel in chosen.channels.items() if channel.clock == other}
         columns, time = _read_clock(

@@ -238,6 +238,7 @@ def _find_channel_clock(
                 f'{reference.length}; give it its own with Column(column=..., time="...")'
             )
         return _shift_clock(clock, column)
+    # Another clock: the format's own, or in another file the column named like the log's clock.
     if field.clock is not None:
         known = Column(column=field.clock)
     elif source is not clock.source:
