@@ -11,7 +11,6 @@ Every bound is a theorem but for rounding, which is estimated at every step and 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -113,19 +112,7 @@ class Bracket:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what robustness.json keeps with the worst case."""
-        return {name: getattr(self, name) for name in self._stored_names()}
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Bracket:
-        """Return what robustness.json keeps; bounds that are missing are infinite, as JSON has no infinity."""
-        stored: dict[str, Any] = {
-            name: np.inf if content[name] is None else content[name] for name in cls._stored_names()
-        }
-        return cls(**stored)
-
-    @classmethod
-    def _stored_names(cls) -> list[str]:
-        return [field.name for field in fields(cls) if field.name != "parameters"]
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "parameters"}
 
     def __repr__(self) -> str:
         return f"Bracket(Ms from {self.ms_lower:.5g}, Mt from {self.mt_lower:.5g}; {self.statement})"

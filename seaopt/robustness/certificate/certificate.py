@@ -241,41 +241,41 @@ class Certificate:
             A field is missing or malformed.
 
         """
+        from seaopt.robustness.certificate.stored import REMEDY, read_certificate  # deferred: pydantic
+
+        stored = read_certificate(content)
         if controller.design is not None:  # certified too where nobody listed it
             models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
+        for name in stored.plants:
+            if name not in models:
+                raise FileError(f'robustness.json: plants has "{name}", which is not a plant given; {REMEDY}')
         try:
-            models = {name: models[name] for name in content["plants"]}
-            worst = {
-                name: measure_worst(controller, models[name], parameters, table["worst"]["parameters"])
-                for name, table in content["plants"].items()
-            }
-            requirements = tuple(Requirement(**_read_infinite(row)) for row in content["requirements"])
+            models = {name: models[name] for name in stored.plants}
+            requirements = tuple(Requirement(**row.model_dump()) for row in stored.requirements)
+            bounds = {name: plant.worst.bounds for name, plant in stored.plants.items()}
             certificate = cls(
                 passed=all(row.met for row in requirements),
                 requirements=requirements,
-                plants={name: controller.close(models[name], parameters).figures() for name in worst},
-                margins={name: plant_margins(controller, models[name], parameters) for name in worst},
-                worst=worst,
-                monte_carlo=MonteCarlo(**content["monte_carlo"]),
+                plants={name: controller.close(plant, parameters).figures() for name, plant in models.items()},
+                margins={name: plant_margins(controller, plant, parameters) for name, plant in models.items()},
+                worst={
+                    name: measure_worst(controller, plant, parameters, stored.plants[name].worst.parameters)
+                    for name, plant in models.items()
+                },
+                monte_carlo=MonteCarlo(**stored.monte_carlo.model_dump()),
                 controller=controller,
                 models=models,
                 parameters=parameters,
-                varied=tuple(_read_varied(table) for table in content.get("varied", [])),
-                brackets={
-                    name: Bracket.from_dict(table["worst"])
-                    for name, table in content["plants"].items()
-                    if "ms_upper" in table["worst"]
-                },
+                varied=tuple(Varied(**row.model_dump()) for row in stored.varied),
+                brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
             )
-            simulation = content.get("simulation")
-            if simulation is None:
+            played = stored.simulation
+            if played is None:
                 return certificate
-            sensors = Sensors(**simulation["sensors"])
-            return replace(
-                certificate, simulated=certificate._simulate(sensors, simulation["current_step_A"], simulation["seed"])
-            )
-        except (KeyError, TypeError, ValueError, AttributeError, SeaoptError) as error:
-            raise FileError(f"robustness.json: {error} is missing or malformed; certify again") from error
+            sensors = Sensors(**played.sensors.model_dump())
+            return replace(certificate, simulated=certificate._simulate(sensors, played.current_step_A, played.seed))
+        except SeaoptError as error:
+            raise FileError(f"robustness.json: {error}; {REMEDY}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/1)."""
@@ -392,21 +392,6 @@ def _format_signed(value: float | None) -> str:
 def _format_confidence(value: float) -> str:
     rest = 1.0 - value
     return f"1 - {rest:.0e}" if rest < 1e-3 else f"{value:.3%}"
-
-
-def _read_varied(table: Mapping[str, Any]) -> Varied:
-    """Return what is varied; JSON has no infinity, so that a missing bound is one."""
-    ends = {
-        "low": -np.inf if table["low"] is None else table["low"],
-        "high": np.inf if table["high"] is None else table["high"],
-    }
-    fields_of: dict[str, Any] = {**table, **ends}
-    return Varied(**fields_of)
-
-
-def _read_infinite(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields with null read as infinite: JSON has no infinity."""
-    return {key: np.inf if value is None else value for key, value in row.items()}
 
 
 def _list_fields(data: Any) -> dict[str, Any]:

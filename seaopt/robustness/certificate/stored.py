@@ -1,0 +1,112 @@
+"""What a certificate needs of its robustness.json, as pydantic models; all other figures are computed again.
+
+Null stands for what is infinite: the value of a requirement that an unstable plant breaks, a bound that is not proven.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
+from seaopt.files import plain
+
+REMEDY = "certify again"
+
+
+class StoredRequirement(ResultTable):
+    """A figure against its limit."""
+
+    name: str
+    limit: NullIsInfinite
+    value: NullIsInfinite
+    met: Flag
+    where: str
+
+
+class StoredWorst(ResultTable):
+    """The parameters of a worst case and, where bounds were asked for, what they prove."""
+
+    parameters: dict[str, Number]
+    ms_lower: NullIsInfinite = math.inf
+    ms_upper: NullIsInfinite = math.inf
+    mt_lower: NullIsInfinite = math.inf
+    mt_upper: NullIsInfinite = math.inf
+    proven_stable: Flag = False
+    boxes: Whole = 0
+    left_out: str = ""
+
+    @property
+    def bounds(self) -> dict[str, Any] | None:
+        """The fields of its `Bracket`; None if bounds were not asked for."""
+        return self.model_dump(exclude={"parameters"}) if "ms_upper" in self.model_fields_set else None
+
+
+class StoredPlant(ResultTable):
+    """A plant: its worst case."""
+
+    worst: StoredWorst
+
+
+class StoredMonteCarlo(ResultTable):
+    """Draws and failures."""
+
+    samples: Whole
+    failures: Whole
+    seed: Whole
+    failure_probability_bound: Number
+    confidence: Number
+    unstable: Whole = 0
+    over_ms: Whole = 0
+    over_mt: Whole = 0
+
+
+class StoredVaried(ResultTable):
+    """A quantity that was drawn."""
+
+    name: str
+    unit: str
+    value: Number | None
+    std: Number | None
+    low: NullIsMinusInfinite
+    high: NullIsInfinite
+
+
+class StoredSensors(ResultTable):
+    """What the simulations read the measured output with."""
+
+    noise_std: dict[str, Number] = {}
+    offset: dict[str, Number] = {}
+    quantisation: dict[str, Number] = {}
+    saturation: dict[str, Number] = {}
+
+
+class StoredSimulation(ResultTable):
+    """What the scenarios were played with."""
+
+    sensors: StoredSensors
+    current_step_A: Number
+    seed: Whole
+
+
+class StoredCertificate(ResultTable):
+    """A robustness.json."""
+
+    requirements: list[StoredRequirement]
+    plants: dict[str, StoredPlant]
+    monte_carlo: StoredMonteCarlo
+    varied: list[StoredVaried] = []
+    simulation: StoredSimulation | None = None
+
+
+def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
+    """Return what a certificate needs of a robustness.json.
+
+    Raises
+    ------
+    FileError
+        A field is missing or malformed.
+
+    """
+    return check_table(StoredCertificate, plain(content), "robustness.json", remedy=REMEDY)
