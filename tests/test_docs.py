@@ -69,7 +69,7 @@ def test_the_passivity_of_the_docs_works():
     space: dict = {}
     for block in blocks("passivity.md", "python"):
         exec(re.sub(r"print\(.*", "", block), space)
-    assert space["found"].holds((0.1, 60.0))
+    assert space["port"].holds((0.1, 60.0))
     assert space["passive"]
 
 
