@@ -19,7 +19,7 @@ from seaopt.cli.provenance import FILES, made_from
 from seaopt.cli.responses import responses
 from seaopt.control import Controller, sweep, tune
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, fit, resting_on
+from seaopt.estimation import Experiment, Fit, fit, warn_unidentified
 from seaopt.files import read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
@@ -158,7 +158,7 @@ class Session:
     def _design_values(self, *plants: Plant) -> ParameterSet:
         """Return the values to design with; those that the fit cannot tell, of these plants, are named on stderr."""
         values = self.values()
-        for note in resting_on(values, {name for plant in plants for name in plant.parameters}):
+        for note in warn_unidentified(values, {name for plant in plants for name in plant.parameters}):
             if note not in self._warned:
                 self.say(f"warning: {note}")
             self._warned.add(note)

@@ -17,7 +17,7 @@ from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import DerivedFigure, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.fit import fit
 from seaopt.estimation.result.fit_result import Fit
-from seaopt.estimation.result.identifiability import Identifiability, resting_on
+from seaopt.estimation.result.identifiability import Identifiability, warn_unidentified
 from seaopt.estimation.solver.methods import Method, OutputError, PredictionError
 from seaopt.estimation.solver.shooting import MultipleShooting
 from seaopt.estimation.uncertainty.bootstrap import Bootstrap, bootstrap
@@ -27,5 +27,5 @@ __all__ = [
     "Bootstrap", "Chirps", "Comparison", "Covariance", "DerivedFigure", "Design", "Diagnostics", "Experiment", "Fit",
     "Huber", "Identifiability", "Limits", "Method", "ModelledOutputs", "MultipleShooting", "Multisines", "Nuisance",
     "OutputError", "OutputFit", "PredictionError", "Profile", "Ranking", "SoftL1", "Squares", "bootstrap", "compare",
-    "design_experiment", "diagnose", "expected_covariance", "fit", "profile", "resting_on",
+    "design_experiment", "diagnose", "expected_covariance", "fit", "profile", "warn_unidentified",
 ]  # fmt: skip

@@ -45,17 +45,17 @@ def assert_recovered(
     for name in fit.covariance.names:
         if name not in truth:
             raise SeaoptError(f'truth has no "{name}", which the fit estimated; {suggestion(name, truth)}')
-        given = truth[name]
-        true = given if isinstance(given, (int, float)) else given.value
-        item = fit.parameters[name]
-        std = item.std if item.std is not None else np.nan
-        error = item.value - true
+        expected = truth[name]
+        true = expected if isinstance(expected, (int, float)) else expected.value
+        fitted = fit.parameters[name]
+        std = fitted.std if fitted.std is not None else np.nan
+        error = fitted.value - true
         distance = abs(error) / std if std > 0.0 else np.inf
         relative = abs(error) / abs(true) if true else np.inf
         good = distance <= sigmas and np.isfinite(std) and (within is None or relative <= within)
         failed |= not good
         rows.append(
-            f"  {name:<12} found {item.value:.6g} ± {std:.2g}{unit_after(item.unit)}, true {true:.6g}: "
+            f"  {name:<12} fitted {fitted.value:.6g} ± {std:.2g}{unit_after(fitted.unit)}, true {true:.6g}: "
             f"{distance:.1f} std, {relative:.2%} off{'' if good else '   <-- TOO FAR'}"
         )
     if failed:

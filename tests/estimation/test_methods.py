@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
+from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
-from seaopt.estimation.problem.residuals import pose_problem
 from seaopt.estimation.problem.steady_state_filter import kalman_gain
 from seaopt.estimation.result.fit import check_choices, complete_parameters
 

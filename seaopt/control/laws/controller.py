@@ -14,7 +14,7 @@ from seaopt.control.laws.structures import Observer
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.estimation import resting_on
+from seaopt.estimation import warn_unidentified
 from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -107,7 +107,7 @@ class Controller:
             return ()
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
-        return (*resting_on(values, None if self.robust_to else plant.parameters), *self._noise_notes())
+        return (*warn_unidentified(values, None if self.robust_to else plant.parameters), *self._noise_notes())
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""

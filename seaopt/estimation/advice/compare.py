@@ -39,8 +39,8 @@ from seaopt.estimation.advice.forecasts import (
 )
 from seaopt.estimation.problem.correlation import autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitOutput
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import format_table, html_text
 from seaopt.records import record
@@ -264,7 +264,7 @@ def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
     return named
 
 
-def _check(problems: dict[str, Residuals]) -> None:
+def _check(problems: dict[str, FitProblem]) -> None:
     """Refuse fits to data that are not the same: their likelihoods are not of the same thing."""
     (first, one), *others = problems.items()
     for name, other in others:
@@ -276,7 +276,7 @@ def _check(problems: dict[str, Residuals]) -> None:
             )
 
 
-def _find_difference(one: Residuals, other: Residuals) -> str:
+def _find_difference(one: FitProblem, other: FitProblem) -> str:
     """Return what differs in the data of two problems; empty if nothing does."""
     names, others = [e.name for e in one.experiments], [e.name for e in other.experiments]
     if names != others:
@@ -310,7 +310,7 @@ def _count_effective(output: FitOutput, residuals: ResidualsByExperiment) -> flo
 
 
 def _compute_bic(
-    fit: Fit, problem: Residuals, residuals: ResidualsByExperiment, effective: Mapping[str, float]
+    fit: Fit, problem: FitProblem, residuals: ResidualsByExperiment, effective: Mapping[str, float]
 ) -> float:
     """Return the BIC with the effective number of samples of each output."""
     total = 0.0
@@ -321,14 +321,14 @@ def _compute_bic(
     return total + fit.all_unknowns * float(np.log(max(sum(effective.values()), 1.0)))
 
 
-def _compute_percents(problem: Residuals, residuals: ResidualsByExperiment) -> dict[str, dict[str, Percent]]:
+def _compute_percents(problem: FitProblem, residuals: ResidualsByExperiment) -> dict[str, dict[str, Percent]]:
     return {
         experiment.name: {output.name: compute_percent(output, residuals) for output in experiment.outputs}
         for experiment in problem.experiments
     }
 
 
-def _compare_held_out(problem: Residuals, one: ResidualsByExperiment, best: ResidualsByExperiment) -> float | None:
+def _compare_held_out(problem: FitProblem, one: ResidualsByExperiment, best: ResidualsByExperiment) -> float | None:
     """Return the ratio of held-out residuals to the best fit's, geometric mean over outputs."""
     logs: list[float] = []
     for output in problem.outputs:

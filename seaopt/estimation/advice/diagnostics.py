@@ -112,12 +112,13 @@ class Diagnostics:
         """Return the content as numbers, lists and text."""
         return {
             "outputs": {
-                name: {output: _output_dict(item) for output, item in row.items()} for name, row in self.outputs.items()
+                name: {output: _output_dict(one) for output, one in row.items()} for name, row in self.outputs.items()
             },
             "leverage": {
-                name: {"parameters": dict(item.parameters), "whole": item.whole} for name, item in self.leverage.items()
+                name: {"parameters": dict(source.parameters), "whole": source.whole}
+                for name, source in self.leverage.items()
             },
-            "at_bound": list(self.at_bound), "held": {name: asdict(item) for name, item in self.held.items()},
+            "at_bound": list(self.at_bound), "held": {name: asdict(test) for name, test in self.held.items()},
             "aic": self.aic, "bic": self.bic, "sentences": list(self.sentences),
         }  # fmt: skip
 
@@ -125,49 +126,49 @@ class Diagnostics:
         lines = ["Diagnostics: " + ("no problem found" if self.ok else f"{len(self.sentences)} to look at")]
         lines += [f"  - {sentence}" for sentence in self.sentences]
         for name, row in self.outputs.items():
-            for output, item in row.items():
-                lines.append(f"  {name}.{output}: whiteness p {item.whiteness_p:.2g}; {_percents(item)}")
+            for output, one in row.items():
+                lines.append(f"  {name}.{output}: whiteness p {one.whiteness_p:.2g}; {_percents(one)}")
                 lines += [
                     f"    against {u}: {cross.worst:.2g} of the 99 % bound, at lag {cross.worst_lag}"
-                    for u, cross in item.inputs.items()
+                    for u, cross in one.inputs.items()
                 ]
         lines += [
-            f"  {name} = {item.value:.6g}{unit_after(item.unit)} held fixed: chi-square {item.chi2:.3g}, one step with "
-            f"it free goes to {item.preferred:.4g}"
-            for name, item in self.held.items()
-            if item.p < SIGNIFICANCE
+            f"  {name} = {test.value:.6g}{unit_after(test.unit)} held fixed: chi-square {test.chi2:.3g}, one step with "
+            f"it free goes to {test.preferred:.4g}"
+            for name, test in self.held.items()
+            if test.p < SIGNIFICANCE
         ]
-        for name, item in self.leverage.items():
-            shares = ", ".join(f"{parameter} {100 * share:.3g} %" for parameter, share in item.parameters.items())
-            lines.append(f"  {name} brings {100 * item.whole:.3g} % of what is known: {shares}")
+        for name, source in self.leverage.items():
+            shares = ", ".join(f"{parameter} {100 * share:.3g} %" for parameter, share in source.parameters.items())
+            lines.append(f"  {name} brings {100 * source.whole:.3g} % of what is known: {shares}")
         lines.append(f"  AIC {self.aic:.6g}, BIC {self.bic:.6g}")
         return "\n".join(lines)
 
     _repr_html_ = html_text
 
 
-def _output_dict(item: OutputDiagnostics) -> dict[str, Any]:
+def _output_dict(one: OutputDiagnostics) -> dict[str, Any]:
     return {
-        "whiteness_p": item.whiteness_p,
-        "autocorrelation": item.autocorrelation,
-        "autocorrelation_bound": item.autocorrelation_bound,
+        "whiteness_p": one.whiteness_p,
+        "autocorrelation": one.autocorrelation,
+        "autocorrelation_bound": one.autocorrelation_bound,
         "inputs": {
             name: {
                 "lags": cross.lags, "values": cross.values, "bound": cross.bound, "p": cross.p,
                 "worst_lag": cross.worst_lag, "outside": cross.outside,
             }
-            for name, cross in item.inputs.items()
+            for name, cross in one.inputs.items()
         },
-        "free_run": {"used": item.free_run.used, "held_out": item.free_run.held_out},
-        "one_step": {"used": item.one_step.used, "held_out": item.one_step.held_out},
+        "free_run": {"used": one.free_run.used, "held_out": one.free_run.held_out},
+        "one_step": {"used": one.one_step.used, "held_out": one.one_step.held_out},
     }  # fmt: skip
 
 
-def _percents(item: OutputDiagnostics) -> str:
+def _percents(one: OutputDiagnostics) -> str:
     parts: list[str] = []
-    for what, percent in (("simulated", item.free_run), ("one sample ahead", item.one_step)):
-        held = "" if percent.held_out is None else f" (held out {percent.held_out:.2f} %)"
-        parts.append(f"{what} {percent.used:.2f} %{held}")
+    for what, percent in (("simulated", one.free_run), ("one sample ahead", one.one_step)):
+        held_out = "" if percent.held_out is None else f" (held out {percent.held_out:.2f} %)"
+        parts.append(f"{what} {percent.used:.2f} %{held_out}")
     return ", ".join(parts)
 
 

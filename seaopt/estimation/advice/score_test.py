@@ -1,7 +1,7 @@
 r"""Is a parameter that was fixed at fault? A score test of each, and a refit with the one that would do most.
 
 With :math:`g, H` the gradient and Gauss-Newton Hessian of the cost in the unknowns f and one more parameter c, which
-was held, the multiplier of "c is right" and what it would be in chance are
+was fixed, the multiplier of "c is right" and what it would be by chance are
 
 .. math:: s = g_c - H_{cf} H_{ff}^{-1} g_f, \qquad I = H_{cc} - H_{cf} H_{ff}^{-1} H_{fc}, \qquad
           \operatorname{var} s = v^T (B + P)\, v, \quad v = (-H_{ff}^{-1} H_{fc},\, 1),
@@ -10,8 +10,8 @@ with B the sum over the residuals' correlations that the covariance of a fit has
 coloured residuals. :math:`s^2 / \operatorname{var} s` is chi-square with one degree of freedom where c is right (Rao,
 Proc. Cambridge Phil. Soc. 44, 1948; for residuals that are not as assumed White, Econometrica 50, 1982). One
 Gauss-Newton step with c free moves it by -s/I, and the cost falls by s^2/(2 I). What would lower it most is
-refitted: one step is not enough where a resonance has to move. Parameters whose refits are as likely are told together,
-for no residual tells which of them is wrong.
+refitted: one step is not enough where a resonance has to move. Parameters whose refits are as likely are named
+together, for no residual tells which of them is wrong.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from jaxtyping import Float, Int
 
 from seaopt.estimation.problem.correlation import CrossCorrelation, cross_correlation
 from seaopt.estimation.problem.fit_experiment import FitOutput
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_statistics
-from seaopt.estimation.problem.residuals import Evaluation, Residuals
 from seaopt.estimation.result.covariance import compute_bread, compute_meat
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.identifiability import join_names
@@ -55,7 +55,7 @@ class ScoreTest:
     Parameters
     ----------
     value, unit : float and str
-        At which it was held.
+        At which it was fixed.
     chi2 : float
         With one degree of freedom where the value is right, allowing for coloured residuals.
     p : float
@@ -212,7 +212,7 @@ def _test(fit: Fit, name: str, score: float, information: float, variance: float
     )  # fmt: skip
 
 
-def _find_candidates(problem: Residuals, fit: Fit) -> tuple[str, ...]:
+def _find_candidates(problem: FitProblem, fit: Fit) -> tuple[str, ...]:
     """Return the fixed parameters of the plants whose freedom leaves a linear plant linear."""
     free = fit.parameters.free_names
     candidates: list[str] = []
@@ -234,7 +234,7 @@ def _free(fit: Fit, names: tuple[str, ...]) -> ParameterSet:
 
 
 def _compute_scores(
-    trial: Residuals, here: Evaluation, places: Int[np.ndarray, " c"]
+    trial: FitProblem, here: Evaluation, places: Int[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return scores, their information, and their variances with the residuals as coloured as they are."""
     unknowns, z = trial.unknowns, here.z

@@ -62,46 +62,46 @@ class CrossCorrelation:
         return self.worst > 1.0
 
 
-def transforms() -> tuple[Any, Any, Any]:
+def load_transforms() -> tuple[Any, Any, Any]:
     """Return SciPy's irfft, next_fast_len and rfft."""
     from scipy import fft  # deferred: scipy is slow to load
 
     return fft.irfft, fft.next_fast_len, fft.rfft
 
 
-def lagged_size(samples: int, lags: int) -> int:
+def choose_transform_size(samples: int, lags: int) -> int:
     """Return a length at which transforms of so many samples tell their products at so many lags, and are quick."""
-    return int(transforms()[1](samples + lags, real=True))
+    return int(load_transforms()[1](samples + lags, real=True))
 
 
 class LaggedSums:
     """Sums over t of x_a(t) x_b(t - k), k = 0..lags, of stretches of at most `longest` samples, added one by one."""
 
     def __init__(self, rows: int, longest: int, lags: int) -> None:
-        self.lags, self.size = lags, lagged_size(longest, lags)
+        self.lags, self.size = lags, choose_transform_size(longest, lags)
         lines = self.size // 2 + 1
         self.own = np.zeros((rows, 2 * lines))  # squares of real and imaginary parts, side by side
         self.cross = {(a, b): np.zeros(lines, dtype=complex) for a in range(rows) for b in range(a)}
 
     def add(self, x: Float[np.ndarray, "rows n"]) -> None:
         """Add a stretch."""
-        spectrum = np.asarray(transforms()[2](x, self.size))
+        spectrum = np.asarray(load_transforms()[2](x, self.size))
         self.own += np.square(spectrum.view(float))
         for (a, b), total in self.cross.items():
             total += spectrum[a] * np.conj(spectrum[b])
 
     def sums(self) -> Float[np.ndarray, "lags1 rows rows"]:
         """Return the sums by lag."""
-        irfft, rows, count = transforms()[0], len(self.own), self.lags + 1
-        found = np.empty((count, rows, rows))
+        irfft, rows, count = load_transforms()[0], len(self.own), self.lags + 1
+        sums = np.empty((count, rows, rows))
         power = np.sum(self.own.reshape(rows, -1, 2), axis=2)
-        for a, own in enumerate(np.asarray(irfft(power, self.size))):
-            found[:, a, a] = own[:count]
+        for a, auto in enumerate(np.asarray(irfft(power, self.size))):
+            sums[:, a, a] = auto[:count]
         for (a, b), total in self.cross.items():
             both = np.asarray(irfft(total, self.size))
-            found[:, a, b] = both[:count]
-            found[0, b, a], found[1:, b, a] = both[0], both[:-count:-1]
-        return found
+            sums[:, a, b] = both[:count]
+            sums[0, b, a], sums[1:, b, a] = both[0], both[:-count:-1]
+        return sums
 
 
 def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
@@ -112,12 +112,12 @@ def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
 
 def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
-    irfft, next_fast_len, rfft = transforms()
+    irfft, next_fast_len, rfft = load_transforms()
     used = r != 0.0
     centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
     size = next_fast_len(len(r) + lags + 1, real=True)
-    found = np.asarray(irfft(np.abs(np.asarray(rfft(centred, size))) ** 2, size))[: lags + 1]
-    return found / found[0] if found[0] > 0.0 else np.zeros(lags + 1)
+    sums = np.asarray(irfft(np.abs(np.asarray(rfft(centred, size))) ** 2, size))[: lags + 1]
+    return sums / sums[0] if sums[0] > 0.0 else np.zeros(lags + 1)
 
 
 def cross_correlation(
@@ -159,7 +159,7 @@ def cross_correlation(
 
 def _products(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, " m"]:
     """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
-    irfft, next_fast_len, rfft = transforms()
+    irfft, next_fast_len, rfft = load_transforms()
     size = next_fast_len(len(a) + lags + 1, real=True)
     whole = np.asarray(irfft(np.asarray(rfft(a, size)) * np.conj(np.asarray(rfft(b, size))), size))
     return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]

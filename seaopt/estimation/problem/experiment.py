@@ -24,7 +24,7 @@ from seaopt.units import same_dimension
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
-SHORTEST = 4  # samples of a shot
+SHORTEST_SHOT = 4  # samples
 Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
@@ -48,7 +48,7 @@ class Experiment:
     initial_state : "estimate", "rest" or mapping
         Unknown in each segment; zero; or known (zero where left out).
     offset : bool or mapping
-        One unknown offset an output; none; or known ones.
+        One unknown offset per output; none; or known ones.
     drift : int
         Slow drift of the sensors: order, up to 5, of a polynomial over the log that is added to each output
         (Legendre's, so that the offset stays the mean). 0: none.
@@ -137,7 +137,7 @@ class Experiment:
         for name, ends in self.saturation.items():
             if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
                 raise EstimationError(
-                    f"experiment {self.name}: saturation of {name} = {ends} is no range; give [low, high]"
+                    f"experiment {self.name}: saturation of {name} = {ends} is not a range; give [low, high]"
                 )
         if self.mask == "none":
             return
@@ -152,25 +152,25 @@ class Experiment:
     def _check_units(self) -> None:
         for kind, names in (("input", self.plant.inputs), ("output", self.plant.outputs)):
             for name, unit in names.items():
-                found = self.log.signals[name].unit if name in self.log.signals else ""
-                if found and found != unit and not same_dimension(found, unit):
+                logged = self.log.signals[name].unit if name in self.log.signals else ""
+                if logged and logged != unit and not same_dimension(logged, unit):
                     raise EstimationError(
-                        f"experiment {self.name}: channel {name} is in {found}, but the {kind} of {self.plant.name} "
+                        f"experiment {self.name}: channel {name} is in {logged}, but the {kind} of {self.plant.name} "
                         f"is in {unit or 'no unit'}; correct the column's unit"
                     )
 
     def _check_settings(self) -> None:
-        for what, given in (("sigma", self.sigma), ("gain", self.gain), ("saturation", self.saturation)):
-            if not isinstance(given, Mapping):
-                raise EstimationError(f"experiment {self.name}: {what} = {given!r}; give a mapping of output to value")
+        for what, values in (("sigma", self.sigma), ("gain", self.gain), ("saturation", self.saturation)):
+            if not isinstance(values, Mapping):
+                raise EstimationError(f"experiment {self.name}: {what} = {values!r}; give a mapping of output to value")
         known = {
             "sigma": self.sigma,
             "gain": self.gain,
             "offset": self.offset if self.offset is not True else {},
             "saturation": self.saturation,
         }
-        for what, given in known.items():
-            for name in given if isinstance(given, Mapping) else ():
+        for what, values in known.items():
+            for name in values if isinstance(values, Mapping) else ():
                 if name not in self.outputs:
                     raise EstimationError(
                         f'experiment {self.name}: {what} names "{name}", which is not a measured output; '
@@ -262,7 +262,7 @@ class Experiment:
 
     def _cuts(self, stretch: slice) -> list[int]:
         """Return the rows at which a stretch is cut into shots, its ends included."""
-        return (stretch.start + shot_edges(stretch.stop - stretch.start, self.shots)).tolist()
+        return (stretch.start + cut_into_shots(stretch.stop - stretch.start, self.shots)).tolist()
 
     def renamed(self, name: str) -> Experiment:
         """Return the experiment under another name."""
@@ -274,12 +274,12 @@ def is_constant(values: Float[np.ndarray, " n"]) -> bool:
     return bool(np.fmin.reduce(values) == np.fmax.reduce(values))
 
 
-def shot_edges(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
+def cut_into_shots(n: int, shots: int) -> Int[np.ndarray, " shots1"]:
     """Return the first rows of shots of about equal length, and one past the last; no shot is under four samples."""
-    return np.linspace(0, n, max(1, min(shots, n // SHORTEST)) + 1).astype(int)
+    return np.linspace(0, n, max(1, min(shots, n // SHORTEST_SHOT)) + 1).astype(int)
 
 
-def check_shots(experiment: Experiment, longest: int, shots: int, given: str) -> None:
+def check_shots(experiment: Experiment, longest: int, shots: int, setting: str) -> None:
     """Refuse shots too short for the states they start from.
 
     So many samples of one output as there are states tell the state at a shot's start, where they tell it at all; with
@@ -293,13 +293,13 @@ def check_shots(experiment: Experiment, longest: int, shots: int, given: str) ->
 
     """
     states = len(experiment.plant.states)
-    least = max(SHORTEST, states + 1)
+    least = max(SHORTEST_SHOT, states + 1)
     if longest >= shots * least or shots == 1:
         return
     possible = longest // least
     remedy = f"give {possible} or fewer" if possible > 1 else "leave it out, and use a longer log or OutputError()"
     raise EstimationError(
-        f"experiment {experiment.name}: {given} leaves {longest / shots:.3g} samples a shot, of {longest} in the "
+        f"experiment {experiment.name}: {setting} leaves {longest / shots:.3g} samples per shot, of {longest} in the "
         f"longest stretch; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least "
         f"{least} samples: {remedy}"
     )

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from seaopt.estimation.problem.correlation import LaggedSums, ljung_box
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
-from seaopt.estimation.problem.residuals import Residuals
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.records import record
 from seaopt.simulation import Point
 
@@ -61,7 +61,7 @@ class ExperimentResiduals:
 ResidualsByExperiment = Mapping[str, ExperimentResiduals]
 
 
-def compute_residuals(problem: Residuals, z: Float[np.ndarray, " n"]) -> dict[str, ExperimentResiduals]:
+def compute_residuals(problem: FitProblem, z: Float[np.ndarray, " n"]) -> dict[str, ExperimentResiduals]:
     """Return the residuals of every experiment, by its name."""
     return {experiment.name: compute_experiment_residuals(experiment, z) for experiment in problem.experiments}
 
@@ -190,7 +190,7 @@ class ResidualStatistics:
 StatisticsByExperiment = Mapping[str, ResidualStatistics]
 
 
-def compute_statistics(problem: Residuals, z: Float[np.ndarray, " n"]) -> dict[str, ResidualStatistics]:
+def compute_statistics(problem: FitProblem, z: Float[np.ndarray, " n"]) -> dict[str, ResidualStatistics]:
     """Return what the residuals of every experiment come to, by its name."""
     return {experiment.name: _compute_statistics(experiment, z) for experiment in problem.experiments}
 

@@ -27,15 +27,15 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from seaopt.estimation.problem.correlation import lagged_size, parzen, transforms
+from seaopt.estimation.problem.correlation import choose_transform_size, load_transforms, parzen
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import add_gram
 from seaopt.estimation.problem.residual_statistics import (
     ResidualStatistics,
     StatisticsByExperiment,
     stream_columns,
 )
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.records import record
 from seaopt.simulation import double_sum
 
@@ -59,13 +59,13 @@ class Covariance:
         return float(np.sqrt(max(self.matrix[i, i], 0.0)))
 
 
-def compute_bread(problem: Residuals, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+def compute_bread(problem: FitProblem, z: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
     """Return J^T J with the loss's second derivative as weight."""
     return _sum_weighted(problem, z, lambda experiment, o, r: problem.loss.curvature(r))
 
 
 def compute_white_meat(
-    problem: Residuals, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
+    problem: FitProblem, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
 ) -> Float[np.ndarray, "n n"]:
     """Return B for white residuals: J^T J with the mean square of what the loss makes of each output's residuals."""
     power = {
@@ -75,7 +75,7 @@ def compute_white_meat(
 
 
 def _sum_weighted(
-    problem: Residuals, z: Float[np.ndarray, " n"],
+    problem: FitProblem, z: Float[np.ndarray, " n"],
     weigh: Callable[[FitExperiment, int, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]],
 ) -> Float[np.ndarray, "n n"]:  # fmt: skip
     """Return J^T J with weights that come of the residuals, in sigma, of an experiment's output."""
@@ -91,7 +91,7 @@ def _sum_weighted(
 
 
 def compute_meat(
-    problem: Residuals, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
+    problem: FitProblem, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
     statistics: StatisticsByExperiment,
 ) -> Float[np.ndarray, "p p"]:  # fmt: skip
     """Return E^T H^-1 B H^-1 E of the module docstring, with `inverse` = H^-1 E: B for residuals of any colour."""
@@ -173,11 +173,11 @@ class _Form:
     @classmethod
     def make(cls, r: Float[np.ndarray, "lags1 ny ny"], n: int) -> _Form:
         """Return the form for at most n samples."""
-        reach, size = len(r) - 1, lagged_size(n, len(r))
+        reach, size = len(r) - 1, choose_transform_size(n, len(r))
         kernel = np.zeros((*r.shape[1:], size))
         kernel[:, :, : reach + 1] = r.transpose(1, 2, 0)
         kernel[:, :, size - reach :] = r[:0:-1].transpose(2, 1, 0)  # R(-k) = R(k)'
-        density = np.asarray(transforms()[2](kernel)) * (2.0 / size)
+        density = np.asarray(load_transforms()[2](kernel)) * (2.0 / size)
         density[:, :, 0] *= 0.5
         if size % 2 == 0:
             density[:, :, -1] *= 0.5
@@ -188,7 +188,7 @@ class _Form:
         ny, p, n = a.shape
         if not n:
             return np.zeros((p, p))
-        spectrum = np.asarray(transforms()[2](a, self.size))
+        spectrum = np.asarray(load_transforms()[2](a, self.size))
         density = self.density[:, :, None]
         total = np.zeros((p, p))
         for o in range(ny):

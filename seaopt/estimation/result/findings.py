@@ -1,4 +1,4 @@
-"""What a fit finds besides parameters: of each output, of each experiment, and what follows from the parameters."""
+"""What a fit says besides its parameters: of each output, of each experiment, and figures that follow from them."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
+from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
-from seaopt.estimation.problem.residuals import Residuals, pose_problem
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.least_squares import Callback
@@ -162,7 +162,7 @@ def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSe
     return ParameterSet(parameters.values())
 
 
-def _check_samples(problem: Residuals) -> None:
+def _check_samples(problem: FitProblem) -> None:
     """Refuse outputs of which no sample counts, and segments and shots that are too short."""
     for experiment in problem.experiments:
         settle, data = experiment.weights.settle, experiment.data

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import DerivedFigure, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
@@ -31,7 +31,7 @@ SCHEMA = "seaopt/fit/1"
 class Minimum:
     """The problem that was solved, with its sigma and steps, the unknowns where its cost is least, and the method."""
 
-    problem: Residuals
+    problem: FitProblem
     z: Float[np.ndarray, " n"]
     method: Method
 
@@ -179,15 +179,15 @@ class Fit:
             "iterations": self.iterations,
             "samples": self.samples,
             "wall_s": self.wall_s,
-            "parameters": {name: _parameter_dict(item) for name, item in self.parameters.items()},
+            "parameters": {name: _parameter_dict(one) for name, one in self.parameters.items()},
             "derived": {
-                name: {"value": item.value, "unit": item.unit, "std": item.std, "ci95": list(item.ci95)}
-                for name, item in self.derived.items()
+                name: {"value": figure.value, "unit": figure.unit, "std": figure.std, "ci95": list(figure.ci95)}
+                for name, figure in self.derived.items()
             },
             "covariance": {"names": list(self.covariance.names), "matrix": self.covariance.matrix},
             "white_covariance": {"names": list(self.white_covariance.names), "matrix": self.white_covariance.matrix},
             "outputs": {
-                name: {output: _fields(item) for output, item in row.items()} for name, row in self.outputs.items()
+                name: {output: _fields(one) for output, one in row.items()} for name, row in self.outputs.items()
             },
             "identifiability": {
                 "rank": self.identifiability.rank,
@@ -197,7 +197,7 @@ class Fit:
                 "weak": list(self.identifiability.weak),
                 "structural_rank": self.identifiability.structural_rank,
             },
-            "experiments": {name: _fields(item) for name, item in self.nuisance.items()},
+            "experiments": {name: _fields(nuisance) for name, nuisance in self.nuisance.items()},
             "step_error_sigma": self.step_error_sigma,
             "step_error_parameter": self.step_error_parameter,
             "method": self.method,
@@ -225,24 +225,24 @@ class Fit:
     def __repr__(self) -> str:
         lines = [f"Fit: {self.status} ({self.message})"]
         lines.append(f"  {self.samples} samples, {self.iterations} iterations, {self.wall_s:.2f} s")
-        shown = ParameterSet(item for item in self.parameters.values() if item.free)
-        lines += [f"  {line}" for line in repr(shown).splitlines()]
+        free = ParameterSet(parameter for parameter in self.parameters.values() if parameter.free)
+        lines += [f"  {line}" for line in repr(free).splitlines()]
         lines += [
-            f"  {name} = {item.value:.5g} ± {item.std:.2g}{unit_after(item.unit)}"
-            for name, item in self.derived.items()
+            f"  {name} = {figure.value:.5g} ± {figure.std:.2g}{unit_after(figure.unit)}"
+            for name, figure in self.derived.items()
         ]
         for name, own in self.nuisance.items():
             lines += [f"  {name}: {line}" for line in own.describe()]
             if len(own.initial_state) > 1:
                 lines.append(f"  {name}: {len(own.initial_state)} segments with initial states of their own")
         for name, row in self.outputs.items():
-            for output, item in row.items():
-                held = "" if item.holdout_fit_percent is None else f", held out {item.holdout_fit_percent:.2f} %"
-                held += "" if item.band_fit_percent is None else f", in the band {item.band_fit_percent:.2f} %"
-                held += "" if item.one_step_fit_percent is None else f", one step {item.one_step_fit_percent:.2f} %"
+            for output, one in row.items():
+                others = "" if one.holdout_fit_percent is None else f", held out {one.holdout_fit_percent:.2f} %"
+                others += "" if one.band_fit_percent is None else f", in the band {one.band_fit_percent:.2f} %"
+                others += "" if one.one_step_fit_percent is None else f", one step {one.one_step_fit_percent:.2f} %"
                 lines.append(
-                    f"  {name}.{output}: fit {item.fit_percent:.2f} %{held}, "
-                    f"rms residual {item.rms_residual:.4g}{unit_after(item.unit)}"
+                    f"  {name}.{output}: fit {one.fit_percent:.2f} %{others}, "
+                    f"rms residual {one.rms_residual:.4g}{unit_after(one.unit)}"
                 )
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)
@@ -250,14 +250,14 @@ class Fit:
     _repr_html_ = html_text
 
 
-def _fields(item: Any) -> dict[str, Any]:
-    return {name: getattr(item, name) for name in item.__dataclass_fields__}
+def _fields(record: Any) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in record.__dataclass_fields__}
 
 
-def _parameter_dict(item: Parameter) -> dict[str, Any]:
-    ci95 = list(item.ci95) if item.ci95 is not None else None
+def _parameter_dict(parameter: Parameter) -> dict[str, Any]:
+    ci95 = list(parameter.ci95) if parameter.ci95 is not None else None
     return {
-        "value": item.value, "unit": item.unit, "free": item.free, "std": item.std, "ci95": ci95,
-        "at_bound": item.at_bound, "min": item.min, "max": item.max, "prior_std": item.prior_std,
-        "description": item.description, "identified": item.identified,
+        "value": parameter.value, "unit": parameter.unit, "free": parameter.free, "std": parameter.std, "ci95": ci95,
+        "at_bound": parameter.at_bound, "min": parameter.min, "max": parameter.max, "prior_std": parameter.prior_std,
+        "description": parameter.description, "identified": parameter.identified,
     }  # fmt: skip

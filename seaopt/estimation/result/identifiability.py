@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import RANK, eliminate
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.simulation import Segment, run_passes
@@ -86,7 +86,7 @@ def assess_identifiability(
     )
 
 
-def compute_structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> int:
+def compute_structural_rank(problem: FitProblem, z: Float[np.ndarray, " n"]) -> int:
     """Return how many directions of the parameters a rich input would show on the outputs that were measured.
 
     The input is white noise of the log's own size on every input that the log excites, from rest and without noise.
@@ -112,7 +112,7 @@ def compute_structural_rank(problem: Residuals, z: Float[np.ndarray, " n"]) -> i
 
 
 def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
-    """Say in words what cannot be told.
+    """Return in words what cannot be identified.
 
     Parameters
     ----------
@@ -134,8 +134,8 @@ def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
     return f"{join_names(names)} enter only together: {changes} change no output"
 
 
-def resting_on(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
-    """Say which values come from a fit that cannot tell them; nothing where there are none.
+def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
+    """Return a warning that names values from a fit that cannot identify them; nothing where there are none.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From a minimum to the result of a fit: covariance, what cannot be told, how well each output is explained."""
+"""From a minimum to the result of a fit: covariance, what cannot be identified, how well each output is explained."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from jaxtyping import Float
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
-from seaopt.estimation.problem.residuals import Evaluation, Residuals
 from seaopt.estimation.result.covariance import (
     Covariance,
     compute_bread,
@@ -141,7 +141,7 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 
 
 def _compute_covariances(
-    problem: Residuals, evaluation: Evaluation, statistics: StatisticsByExperiment | None
+    problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
@@ -159,7 +159,7 @@ def _compute_covariances(
     return white, mark_unseen(compute_meat(problem, z, columns, statistics) + known, unseen[:p])
 
 
-def _compute_log_likelihood(problem: Residuals, evaluation: Evaluation) -> float:
+def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> float:
     """Return the Gaussian likelihood at the residuals' own sigma, which is that of its best value."""
     total = 0.0
     for experiment in problem.experiments:
@@ -273,7 +273,7 @@ def _derive_figures(
 
 
 def _describe_outputs(
-    problem: Residuals, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
+    problem: FitProblem, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
 ) -> dict[str, dict[str, OutputFit]]:
     """Return how well each output is explained, on the samples used and on those held out."""
     simulated = compute_statistics(problem.with_each(predictor=None), z) if problem.predicts else statistics
@@ -298,7 +298,7 @@ def _describe_outputs(
 
 
 def _explains_something(
-    problem: Residuals, outputs: dict[str, dict[str, OutputFit]], statistics: StatisticsByExperiment
+    problem: FitProblem, outputs: dict[str, dict[str, OutputFit]], statistics: StatisticsByExperiment
 ) -> bool:
     """Tell whether some output is explained better than by chance: N R^2 of its band is far above its mean, 1."""
     for output in problem.outputs:

@@ -16,7 +16,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError
 from seaopt.estimation.problem.fit_experiment import FitExperiment
-from seaopt.estimation.problem.residuals import Residuals
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.records import record
 from seaopt.simulation import Model, linearised
@@ -45,7 +45,7 @@ class _Target:
     weight: Float[np.ndarray, "m ny"]
 
 
-def guess_from_responses(problem: Residuals, rng: np.random.Generator) -> tuple[list[Float[np.ndarray, " n"]], bool]:
+def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple[list[Float[np.ndarray, " n"]], bool]:
     """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
 
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
@@ -146,7 +146,7 @@ def _misfits(targets: list[_Target], candidates: list[Float[np.ndarray, " p"]]) 
     return np.where(np.isfinite(costs), costs, np.inf)
 
 
-@np.errstate(all="ignore")  # what is not finite is told by the caller
+@np.errstate(all="ignore")  # callers look for what is not finite
 def _mismatch(
     target: _Target, g: Float[np.ndarray, "*k rows cols"]
 ) -> tuple[

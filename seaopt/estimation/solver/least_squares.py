@@ -10,7 +10,7 @@ Lecture Notes in Mathematics 630, 1978): a parameter that the data hardly show a
 world. The step is clipped to the bounds and is taken if the cost falls; :math:`\Delta` follows from how well the fall
 was predicted. Costs are in units of sigma, so that the Newton decrement :math:`g^T H^{-1} g` is the squared distance
 to the minimum in standard deviations: the search ends when that distance is negligible. An evaluation may move the
-point (to the best linear unknowns, see `residuals`); the region does not bound those.
+point (to the best linear unknowns, see `fit_problem`); the region does not bound those.
 """
 
 from __future__ import annotations

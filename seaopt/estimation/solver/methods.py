@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.residuals import Evaluation, Residuals
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
@@ -32,7 +32,7 @@ class Method(ABC):
     seed: int = 0
 
     @abstractmethod
-    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+    def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Return the minimum, and the problem with the sigma and the step with which it was found."""
 
 
@@ -46,7 +46,7 @@ class OutputError(Method):
         Of least squares.
     search : bool
         Look for a start: from the logs' frequency responses, over two decades around the given values, and, where that
-        ends badly, by predicting sample by sample with an observer that holds the simulation to the log. The given
+        ends badly, by predicting sample by sample with a filter that holds the simulation to the log. The given
         values are kept where they explain the logs better.
     seed : int
         Of that search.
@@ -56,7 +56,7 @@ class OutputError(Method):
     key: ClassVar[str] = "output_error"
     remedy: ClassVar[str] = "the simulation may run away: try PredictionError() or MultipleShooting()"
 
-    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+    def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
         solved = settle(problem, best, self.max_iterations, callback) if np.isfinite(best.cost) else None
@@ -95,7 +95,7 @@ class PredictionError(Method):
 
     max_iterations: int = 240
 
-    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+    def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle with a filter that hardly trusts the plant, then with one whose noise is estimated."""
         best, _ = find_start(problem, self)
         solved: Solved | None = None
@@ -114,7 +114,7 @@ class PredictionError(Method):
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
 
 
-def find_start(problem: Residuals, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
+def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses.
 
     A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
@@ -127,8 +127,8 @@ def find_start(problem: Residuals, method: Method) -> tuple[Evaluation, list[Flo
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed.power):
         return guessed, guesses
-    given = problem.evaluate(problem.unknowns.start)
-    best = given if guessed is None or guessed.cost > given.cost else guessed
+    first = problem.evaluate(problem.unknowns.start)
+    best = first if guessed is None or guessed.cost > first.cost else guessed
     if matched and explains_little(problem, best.power):
         predicting = find_predicting_start(problem, guesses[0], method.max_iterations)
         other = None if predicting is None else problem.evaluate(predicting)
@@ -151,7 +151,7 @@ def _is_doubtful(solved: Solved, guesses: list[Float[np.ndarray, " n"]]) -> bool
 
 
 def _further_starts(
-    problem: Residuals, best: Evaluation, guesses: list[Float[np.ndarray, " n"]], method: Method
+    problem: FitProblem, best: Evaluation, guesses: list[Float[np.ndarray, " n"]], method: Method
 ) -> Iterator[Float[np.ndarray, " n"]]:
     """Yield further starts: predicting from the given values and from the best, then the other guesses."""
     for start in (problem.unknowns.start, best.z):

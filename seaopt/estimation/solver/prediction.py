@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.settle import estimate_sigma
@@ -25,7 +25,7 @@ PLACES = 48  # over which a nonlinear plant is linearised for its filter
 
 
 def find_predicting_start(
-    problem: Residuals, start: Float[np.ndarray, " n"], iterations: int
+    problem: FitProblem, start: Float[np.ndarray, " n"], iterations: int
 ) -> Float[np.ndarray, " n"] | None:
     """Return the minimum of the errors of prediction by a filter of fixed gain, which holds the plant to the log.
 
@@ -49,7 +49,7 @@ def find_predicting_start(
     return z
 
 
-def add_predictors(problem: Residuals, z: Float[np.ndarray, " n"], *, follows: bool) -> Residuals | None:
+def add_predictors(problem: FitProblem, z: Float[np.ndarray, " n"], *, follows: bool) -> FitProblem | None:
     """Return the problem whose residuals are errors of prediction; None where the filter finds no finite state."""
     predictors: dict[str, SteadyStateFilter] = {}
     for experiment in problem.experiments:

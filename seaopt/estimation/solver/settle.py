@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import ResidualPower
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
-from seaopt.estimation.problem.residuals import Evaluation, Residuals
 from seaopt.estimation.solver.least_squares import DECREMENT, Callback, Solution, minimise
 from seaopt.estimation.solver.step_size import (
     Checks,
@@ -32,7 +32,7 @@ NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction
 class Solved:
     """A minimum, and the problem with the sigma and the step with which it was found."""
 
-    problem: Residuals
+    problem: FitProblem
     solution: Solution[Evaluation]
     step_error: StepError
 
@@ -46,7 +46,7 @@ class Solved:
         return float(sum(np.sum(n * np.log(np.maximum(s, 1e-300) / np.maximum(n, 1.0))) for s, n in rows))
 
 
-def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
+def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
     """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
     unknowns, iterations = problem.unknowns, 0
     if not np.isfinite(start.cost):
@@ -91,13 +91,13 @@ def settle(problem: Residuals, start: Evaluation, max_iterations: int, callback:
     raise AssertionError  # the last attempt returns
 
 
-def explains_little(problem: Residuals, power: Mapping[str, ResidualPower]) -> bool:
+def explains_little(problem: FitProblem, power: Mapping[str, ResidualPower]) -> bool:
     """Tell whether the residual of some output is a large part of its spread."""
     return not all(np.all(power[e.name].rms <= UNEXPLAINED * e.spread) for e in problem.experiments)
 
 
 def estimate_sigma(
-    problem: Residuals, power: Mapping[str, ResidualPower], z: Float[np.ndarray, " n"]
+    problem: FitProblem, power: Mapping[str, ResidualPower], z: Float[np.ndarray, " n"]
 ) -> dict[str, Float[np.ndarray, " ny"]]:
     """Return the rms of each residual where sigma is not given; never less than rounding of the signal."""
     sigma: dict[str, Float[np.ndarray, " ny"]] = {}
@@ -110,8 +110,8 @@ def estimate_sigma(
         # A constant output has no size of its own.
         floor = np.maximum(1e-9 * np.where(experiment.spread > 0.0, experiment.spread, 1.0), 1e-300)
         estimated = np.maximum(rms, floor)
-        given = experiment.data.sigma
+        known = experiment.data.sigma
         sigma[experiment.name] = np.array(
-            [given.get(name, float(s)) for name, s in zip(experiment.data.outputs, estimated, strict=True)]
+            [known.get(name, float(s)) for name, s in zip(experiment.data.outputs, estimated, strict=True)]
         )
     return sigma

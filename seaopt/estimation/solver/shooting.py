@@ -25,12 +25,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import EstimationError
-from seaopt.estimation.problem.experiment import Experiment, check_shots, shot_edges
+from seaopt.estimation.problem.experiment import Experiment, check_shots, cut_into_shots
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment, ResidualPower
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.normal_equations import QuadraticModel, add_gram
 from seaopt.estimation.problem.residual_statistics import compute_residuals
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.solver.least_squares import Callback, minimise
 from seaopt.estimation.solver.methods import Method, find_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
@@ -74,7 +74,7 @@ class MultipleShooting(Method):
         if self.segments < 1:
             raise EstimationError(f"MultipleShooting(segments={self.segments}): give at least 1")
 
-    def solve(self, problem: Residuals, callback: Callback | None) -> Solved:
+    def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Join the shots step by step; then settle by single shooting, or on separate shots if the plant runs away."""
         for experiment in problem.experiments:
             check_shots(
@@ -160,7 +160,7 @@ class CondensedModel(QuadraticModel):
 class Shooting:
     """The condensed problem at one stiffness: residuals of the log and of the joints."""
 
-    problem: Residuals
+    problem: FitProblem
     first_shots: ShotsByExperiment
 
     def evaluate(self, z: Float[np.ndarray, " n"]) -> CondensedModel:
@@ -271,7 +271,7 @@ def _eliminate_nodes(
 
 
 def _settle_apart(
-    problem: Residuals, method: MultipleShooting, z: Float[np.ndarray, " n"], shots: ShotsByExperiment,
+    problem: FitProblem, method: MultipleShooting, z: Float[np.ndarray, " n"], shots: ShotsByExperiment,
     callback: Callback | None,
 ) -> Solved:  # fmt: skip
     """Settle on shots that keep initial states of their own, for a plant that runs away in one go."""
@@ -305,8 +305,8 @@ def _find_nodes_by_row(experiment: Experiment, shots: tuple[Shots, ...]) -> dict
 
 
 def _join(
-    problem: Residuals, z: Float[np.ndarray, " n"], method: MultipleShooting, callback: Callback | None
-) -> tuple[Residuals, Float[np.ndarray, " n"], ShotsByExperiment]:
+    problem: FitProblem, z: Float[np.ndarray, " n"], method: MultipleShooting, callback: Callback | None
+) -> tuple[FitProblem, Float[np.ndarray, " n"], ShotsByExperiment]:
     """Return the problem with its sigmas, unknowns and shots after the joints have closed, as far as they do."""
     shots = _make_shots(problem, z, method.segments)
     low, high = problem.unknowns.low, problem.unknowns.high
@@ -344,7 +344,7 @@ def _measure_gaps(model: CondensedModel) -> float:
     return worst
 
 
-def _explains_as_much(solved: Solved, joined: Residuals) -> bool:
+def _explains_as_much(solved: Solved, joined: FitProblem) -> bool:
     """Tell whether single shooting leaves no more than the joined shots do; where the plant runs away it does not."""
     plain = solved.problem.with_each(band_hz=None, loss=Squares())  # as the shots were joined
     plain = plain.with_sigma({experiment.name: experiment.sigma for experiment in joined.experiments})
@@ -359,7 +359,7 @@ def _explains_as_much(solved: Solved, joined: Residuals) -> bool:
 
 
 @np.errstate(all="ignore")
-def _weigh_nodes(problem: Residuals, model: CondensedModel) -> dict[str, list[Float[np.ndarray, " nx"]]]:
+def _weigh_nodes(problem: FitProblem, model: CondensedModel) -> dict[str, list[Float[np.ndarray, " nx"]]]:
     """Return, for each segment, what the log says of a node: the median diagonal of its information."""
     scale: dict[str, list[Float[np.ndarray, " nx"]]] = {}
     for experiment in problem.experiments:
@@ -378,7 +378,7 @@ def _weigh_nodes(problem: Residuals, model: CondensedModel) -> dict[str, list[Fl
     return scale
 
 
-def _make_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> ShotsByExperiment:
+def _make_shots(problem: FitProblem, z: Float[np.ndarray, " n"], count: int) -> ShotsByExperiment:
     """Return shots whose nodes are where a filter that hardly trusts the plant sees the state."""
     predicting = add_predictors(problem, z, follows=False)
     experiments = (problem if predicting is None else predicting).experiments
@@ -388,7 +388,7 @@ def _make_shots(problem: Residuals, z: Float[np.ndarray, " n"], count: int) -> S
 def _make_segment_shots(
     experiment: FitExperiment, segment: FitSegment, z: Float[np.ndarray, " n"], count: int
 ) -> Shots:
-    edges, nx = shot_edges(segment.samples.n, count), experiment.model.nx
+    edges, nx = cut_into_shots(segment.samples.n, count), experiment.model.nx
     shots = len(edges) - 1
     nodes = np.zeros((shots, nx))
     if experiment.predictor is not None:
@@ -402,7 +402,7 @@ def _make_segment_shots(
 
 
 def _with_first_nodes(
-    problem: Residuals, z: Float[np.ndarray, " n"], shots: ShotsByExperiment
+    problem: FitProblem, z: Float[np.ndarray, " n"], shots: ShotsByExperiment
 ) -> Float[np.ndarray, " n"]:
     """Return the unknowns with each segment's first node as its initial state."""
     z = z.copy()

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
-from seaopt.estimation.problem.residuals import Evaluation, Residuals
 from seaopt.records import record
 from seaopt.simulation import Pass
 
@@ -48,7 +48,7 @@ class Check:
 Checks = Mapping[str, Check]  # by experiment, those that are known
 
 
-def choose_first_steps(problem: Residuals, start: Evaluation) -> tuple[Residuals, Evaluation]:
+def choose_first_steps(problem: FitProblem, start: Evaluation) -> tuple[FitProblem, Evaluation]:
     """Return the problem with steps that do for a first search, and its evaluation there."""
     while True:
         finer = problem.map(lambda experiment, here=start: _choose_first_steps(experiment, here))
@@ -70,7 +70,7 @@ def _choose_first_steps(experiment: FitExperiment, here: Evaluation) -> int:
     return _choose_steps(experiment.substeps, StepError(output=error), FIRST_STEP_ERROR)
 
 
-def refine_steps(problem: Residuals, here: Evaluation, checks: Checks) -> tuple[Residuals, Evaluation, Checks]:
+def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
     """Return the problem with steps whose error is small, its evaluation there, and the errors that are known there.
 
     That of a step that was made finer is not: order four says how fine it must be, and the next minimum is looked at.
@@ -88,7 +88,7 @@ def refine_steps(problem: Residuals, here: Evaluation, checks: Checks) -> tuple[
             return problem, here, checks
 
 
-def check_steps(problem: Residuals, here: Evaluation, checks: Checks) -> Checks:
+def check_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> Checks:
     """Return the step error of every experiment: known still, where neither its step nor the minimum has changed."""
 
     def check(experiment: FitExperiment) -> Check:
@@ -108,7 +108,7 @@ def find_worst(checks: Checks) -> StepError:
     return StepError(output=max(error.output for error in errors), parameter=max(error.parameter for error in errors))
 
 
-def _with_substeps(problem: Residuals, substeps: Sequence[int]) -> Residuals:
+def _with_substeps(problem: FitProblem, substeps: Sequence[int]) -> FitProblem:
     return problem.with_values("substeps", {e.name: m for e, m in zip(problem.experiments, substeps, strict=True)})
 
 
@@ -122,7 +122,7 @@ def _choose_steps(steps: int, error: StepError, allowed: float) -> int:
 
 
 @np.errstate(all="ignore")
-def measure_step_error(problem: Residuals, experiment: FitExperiment, here: Evaluation) -> StepError:
+def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Evaluation) -> StepError:
     """Return the integration error of an experiment, from steps of half the length (order four: 16/15 of the change).
 
     In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far

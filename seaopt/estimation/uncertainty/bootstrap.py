@@ -29,9 +29,9 @@ from jaxtyping import Bool, Float, Int
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.correlation import autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
-from seaopt.estimation.problem.residuals import Residuals
 from seaopt.estimation.result.covariance import Covariance, compute_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
@@ -165,7 +165,7 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     )  # fmt: skip
 
 
-def _check(fit: Fit, problem: Residuals, draws: int, refit: bool, block: int | None) -> None:
+def _check(fit: Fit, problem: FitProblem, draws: int, refit: bool, block: int | None) -> None:
     if draws < FEWEST_DRAWS:
         raise EstimationError(f"bootstrap: draws = {draws} are too few for a covariance; give {FEWEST_DRAWS} or more")
     if block is not None and block < 1:
@@ -233,7 +233,7 @@ class _Blocks:
 
 
 def _draw_blocks(
-    problem: Residuals, lengths: Mapping[str, int], pools: Mapping[str, Float[np.ndarray, "_ ny"]], draws: int,
+    problem: FitProblem, lengths: Mapping[str, int], pools: Mapping[str, Float[np.ndarray, "_ ny"]], draws: int,
     rng: np.random.Generator,
 ) -> dict[str, _Blocks]:  # fmt: skip
     """Return the blocks of each experiment."""

@@ -13,7 +13,7 @@ from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import FileError, SeaoptError
-from seaopt.estimation import resting_on
+from seaopt.estimation import warn_unidentified
 from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -313,7 +313,7 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        return (*resting_on(self.parameters, used), *outside, *little)
+        return (*warn_unidentified(self.parameters, used), *outside, *little)
 
     def _bounds(self, name: str) -> dict[str, Any]:
         return self.brackets[name].to_dict() if name in self.brackets else {}

@@ -71,7 +71,7 @@ class Evaluation(QuadraticModel):
 
 
 @record(eq=False)
-class Residuals:
+class FitProblem:
     """Experiments and their unknowns: what a fit minimises.
 
     Parameters
@@ -119,16 +119,16 @@ class Residuals:
         """Whether every plant is linear."""
         return all(experiment.model.linear for experiment in self.experiments)
 
-    def with_each(self, **changes: Any) -> Residuals:
+    def with_each(self, **changes: Any) -> FitProblem:
         """Return the problem with the same changes to each experiment."""
         return replace(self, experiments=tuple(replace(experiment, **changes) for experiment in self.experiments))
 
-    def with_values(self, field: str, values: Mapping[str, Any]) -> Residuals:
+    def with_values(self, field: str, values: Mapping[str, Any]) -> FitProblem:
         """Return the problem with other values of one field of its experiments, by their names."""
         experiments = (replace(e, **{field: values[e.name]}) if e.name in values else e for e in self.experiments)
         return replace(self, experiments=tuple(experiments))
 
-    def with_sigma(self, sigma: Mapping[str, Float[np.ndarray, " _"]]) -> Residuals:
+    def with_sigma(self, sigma: Mapping[str, Float[np.ndarray, " _"]]) -> FitProblem:
         """Return the problem with other sigmas, by experiment."""
         return self.with_values("sigma", sigma)
 
@@ -150,7 +150,7 @@ class Residuals:
         del here, share
         return self.evaluate(z)
 
-    @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which is said there
+    @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which callers check
     def assemble(self, passes: PassSet, to: Float[np.ndarray, " n"] | None = None) -> Evaluation:
         """Return the evaluation that passes give: other sigmas need no other passes.
 
@@ -200,7 +200,7 @@ class Residuals:
 
     def rebuild(
         self, params: ParameterSet, z: Float[np.ndarray, " n"], data: Mapping[str, Experiment] | None = None
-    ) -> tuple[Residuals, Float[np.ndarray, " n"]]:
+    ) -> tuple[FitProblem, Float[np.ndarray, " m"]]:
         """Return the problem with other parameters free, and `z` in its unknowns; new ones are at their start.
 
         Parameters
@@ -225,7 +225,7 @@ class Residuals:
             theta = np.array([unknowns.names.index(name) for name in model.free], dtype=int)
             segments = make_segments(new, slots, theta.tolist(), old.holdout)
             rebuilt.append(replace(old, data=new, segments=segments, model=model, theta=theta, slots=slots))
-        return Residuals(
+        return FitProblem(
             experiments=tuple(rebuilt), unknowns=replace(unknowns, start=start), params=params
         ), values  # fmt: skip
 
@@ -238,11 +238,11 @@ def pose_problem(
     band_hz: tuple[float, float] | None = None,
     holdout: float = 0.0,
     noise: bool = False,
-) -> Residuals:
+) -> FitProblem:
     """Return the problem of fitting the free ones of `params` to experiments; with `noise`, their process noise too."""
     unknowns, modelled = collect(experiments, params, noise=noise, band_hz=band_hz)
     posed = tuple(
         make_fit_experiment(data, model, slots, unknowns.names, loss=loss, band_hz=band_hz, holdout=holdout)
         for data, (model, slots) in zip(experiments, modelled, strict=True)
     )
-    return Residuals(experiments=posed, unknowns=unknowns, params=params)
+    return FitProblem(experiments=posed, unknowns=unknowns, params=params)
