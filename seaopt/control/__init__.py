@@ -5,7 +5,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import Gains, Notch, Observer
+from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.margins import DiskMargin, Margins, margins, nu_gap
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -24,10 +24,10 @@ from seaopt.control.tuning.frontier import Frontier, sweep
 from seaopt.control.tuning.tuner import current_per_force, tune
 
 __all__ = [
-    "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "Estimator", "EstimatorRun", "EstimatorState",
-    "ForceMPC", "ForceRun", "Frontier", "Gains", "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep",
-    "Margins", "NoiseModel", "Notch", "Observer", "Passivity", "RunnableLaw", "SampledLoop", "TransferFunction",
-    "close_loop", "corners", "current_per_force", "draw", "estimate_noise", "estimator", "export", "export_mpc",
-    "force_mpc", "margins", "nu_gap", "passivity", "passivity_rows", "realise", "run_loop", "runnable", "sample",
-    "sweep", "tune",
+    "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator", "EstimatorRun",
+    "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "LawState", "Loop", "LoopFigures", "MPCSpec",
+    "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity", "RunnableLaw", "SampledLoop",
+    "TransferFunction", "close_loop", "corners", "current_per_force", "draw", "estimate_noise", "estimator", "export",
+    "export_mpc", "force_mpc", "margins", "nu_gap", "passivity", "passivity_rows", "realise", "run_loop", "runnable",
+    "sample", "sweep", "tune",
 ]  # fmt: skip

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.control import Controller, Frontier
+from seaopt.control.laws.verdict import list_design_figures
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.estimation.advice.forecasts import Percent
@@ -322,6 +323,7 @@ def _page(
         title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller, certificate=certificate,
         figures=figures, verdict=verdict(fit, controller, certificate, verification), swinging=_swinging(certificate),
         forces=_forces(controller), simulated=simulated,
+        limited=[] if controller is None else list_design_figures(controller.spec, controller.achieved),
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import bilinear, lfilter
 
 import seaopt as so
-from seaopt.control import Controller, Gains, Notch, Observer, corners, current_per_force, draw, sample
+from seaopt.control import Controller, DisturbanceObserver, Gains, Notch, corners, current_per_force, draw, sample
 from seaopt.control.laws.structures import Nominal
 from seaopt.control.tuning.feasibility import sensitivity_possible
 from seaopt.errors import ControlError
@@ -29,7 +29,12 @@ def test_the_observer_is_the_written_one(stand, thor):
     """Sample by sample: F_m = v - Q(F_meas/P_n - F_m), Q F_m from past outputs alone."""
     plant = digital(stand, thor)
     gains = Gains(
-        k_p=2.0, k_i=5.0, k_d=0.03, T_f=2e-3, k_ff=1.0, observer=Observer(nominal=Nominal.of(plant), T_q=5e-3)
+        k_p=2.0,
+        k_i=5.0,
+        k_d=0.03,
+        T_f=2e-3,
+        k_ff=1.0,
+        observer=DisturbanceObserver(nominal=Nominal.of(plant), T_q=5e-3),
     )
     q, q_over_p = gains.observer.filters(TS)
     assert q.num[0] == 0.0
@@ -50,7 +55,7 @@ def test_the_nominal_inverse_is_stable_and_exact(thor, options):
     """Q/P_n times the plant, from its matrices, is Q; and Q is 1 at 0 Hz."""
     stand = so.plants.high_impedance(**options)
     plant = digital(stand, stand.complete(thor), delay=2)
-    observer = Observer(nominal=Nominal.of(plant), T_q=4e-3)
+    observer = DisturbanceObserver(nominal=Nominal.of(plant), T_q=4e-3)
     q, q_over_p = observer.filters(TS)
     f = np.geomspace(0.5, 490, 60)
     z = np.exp(2j * np.pi * f * TS)

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from seaopt.control.laws.limits import Limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.stored import stored
-from seaopt.control.laws.structures import Observer
+from seaopt.control.laws.structures import DisturbanceObserver
+from seaopt.control.laws.verdict import list_design_figures
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -58,7 +60,7 @@ class Controller:
         The plants, besides the design plant, that Ms and Mt were kept on.
     design : (Plant, ParameterSet) or None
         The design plant and its parameters.
-    observer : Observer or None
+    observer : DisturbanceObserver or None
         The disturbance observer of a pid_dob, which is in the law already.
     blocked_by : tuple of str
         The limits that are broken, each with its figure.
@@ -81,7 +83,7 @@ class Controller:
     active_constraints: tuple[str, ...]
     robust_to: tuple[str, ...] = ()
     design: tuple[Plant, ParameterSet] | None = None
-    observer: Observer | None = None
+    observer: DisturbanceObserver | None = None
     blocked_by: tuple[str, ...] = ()
     largest_bandwidth_hz: float | None = None
 
@@ -270,28 +272,26 @@ class Controller:
         )  # fmt: skip
 
     def _achieved_rows(self) -> list[tuple[str, str, str]]:
-        a, s = self.achieved, self.spec
+        a = self.achieved
         band, delay = a.tracking_band_hz, a.delay_margin_s
+        limited = [
+            (limit.label, format_figure(value, limit.unit), _format_allowed(limit, allowed))
+            for limit, value, allowed in list_design_figures(self.spec, a)
+        ]
         return [
-            ("bandwidth", format_figure(a.bandwidth_hz, "Hz"), f"{s.bandwidth_hz:g} Hz"),
+            *limited,
             ("tracking band", "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", ""),
-            (
-                "sensitivity bandwidth", format_figure(a.sensitivity_bandwidth_hz, "Hz"),
-                f"at least {s.sensitivity_bandwidth_limit_hz:g} Hz",
-            ),
-            ("Ms", format_figure(a.ms), _limited("at most", s.max_sensitivity)),
-            ("Mt", format_figure(a.mt), _limited("at most", s.max_complementary)),
-            ("reference peak", format_figure(a.reference_peak), _limited("at most", s.max_reference_peak)),
-            ("noise gain", format_figure(a.noise_gain, "N/N"), _limited("at most", s.max_noise_gain)),
-            ("disk margin", format_figure(a.disk_margin), _limited("at least", s.min_disk_margin)),
             ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
             ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
             ("delay margin", format_figure(None if delay is None else 1e3 * delay, "ms"), ""),
-        ]  # fmt: skip
+        ]
 
 
-def _limited(sense: str, limit: float | None) -> str:
-    return "" if limit is None else f"{sense} {limit:g}"
+def _format_allowed(limit: Limit, allowed: float | None) -> str:
+    if allowed is None:
+        return ""
+    sense = "" if limit.sense == "equal to" else f"{limit.sense} "
+    return f"{sense}{allowed:g} {limit.unit}".rstrip()
 
 
 def _shown(value: float | None) -> str:

@@ -1,4 +1,4 @@
-r"""Two transfer functions over their poles as one state space of least order, integrators apart.
+r"""Realise a law's two transfer functions as one state space of least order, integrators apart, for `realisation`.
 
 C_r and C_y become one system with two inputs, of least order, in coordinates that single precision can hold. With
 :math:`\delta = 1 - q`, every denominator is :math:`\delta^m R(q)`, R without a root at 1, and the m integrators split
@@ -33,7 +33,7 @@ VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
 @record(eq=False)
-class Part:
+class SplitLaw:
     """A transfer function taken apart: g_1 ... g_m, Y, R, and the first m + 2 terms of the series of N/R."""
 
     chain: Float[np.ndarray, " m"]
@@ -42,7 +42,7 @@ class Part:
     series: Float[np.ndarray, " _"]
 
 
-def split(name: str, tf: TransferFunction) -> Part:
+def split(name: str, tf: TransferFunction) -> SplitLaw:
     """Take a transfer function apart as the module's docstring does, m as small as the numerator lets it be.
 
     Raises
@@ -55,25 +55,25 @@ def split(name: str, tf: TransferFunction) -> Part:
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
         raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
     if not np.any(num):
-        return Part(chain=np.zeros(0), rest=np.zeros(1), den=np.ones(1), series=np.zeros(2))
-    while den.size > 1 and _at_one(den, POLE_AT_ONE):
+        return SplitLaw(chain=np.zeros(0), rest=np.zeros(1), den=np.ones(1), series=np.zeros(2))
+    while den.size > 1 and _has_root_at_one(den, POLE_AT_ONE):
         den, m = np.cumsum(den)[:-1], m + 1
-        if num.size > 1 and _at_one(num, ZERO_AT_ONE):
+        if num.size > 1 and _has_root_at_one(num, ZERO_AT_ONE):
             num, m = np.cumsum(num)[:-1], m - 1
-    series = _taylor(num, den, m + 2)
+    series = _expand(num, den, m + 2)
     chain = np.zeros(m + 1)  # the coefficients of w^0 ... w^m in X / delta^m, with 1/delta = 1 + w
     for power, value in zip(range(m, 0, -1), series, strict=False):
         chain[: power + 1] += value * np.array([math.comb(power, i) for i in range(power + 1)])
-    removed = np.convolve(_flipped(series[:m]), den) if m else np.zeros(1)
+    removed = np.convolve(_flip(series[:m]), den) if m else np.zeros(1)
     rest = np.zeros(max(num.size, removed.size, m + 1))
     rest[: num.size] = num
     rest[: removed.size] -= removed
     for _ in range(m):
         rest = np.cumsum(rest)[:-1]
-    return Part(chain=chain[1:], rest=rest, den=den, series=series)
+    return SplitLaw(chain=chain[1:], rest=rest, den=den, series=series)
 
 
-def common(parts: list[Part]) -> tuple[list[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]]:
+def put_over_one_denominator(parts: list[SplitLaw]) -> tuple[list[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]]:
     """Return both Y over one R."""
     one, other = parts
     if np.array_equal(one.den, other.den):
@@ -81,11 +81,11 @@ def common(parts: list[Part]) -> tuple[list[Float[np.ndarray, " _"]], Float[np.n
     return [np.convolve(one.rest, other.den), np.convolve(other.rest, one.den)], np.convolve(one.den, other.den)
 
 
-def _at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:
+def _has_root_at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:
     return bool(abs(np.sum(polynomial)) <= share * np.sum(np.abs(polynomial)))
 
 
-def _flipped(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _flip(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return the coefficients in 1 - q of a polynomial in q, or the other way."""
     out = np.zeros(polynomial.size)
     for value in polynomial[::-1]:  # Horner's rule; the last coefficient shifted out is zero
@@ -94,16 +94,16 @@ def _flipped(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return out
 
 
-def _taylor(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: int) -> Float[np.ndarray, " terms"]:
+def _expand(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: int) -> Float[np.ndarray, " terms"]:
     """Return the first terms of num/den in powers of 1 - q."""
-    top, bottom = (np.concatenate([_flipped(p), np.zeros(terms)]) for p in (num, den))
+    top, bottom = (np.concatenate([_flip(p), np.zeros(terms)]) for p in (num, den))
     out = np.zeros(terms)
     for j in range(terms):
         out[j] = (top[j] - np.dot(out[:j], bottom[j:0:-1])) / bottom[0]
     return out
 
 
-def balanced(
+def balance(
     numerators: list[Float[np.ndarray, " _"]], den: Float[np.ndarray, " k"], gain: float
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Return a balanced realisation of least order of two transfer functions over one denominator, each of its input.

@@ -35,7 +35,7 @@ from jaxtyping import Complex, Float
 from scipy.linalg import block_diag
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.minimal import Part, balanced, common, split
+from seaopt.control.laws.minimal import SplitLaw, balance, put_over_one_denominator, split
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.records import record
@@ -268,7 +268,7 @@ def realise(
     for column, part in enumerate(parts):
         gains[: part.chain.size, column] = part.chain
     through = (float(reference.num[0]), float(measurement.num[0]))
-    a, b, c = balanced(*common(parts), max(map(abs, through)))
+    a, b, c = balance(*put_over_one_denominator(parts), max(map(abs, through)))
     tracking = _tracking(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
     share = sample_time_s / (tracking + sample_time_s) if tracking is not None else 0.0
     b = np.vstack([gains, b])
@@ -306,7 +306,7 @@ def _check(law: RunnableLaw, reference: TransferFunction, measurement: TransferF
             )
 
 
-def _tracking(parts: list[Part], sample_time_s: float) -> float:
+def _tracking(parts: list[SplitLaw], sample_time_s: float) -> float:
     """Return T_s abs(a_1/a_0) of C_r, of C_y where the reference is not integrated; a sample at least."""
     most = max(part.chain.size for part in parts)
     a_0, a_1 = next(part.series for part in parts if part.chain.size == most)[:2]

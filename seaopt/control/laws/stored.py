@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import Gains, Nominal, Notch, Observer
+from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal, Notch
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError, FileError
 
@@ -54,7 +54,10 @@ def stored(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _agree(
-    gains: Mapping[str, float], observer: Observer | None, spec: ControllerSpec, law: Mapping[str, TransferFunction]
+    gains: Mapping[str, float],
+    observer: DisturbanceObserver | None,
+    spec: ControllerSpec,
+    law: Mapping[str, TransferFunction],
 ) -> None:
     """Refuse gains that do not give the coefficients."""
     needed = {*LAW, *(NOTCH if "notch_depth" in gains else ()), *(("T_q",) if observer is not None else ())}
@@ -109,13 +112,13 @@ def _transfer_function(content: Mapping[str, Any], name: str) -> TransferFunctio
     return TransferFunction(num=num, den=den)
 
 
-def _observer(content: Any) -> Observer | None:
+def _observer(content: Any) -> DisturbanceObserver | None:
     if content is None:
         return None
     table = _item(content, "inverse", "observer.")
     inverse = TransferFunction(**{part: _numbers(table, part, "observer.inverse.") for part in ("num", "den")})
     nominal = Nominal(kept=_numbers(content, "kept", "observer."), inverse=inverse)
-    return Observer(nominal=nominal, T_q=_number(content, "T_q", "observer."))
+    return DisturbanceObserver(nominal=nominal, T_q=_number(content, "T_q", "observer."))
 
 
 def _item(content: Any, name: str, before: str = "") -> Any:

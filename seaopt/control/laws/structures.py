@@ -113,7 +113,7 @@ class Nominal:
 
 
 @record(eq=False)
-class Observer:
+class DisturbanceObserver:
     """A disturbance observer: the filters Q and Q/P_n.
 
     Parameters
@@ -162,7 +162,7 @@ class Gains:
         N/N: feedforward of the reference.
     derivative : {"error", "measurement"}
         What is differentiated.
-    observer : Observer, optional
+    observer : DisturbanceObserver, optional
         Of a pid_dob.
     notch : Notch, optional
         With a value in every field.
@@ -175,7 +175,7 @@ class Gains:
     T_f: float
     k_ff: float
     derivative: Derivative = "error"
-    observer: Observer | None = None
+    observer: DisturbanceObserver | None = None
     notch: Notch | None = None
 
     def by_name(self) -> dict[str, float]:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from seaopt.control.laws.limits import LIMITS, Limit, MeasuredLoop, Scope
+from seaopt.control.laws.limits import FIELDS, LIMITS, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.records import record
 
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
@@ -67,6 +67,18 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
 def explain_broken(spec: ControllerSpec, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
     """Return each limit that is broken with the figure that was reached; `loop` is the design plant's."""
     return [_explain(spec, verdict, design, loop) for verdict in verdicts if not verdict.met]
+
+
+def list_design_figures(spec: ControllerSpec, figures: LoopFigures) -> list[tuple[Limit, float | None, float | None]]:
+    """Return for tables each limit of one loop's figures, the figure, and what is allowed; None where there is none."""
+    loop = MeasuredLoop(name="design", figures=figures)
+    rows: list[tuple[Limit, float | None, float | None]] = []
+    for limit in FIELDS:
+        if limit.condition is None:  # a figure of the loop alone
+            value = limit.figure(loop)
+            reached = limit.sense != "equal to" or np.isfinite(value)
+            rows.append((limit, value if reached else None, spec.allowed(limit)))
+    return rows
 
 
 def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:

@@ -26,7 +26,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control.laws.limits import BY_NAME, LIMITS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
-from seaopt.control.laws.structures import Gains, LawTerms, Nominal, Notch, Observer, evaluate_terms
+from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.port import Port, sight
 from seaopt.control.loops.sampled_plant import DigitalPlant
@@ -149,7 +149,7 @@ class Task:
         return Gains(
             k_p=float(x[0]), k_i=float(x[1]), k_d=float(x[2]), T_f=float(x[3]), k_ff=self.k_ff,
             derivative=self.spec.derivative, notch=notch,
-            observer=None if self.nominal is None else Observer(nominal=self.nominal, T_q=float(x[4])),
+            observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[4])),
         )  # fmt: skip
 
     def loop(self, x: LawNumbers, plant: int = 0) -> Loop:
