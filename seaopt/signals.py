@@ -59,7 +59,7 @@ class Signal:
 
     def __post_init__(self) -> None:
         if self.values.ndim != 1:
-            raise LogError(f"channel {self.name} has shape {self.values.shape}; give one value a sample")
+            raise LogError(f"channel {self.name} has shape {self.values.shape}; give one value per sample")
         self.values.setflags(write=False)
 
 

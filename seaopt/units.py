@@ -116,7 +116,7 @@ def si_unit(unit: str) -> str:
 
 
 def is_unit(text: str) -> bool:
-    """Tell whether a text is a known unit."""
+    """Return whether a text is a known unit."""
     try:
         si_unit(text)
     except UnitError:
@@ -125,7 +125,7 @@ def is_unit(text: str) -> bool:
 
 
 def same_dimension(first: str, second: str) -> bool:
-    """Tell whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
+    """Return whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
     return bool(_parse(first).dimensionality == _parse(second).dimensionality)
 
 

@@ -52,6 +52,8 @@ def test_resampling_a_jittered_log_is_a_line_between_samples():
     log = make(t, F1=sine(t))
     with pytest.raises(LogError, match=r"log.resample\(rate_hz=500\)"):
         _ = log.segments
+    with pytest.raises(LogError, match=r"log.resample\(rate_hz=5000\)"):  # not 5e+03
+        _ = make(t / 10, F1=sine(t)).segments
     even = log.resample(rate_hz=500)
     assert len(even.segments) == 1
     np.testing.assert_allclose(even.time, t[0] + np.arange(len(even)) / 500, atol=1e-12)

@@ -72,7 +72,7 @@ def _list_dataset(node: Any, name: str) -> Fields:
         yield Field(name=name, kind="data in another file", length=None), Place(array=node.name), None
         return
     dtype = node.dtype
-    if dtype.names:  # a table: one field a column
+    if dtype.names:  # a table: one field per column
         for part in dtype.names:
             kind = dtype[part].name if not dtype[part].shape else f"array {dtype[part]}"
             field = Field(name=f"{name}.{part}", kind=kind, length=node.size)

@@ -18,7 +18,7 @@ from seaopt.logs.formats.text_layout import MAX_LINE, line_length_error
 from seaopt.units import header_unit
 
 MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
-Entry = Mapping[str, Any]
+JsonEntry = Mapping[str, Any]
 
 
 def open_json(path: Path) -> Source:
@@ -71,7 +71,7 @@ def _to_number(path: Path, place: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def _read_entries(path: Path, notes: list[str]) -> Generator[tuple[str, Entry]]:
+def _read_entries(path: Path, notes: list[str]) -> Generator[tuple[str, JsonEntry]]:
     """Return the entries with their places; of a header, a note."""
     with path.open("rb") as stream:
         first = _read_line(path, stream, 1)
@@ -94,17 +94,17 @@ def _read_line(path: Path, stream: Any, number: int) -> bytes:
 
 
 def _is_entry(line: bytes) -> bool:
-    """Tell whether the first line is an object by itself, as in JSON lines."""
+    """Return whether the first line is an object by itself, as in JSON lines."""
     try:
         return len(line) <= MAX_LINE and isinstance(json.loads(line), dict)
     except (ValueError, RecursionError):
         return False
 
 
-def _read_whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Entry]]:
+def _read_whole(path: Path, notes: list[str]) -> Iterator[tuple[str, JsonEntry]]:
     size = path.stat().st_size
     if size > MAX_WHOLE:
-        raise LogError(f"{path}: is {size >> 20} MiB of JSON in one piece; save it as JSON lines, one entry a line")
+        raise LogError(f"{path}: is {size >> 20} MiB of JSON in one piece; save it as JSON lines, one entry per line")
     content = _parse(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
     entries = content
     if isinstance(content, dict):
@@ -120,13 +120,13 @@ def _read_whole(path: Path, notes: list[str]) -> Iterator[tuple[str, Entry]]:
         yield f"entry {number}", _check_object(path, entry, f"entry {number}")
 
 
-def _transpose(path: Path, content: dict[str, Any]) -> list[Entry]:
-    """Return the entries of an object of lists, one list a column; without lists it is an entry itself."""
+def _transpose(path: Path, content: dict[str, Any]) -> list[JsonEntry]:
+    """Return the entries of an object of lists, one list per column; without lists it is an entry itself."""
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     lengths = {len(value) for value in lists.values()}
     if len(lengths) > 1:
         counts = ", ".join(f"{key}: {len(value)}" for key, value in list(lists.items())[:10])
-        raise LogError(f"{path}: its lists differ in length ({counts}); write one value a sample in each")
+        raise LogError(f"{path}: its lists differ in length ({counts}); write one value per sample in each")
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)] if lists else [content]
 
 
@@ -155,13 +155,13 @@ def _check_unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return entry
 
 
-def _check_object(path: Path, entry: Any, place: str) -> Entry:
+def _check_object(path: Path, entry: Any, place: str) -> JsonEntry:
     if not isinstance(entry, dict):
         raise LogError(f"{path}: {place} is not an object but {json.dumps(entry)[:40]}; write one with named values")
     return entry
 
 
-def flatten(record: Entry, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+def flatten(record: JsonEntry, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
     """Return names and values; a list gives one name for each of its first elements."""
     for key, value in record.items():
         name = f"{prefix}{key}"

@@ -242,7 +242,7 @@ def _wrap_rosbags(reader: Any, connections: Sequence[Any], start: int, encoding:
 def _limit_size(chunk: Any) -> Callable[[bytes], bytes]:
     """Return the chunk's own decompressor, stopped at the limit."""
 
-    def unpacked(data: bytes) -> bytes:
+    def unpack(data: bytes) -> bytes:
         if data.startswith(b"BZh"):
             stream: Any = bz2.BZ2Decompressor()
         elif data.startswith(b"\x04\x22\x4d\x18"):
@@ -256,7 +256,7 @@ def _limit_size(chunk: Any) -> Callable[[bytes], bytes]:
             raise ValueError(f"a chunk unpacks to more than {MAX_CHUNK >> 20} MiB, or is cut off")
         return out
 
-    return unpacked
+    return unpack
 
 
 @contextmanager

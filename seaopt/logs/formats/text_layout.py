@@ -102,7 +102,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def is_number(cell: str, comma: bool) -> bool:
-    """Tell whether a cell is a number, or infinite."""
+    """Return whether a cell is a number, or infinite."""
     return _NUMBER.fullmatch(cell.replace(",", ".", 1) if comma else cell) is not None
 
 
@@ -142,7 +142,7 @@ def encoding_error(path: Path, encoding: str, error: UnicodeError) -> LogError:
 
 def line_length_error(path: Path, line: int) -> LogError:
     """Return the error of a line that no log has."""
-    return LogError(f"{path}: line {line} is longer than {MAX_LINE >> 20} MiB; is it a log? save one row a line")
+    return LogError(f"{path}: line {line} is longer than {MAX_LINE >> 20} MiB; is it a log? save one row per line")
 
 
 def _is_comment(line: str) -> bool:
@@ -178,7 +178,7 @@ def _is_data(line: str, delimiter: str, comma: bool, width: int) -> bool:
 
 
 def _is_numeric(rows: list[list[str]], index: int, comma: bool) -> bool:
-    """Tell whether a column's first filled cell is a number; a column that starts empty may still hold some."""
+    """Return whether a column's first filled cell is a number; a column that starts empty may still hold some."""
     for row in rows:
         if index < len(row) and row[index].casefold() not in BLANK:
             return is_number(row[index], comma)
@@ -235,7 +235,7 @@ def _split_header(line: str, delimiter: str) -> list[str]:
 
 
 def _fits(row: list[str], width: int, rows: list[list[str]]) -> bool:
-    """Tell whether a line can be the header: as wide as the data, but for cells that are empty in every row."""
+    """Return whether a line can be the header: as wide as the data, but for cells that are empty in every row."""
     if len(row) >= width:
         return not any(row[width:]) or all(len(data) <= len(row) for data in rows)
     return len(row) > 0 and not any(cell for data in rows for cell in data[len(row) :])

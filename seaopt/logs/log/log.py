@@ -154,9 +154,10 @@ class Log:
         for stretch in stretches:
             worst = float(np.max(np.abs(np.diff(self.time[stretch]) - self.period)))
             if worst > JITTER_LIMIT * self.period:
+                round_rate = float(f"{1.0 / self.period:.3g}")
                 raise LogError(
                     f"{self.source}: a step of time differs by {worst / self.period:.0%} from the period "
-                    f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={1.0 / self.period:.3g}), or "
+                    f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={round_rate:g}), or "
                     "log.restamp() where only the timestamps are rounded (in a problem file: resample)"
                 )
         return stretches
@@ -380,13 +381,13 @@ def _steps(time: Float[np.ndarray, " n"]) -> Iterator[Float[np.ndarray, " _"]]:
 
 
 def _increases(time: Float[np.ndarray, " n"]) -> bool:
-    """Tell whether time is finite and strictly increasing; a time that is not finite has a step that is not."""
+    """Return whether time is finite and strictly increasing; a time that is not finite has a step that is not."""
     with np.errstate(invalid="ignore", over="ignore"):
         return all(step.min() > 0 and step.max() < np.inf for step in _steps(time))
 
 
 def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
-    """Say where time does not increase, and what to do."""
+    """Return where time does not increase, and what to do."""
     if not np.all(np.isfinite(time)):
         row = int(np.flatnonzero(~np.isfinite(time))[0])
         return f"time is not a number in sample {row + 1}; remove that row"

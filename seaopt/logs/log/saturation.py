@@ -88,7 +88,7 @@ def _find_clipped(values: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n
 
 
 def _may_be_clipped(values: Float[np.ndarray, " n"]) -> bool:
-    """Tell whether some of the largest, or of the least, samples are equal: nearly every log ends here."""
+    """Return whether some of the largest, or of the least, samples are equal: nearly every log ends here."""
     finite = values[np.isfinite(values)]
     if finite.size <= 2 * EXTREME_SAMPLES:
         return False

@@ -137,7 +137,7 @@ def _rounding_explains(
     stamps: Float[np.ndarray, " n"], step: Float[np.ndarray, " m"], across: Float[np.ndarray, " m"] | np.ndarray,
     rounding: float, period: float,
 ) -> bool:  # fmt: skip
-    """Tell whether every stretch between gaps lies on a line through its timestamps, within their rounding."""
+    """Return whether every stretch between gaps lies on a line through its timestamps, within their rounding."""
     if np.any(step < 0.0):
         return False
     breaks = np.flatnonzero(across) + 1

@@ -11,7 +11,7 @@ from seaopt.records import record
 
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
 REACHED = 0.1  # of the largest power in a band; what is weaker is the window's
-COHERENT = 0.5  # of an output with the input, power-weighted; below it most of the output is something else
+LEAST_COHERENCE = 0.5  # of an output with the input, power-weighted; below it most of the output is something else
 
 
 @record
@@ -148,7 +148,7 @@ def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) ->
                 reach_hz=float(np.max(f[row[power[row] >= REACHED * np.max(power[row])]])),
                 share=float(sums[k] / total), level_db=float(max(levels[k], -300.0)), coherence=best,
                 gain=float(weight @ gains[row]) if gains is not None else None,
-                usable=bool(levels[k] >= -RANGE_DB and (best is None or best >= COHERENT)),
+                usable=bool(levels[k] >= -RANGE_DB and (best is None or best >= LEAST_COHERENCE)),
             )
         )  # fmt: skip
     return InputExcitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]))

@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.records import record
 
-SHORTEST, LONGEST = 32, 1 << 15  # samples in a stretch
+SHORTEST_STRETCH, LONGEST_STRETCH = 32, 1 << 15  # samples in a stretch
 FEWEST_STRETCHES, MOST_STRETCHES = 4, 64
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = 5
@@ -81,7 +81,7 @@ def compute_spectra(
 
     """
     total = sum(stretch.stop - stretch.start for stretch in stretches)
-    length = 2 * (min(max(total // 16, SHORTEST), LONGEST) // 2)
+    length = 2 * (min(max(total // 16, SHORTEST_STRETCH), LONGEST_STRETCH) // 2)
     starts = np.array(
         [row for rows in stretches for row in range(rows.start, rows.stop - length + 1, max(length // 2, 1))], dtype=int
     )

@@ -332,12 +332,12 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
 
 
 def _is_unit_bracket(field: Field) -> bool:
-    """Tell whether a header's brackets are meant as a unit: square ones without a number, which would be an index."""
+    """Return whether a header's brackets are meant as a unit: square ones without a number, which would be an index."""
     return field.unit is not None and field.name.endswith("]") and not field.unit.isdecimal()
 
 
 def _converts_by_factor(unit: str) -> bool:
-    """Tell whether a unit comes to SI by a factor alone."""
+    """Return whether a unit comes to SI by a factor alone."""
     try:
         factor(unit, si_unit(unit))
     except SeaoptError:
