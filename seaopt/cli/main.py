@@ -212,6 +212,19 @@ def export(
         raise typer.Exit(1)
 
 
+@app.command()
+def schema(
+    document: Annotated[
+        str, typer.Argument(metavar="problem|fit|robustness", help="Whose schema.", show_default=False)
+    ],
+) -> None:
+    """Print the JSON Schema of a file that seaopt reads, for editors."""
+    from seaopt.cli.schemas import json_schema
+    from seaopt.files import to_json
+
+    sys.stdout.write(to_json(json_schema(document)))
+
+
 def main() -> None:
     """Run the command line; a SeaoptError is one line on stderr and exit code 2."""
     try:

@@ -182,6 +182,7 @@ def test_a_requirement_not_met_exits_1(copied, seaopt, short):
         (("report", "short.toml", "-o", "empty"), "run seaopt fit"),
         (("fit", "short.toml", "-o", "short.toml"), "is a file"),
         (("fit", "."), "is a folder"),
+        (("schema", "robust"), 'did you mean "robustness"'),
         (("fit", "wide.toml"), "bandwidth_hz = 99 is outside 15 to 60"),
         (("fit", "column.toml"), 'no column "F1 \\[kN\\]"'),
     ],
@@ -201,6 +202,14 @@ def test_bad_input_is_one_line_and_exits_2(folder, seaopt, short, arguments, wor
     assert last.startswith("seaopt: ")
     assert re.search(words, last)
     assert not list((folder / "empty").glob("*"))
+
+
+@pytest.mark.parametrize(
+    ("document", "key"), [("problem", "plant"), ("fit", "covariance"), ("robustness", "monte_carlo")]
+)
+def test_schema_prints_a_json_schema(seaopt, document, key):
+    schema = json.loads(seaopt("schema", document).stdout)
+    assert schema["type"] == "object" and key in schema["required"]
 
 
 def test_unknown_options_exit_2(seaopt):
