@@ -162,4 +162,4 @@ def short_log(stand, thor) -> so.Log:
 @pytest.fixture
 def without_drawing(monkeypatch):
     """Let reports write empty figures: drawing takes most of their time."""
-    monkeypatch.setattr("seaopt.reporting.report.rendered", lambda figure, kind: b"<svg></svg>")
+    monkeypatch.setattr("seaopt.reporting.drawing.render_figure", lambda figure, kind: b"<svg></svg>")

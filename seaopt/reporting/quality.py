@@ -14,8 +14,8 @@ from seaopt.logs.quality.channel import ChannelQuality
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.report import describe_jitter
+from seaopt.reporting.drawing import write_figure
 from seaopt.reporting.figures import envelope, panels
-from seaopt.reporting.report import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from seaopt.control import Controller, Frontier
 from seaopt.control.laws.verdict import list_design_figures
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
-from seaopt.estimation.advice.forecasts import Percent
-from seaopt.files import write_bytes, write_text
+from seaopt.files import write_text
+from seaopt.formatting import format_number
 from seaopt.frequency import Survey
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.reporting.comparison import fit_surveys, sentence, survey_figure
+from seaopt.reporting.drawing import inline_svg, write_figure
 from seaopt.reporting.figures import all_figures
 from seaopt.reporting.residuals import ranking_figure, residual_figure
-from seaopt.reporting.verification import verification_figures, verification_section
+from seaopt.reporting.templates import render_template
+from seaopt.reporting.verification import render_verification, verification_figures
 from seaopt.robustness import Certificate
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.large_signal import LargeSignal
@@ -40,7 +37,6 @@ _CAPTIONS = {
     "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
     "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
 }
-DPI = 130
 
 
 def write_report(
@@ -86,57 +82,59 @@ def write_report(
 
     """
     kinds = (Fit, Ranking, Controller, Certificate, Verification, StabilityMap)
-    fit, ranking, controller, certificate, verification, coupled = (_only(results, kind) for kind in kinds)
-    large = [item for item in results if isinstance(item, LargeSignal)]
-    if not any(isinstance(item, (*kinds, LargeSignal)) for item in results):
+    fit, ranking, controller, certificate, verification, coupled = (_select(results, kind) for kind in kinds)
+    large = [result for result in results if isinstance(result, LargeSignal)]
+    if not any(isinstance(result, (*kinds, LargeSignal)) for result in results):
         raise SeaoptError(
             "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
         )
     if certificate is not None:
         controller = controller or certificate.controller
-        found = certificate.simulated
-        if found is not None:
-            verification, coupled = verification or found.verification, coupled or found.environments
-            large = large or list(found.large_signal)
+        simulation = certificate.simulated
+        if simulation is not None:
+            verification, coupled = verification or simulation.verification, coupled or simulation.environments
+            large = large or list(simulation.large_signal)
     surveys = fit_surveys(fit) if fit is not None else {}
     diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None else None
     figures = all_figures(fit, surveys, controller, _plants(controller, certificate))
-    figures |= _leftover_figures(fit, diagnostics, ranking)
+    figures |= _draw_residuals(fit, diagnostics, ranking)
     simulated = verification_figures(verification, large, coupled)
     figures |= simulated
     target = Path(path)
-    drawn: list[dict[str, str]] = []
+    sections: list[dict[str, str]] = []
     for place, (name, figure) in enumerate(figures.items(), start=1):
         if progress is not None:
             progress(name, place, len(figures))
-        svg = rendered(figure, "svg")
-        write_bytes(target.parent / "figures" / f"{name}.svg", svg)
-        write_bytes(target.parent / "figures" / f"{name}.png", rendered(figure, "png"))
-        drawn.append(
+        svg, _ = write_figure(figure, target.parent / "figures" / name)
+        sections.append(
             {
                 "name": name,
                 "kind": name.split("_")[0],
                 "caption": _caption(name),
-                "svg": _inline(svg.decode(), name),
+                "svg": inline_svg(svg.read_text(encoding="utf-8"), name),
                 "note": _note(name, surveys, fit),
             }
         )
-    shown = {item["name"]: item["svg"] for item in drawn if item["name"] in simulated}
+    svgs = {section["name"]: section["svg"] for section in sections if section["name"] in simulated}
     port = certificate.simulated if certificate is not None else None
-    section = verification_section(verification, large, coupled, port, shown, number)
-    return write_text(
-        target, _page(title, fit, diagnostics, ranking, controller, certificate, drawn, verification, section)
-    )
+    page = render_template(
+        "report.html.jinja", title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller,
+        certificate=certificate, figures=sections, verdict=verdict(fit, controller, certificate, verification),
+        swinging=_swings(certificate), forces=_describe_forces(controller),
+        limited=[] if controller is None else list_design_figures(controller.spec, controller.achieved),
+        simulated=render_verification(verification, large, coupled, port, svgs),
+    )  # fmt: skip
+    return write_text(target, page)
 
 
-def _leftover_figures(fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None) -> dict[str, Any]:
+def _draw_residuals(fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None) -> dict[str, Any]:
     """Return the figures of residuals, by file name."""
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     if fit is not None and diagnostics is not None:
-        found |= {f"residual_{name}": residual_figure(fit, diagnostics, name) for name in diagnostics.outputs}
+        figures |= {f"residual_{name}": residual_figure(fit, diagnostics, name) for name in diagnostics.outputs}
     if ranking is not None:
-        found["ranking"] = ranking_figure(ranking)
-    return found
+        figures["ranking"] = ranking_figure(ranking)
+    return figures
 
 
 def write_frequency_figure(
@@ -194,13 +192,13 @@ def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
     return write_figure(frontier_figure(frontier), path)
 
 
-def _only(results: Sequence[Result], kind: type) -> Any:
-    found = [item for item in results if isinstance(item, kind)]
-    if len(found) > 1:
+def _select(results: Sequence[Result], kind: type) -> Any:
+    matches = [result for result in results if isinstance(result, kind)]
+    if len(matches) > 1:
         raise SeaoptError(
-            f"write_report got {len(found)} results of kind {kind.__name__}; give one, or write two pages"
+            f"write_report got {len(matches)} results of kind {kind.__name__}; give one, or write two pages"
         )
-    return found[0] if found else None
+    return matches[0] if matches else None
 
 
 def _plants(controller: Controller | None, certificate: Certificate | None) -> dict[str, tuple[Plant, ParameterSet]]:
@@ -209,46 +207,6 @@ def _plants(controller: Controller | None, certificate: Certificate | None) -> d
     if controller is not None and controller.design is not None:
         return {"design plant": controller.design}
     return {}
-
-
-def write_figure(figure: Any, path: Path | str) -> list[Path]:
-    """Write a figure as SVG and PNG, whose suffixes are added to the path."""
-    return [write_bytes(f"{path}.{kind}", rendered(figure, kind)) for kind in ("svg", "png")]
-
-
-def rendered(figure: Any, kind: str) -> bytes:
-    """Return a figure as a file of a kind, the same bytes each time."""
-    import matplotlib as mpl
-
-    stream = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else None
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "seaopt", "font.size": 9.0}):
-        _lay_out(figure)
-        figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
-    return stream.getvalue()
-
-
-def _lay_out(figure: Any) -> None:
-    """Lay a figure out, once, and leave it without an engine: for one, even an idle one, `savefig` draws twice."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        figure.set_dpi(DPI)
-        engine.execute(figure)
-        figure.set_layout_engine(None)
-
-
-def _inline(svg: str, name: str) -> str:
-    """Return the <svg> element alone, its ids made unique in the page."""
-    body = re.sub(r'(<image\b[^>]*?)\sid="[^"]*"', r"\1", svg[svg.index("<svg") :])  # named after what they show, twice
-    body = re.sub(r'\bid="', f'id="{name}-', body)
-    body = re.sub(r'(xlink:href|href)="#', rf'\1="#{name}-', body)
-    body = body.replace("url(#", f"url(#{name}-")
-    return re.sub(
-        r'(<svg[^>]*?)\swidth="[^"]*"',
-        r"\1",
-        re.sub(r'(<svg[^>]*?)\sheight="[^"]*"', r"\1", body, count=1),
-        count=1,
-    )
 
 
 def _caption(name: str) -> str:
@@ -262,81 +220,34 @@ def _note(name: str, surveys: Mapping[str, Survey], fit: Fit | None) -> str:
     return sentence(surveys[experiment], fit) if kind == "response" and fit is not None else ""
 
 
-def number(value: Any, digits: int = 4) -> str:
-    """Return a number for people: few digits, a dash where there is none."""
-    if value is None:
-        return "–"
-    if isinstance(value, (bool, np.bool_)):
-        return "yes" if value else "no"
-    if not np.isfinite(value):
-        return "∞" if value > 0 else "–"
-    return f"{value:.{digits}g}"
-
-
-def _interval(value: tuple[float, float] | None) -> str:
-    return f"{number(value[0], 6)} to {number(value[1], 6)}" if value and np.all(np.isfinite(value)) else "unknown"
-
-
-def _percent(value: Percent) -> str:
-    held = "" if value.held_out is None else f" ({number(value.held_out)})"
-    return number(value.used) + held
-
-
-def _swinging(certificate: Certificate | None) -> bool:
+def _swings(certificate: Certificate | None) -> bool:
     """Tell whether some plant's -3 dB bandwidth says nothing: its tracking band does not start at 0 Hz."""
     plants = certificate.plants.values() if certificate is not None else ()
-    return any(item.tracking_band_hz is not None and item.tracking_band_hz[0] > 1.0 for item in plants)
+    return any(figures.tracking_band_hz is not None and figures.tracking_band_hz[0] > 1.0 for figures in plants)
 
 
-def _forces(controller: Controller | None) -> str:
+def _describe_forces(controller: Controller | None) -> str:
     slow = controller.force_limit(0.01) if controller is not None else None
     if controller is None or slow is None:
         return ""
     band = controller.spec.bandwidth_hz
-    fast = number(controller.force_limit(band))
+    fast = controller.force_limit(band)
     return (
-        f"The current limit of {controller.spec.current_limit_A:g} A allows a reference of {number(slow)} N at rest "
-        f"and {fast} N at {band:g} Hz, whatever the gains."
+        f"The current limit of {controller.spec.current_limit_A:g} A allows a reference of {format_number(slow)} N at "
+        f"rest and {format_number(fast)} N at {band:g} Hz, whatever the gains."
     )
 
 
-def _band(value: tuple[float, float] | None) -> str:
-    return "–" if value is None else f"{number(value[0], 3)} to {number(value[1])}"
-
-
-def _page(
-    title: str, fit: Fit | None, diagnostics: Diagnostics | None, ranking: Ranking | None,
-    controller: Controller | None, certificate: Certificate | None, figures: Any, verification: Verification | None,
-    simulated: str,
-) -> str:  # fmt: skip
-    from jinja2 import Environment
-
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = number
-    environment.filters["band"] = _band
-    environment.filters["interval"] = _interval
-    environment.filters["percent"] = _percent
-    template = environment.from_string(
-        files("seaopt.reporting").joinpath("report.html.jinja").read_text(encoding="utf-8")
-    )
-    return template.render(
-        title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller, certificate=certificate,
-        figures=figures, verdict=verdict(fit, controller, certificate, verification), swinging=_swinging(certificate),
-        forces=_forces(controller), simulated=simulated,
-        limited=[] if controller is None else list_design_figures(controller.spec, controller.achieved),
-    )  # fmt: skip
-
-
-def _played(certificate: Certificate) -> str:
-    found = certificate.simulated.verification if certificate.simulated is not None else None
-    return "" if found is None else f", {len(found.rows)} simulations passed"
+def _describe_simulations(certificate: Certificate) -> str:
+    verification = certificate.simulated.verification if certificate.simulated is not None else None
+    return "" if verification is None else f", {len(verification.rows)} simulations passed"
 
 
 def verdict(
     fit: Fit | None, controller: Controller | None, certificate: Certificate | None,
     verification: Verification | None = None,
 ) -> list[tuple[bool, str]]:  # fmt: skip
-    """Return one line a stage: whether it is met, and what to say."""
+    """Return one line per stage: whether it is met, and what to say."""
     lines: list[tuple[bool, str]] = []
     if fit is not None:
         lines.append((fit.ok, f"Fit: {fit.status.replace('_', ' ')} – {fit.message}"))
@@ -345,10 +256,10 @@ def verdict(
         lines.append((controller.feasible, f"Controller at {controller.spec.bandwidth_hz:g} Hz: {what}"))
     if certificate is not None:
         mc = certificate.monte_carlo
-        broken = [f"{item.name} ({item.where})" for item in certificate.requirements if not item.met]
+        broken = [f"{row.name} ({row.where})" for row in certificate.requirements if not row.met]
         what = (
             f"passed – {mc.failures} failures in {mc.samples} draws, failure probability below "
-            f"{mc.failure_probability_bound:.3g}{_played(certificate)}"
+            f"{mc.failure_probability_bound:.3g}{_describe_simulations(certificate)}"
             if certificate.passed
             else "failed – " + "; ".join(broken)
         )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from seaopt.reporting.figures import MEASURED, MODEL, PLANT_COLOURS, panels
+from seaopt.reporting.templates import render_template
 from seaopt.robustness.certificate.simulated import Simulated
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judged_window
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHOWN_S = 0.6  # of the last phase of a run that passed, where the others are shorter: what happens is over soon
-HELD, JUDGED = "#f1f1f1", "#fdf3d8"
+LAST_PHASE_S = 0.6  # drawn of the last phase of a run that passed, where the others are shorter
+HELD_COLOUR, JUDGED_COLOUR = "#f1f1f1", "#fdf3d8"
 
 
 def verification_figure(verification: Verification, plant: str) -> Figure:
@@ -36,19 +36,21 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
     figure, axes = panels(len(rows), 2, 0.5 + 1.5 * len(rows))
     for (left, right), row in zip(axes, rows, strict=True):
         trace = verification.replay(row)
-        shown = trace.time <= (_until(trace) if row.passed else trace.time[-1])
-        time = trace.time[shown]
-        left.plot(time, trace.reference[0][shown], color=MEASURED, linewidth=1.6, label="reference")
-        left.plot(time, trace.outputs[name][0][shown], color=MODEL, linewidth=0.9, label=name)
-        right.step(time, trace.current[0][shown], where="post", color=PLANT_COLOURS[1], linewidth=0.9, label="current")
+        visible = trace.time <= (_visible_until(trace) if row.passed else trace.time[-1])
+        time = trace.time[visible]
+        left.plot(time, trace.reference[0][visible], color=MEASURED, linewidth=1.6, label="reference")
+        left.plot(time, trace.outputs[name][0][visible], color=MODEL, linewidth=0.9, label=name)
+        right.step(
+            time, trace.current[0][visible], where="post", color=PLANT_COLOURS[1], linewidth=0.9, label="current"
+        )
         if limit is not None and row.saturated > 0.0:
             for side in (-limit, limit):
                 right.axhline(side, color="#444444", linestyle=":", linewidth=0.9)
         _phases((left, right), trace, float(time[-1]), verification, row)
-        drawn = "" if row.draw == NOMINAL else f", draw {row.draw}"
-        cut = "" if shown.all() else f", {time[-1]:.2g} of {trace.time[-1]:.3g} s"
+        draw = "" if row.draw == NOMINAL else f", draw {row.draw}"
+        cut = "" if visible.all() else f", {time[-1]:.2g} of {trace.time[-1]:.3g} s"
         verdict = cut if row.passed else ": FAILED"
-        left.set_title(f"{row.scenario}{drawn}{verdict}", fontsize="medium", loc="left")
+        left.set_title(f"{row.scenario}{draw}{verdict}", fontsize="medium", loc="left")
         left.set_ylabel(f"{name} [N]")
         right.set_ylabel("current [A]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -58,40 +60,42 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
     return figure
 
 
-def _until(trace: Trace) -> float:
+def _visible_until(trace: Trace) -> float:
     """Return how much of a trace is drawn: all of one phase, else the last one's beginning."""
     if len(trace.edges) == 2:
         return float(trace.time[-1])
-    return float(trace.time[trace.edges[-2]]) + max(SHOWN_S, float(trace.time[trace.edges[-2]]))
+    return float(trace.time[trace.edges[-2]]) + max(LAST_PHASE_S, float(trace.time[trace.edges[-2]]))
 
 
 def _phases(axes: tuple[Axes, Axes], trace: Trace, until: float, verification: Verification, row: Outcome) -> None:
     if not row.passed:
         window = judged_window(trace)
         for axis in axes:
-            axis.axvspan(float(trace.time[window.start]), float(trace.time[window.stop - 1]), color=JUDGED, zorder=0)
+            axis.axvspan(
+                float(trace.time[window.start]), float(trace.time[window.stop - 1]), color=JUDGED_COLOUR, zorder=0
+            )
     for phase, start, stop in zip(verification.scenario(row).phases, trace.edges[:-1], trace.edges[1:], strict=True):
         if phase.held:
             for axis in axes:
-                axis.axvspan(trace.time[start], min(trace.time[stop - 1], until), color=HELD, zorder=0)
+                axis.axvspan(trace.time[start], min(trace.time[stop - 1], until), color=HELD_COLOUR, zorder=0)
 
 
-def large_signal_figure(found: Sequence[LargeSignal]) -> Figure:
-    """Draw the gain against frequency at each amplitude, and the saturation map, a row a plant."""
+def large_signal_figure(sweeps: Sequence[LargeSignal]) -> Figure:
+    """Draw the gain against frequency at each amplitude, and the saturation map, a row per plant."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    figure, axes = panels(len(found), 2, 3.0 * len(found), sharex=True)
-    for (left, right), item in zip(axes, found, strict=True):
-        shades = np.linspace(0.85, 0.0, item.amplitude_N.size)
-        for amplitude, gain, hit, shade in zip(item.amplitude_N, item.gain, item.saturated, shades, strict=True):
+    figure, axes = panels(len(sweeps), 2, 3.0 * len(sweeps), sharex=True)
+    for (left, right), sweep in zip(axes, sweeps, strict=True):
+        shades = np.linspace(0.85, 0.0, sweep.amplitude_N.size)
+        for amplitude, gain, hit, shade in zip(sweep.amplitude_N, sweep.gain, sweep.saturated, shades, strict=True):
             colour = (shade * 0.75, 0.30 + shade * 0.55, 0.55 + shade * 0.4)
             size = 20 * np.log10(np.maximum(np.abs(gain), 1e-6))
-            left.semilogx(item.frequency_hz, size, color=colour, linewidth=1.3, label=f"{amplitude:.3g} N")
-            left.semilogx(item.frequency_hz[hit], size[hit], ".", color=colour, markersize=5)
+            left.semilogx(sweep.frequency_hz, size, color=colour, linewidth=1.3, label=f"{amplitude:.3g} N")
+            left.semilogx(sweep.frequency_hz[hit], size[hit], ".", color=colour, markersize=5)
         left.axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9)
         left.legend(frameon=False, fontsize="small")
-        left.set_title(f"{item.plant}: |F/F_ref| [dB]; dots: saturated", fontsize="medium", loc="left")
-        right.loglog(item.frequency_hz, item.onset_N, color=MODEL, linewidth=1.3)
+        left.set_title(f"{sweep.plant}: |F/F_ref| [dB]; dots: saturated", fontsize="medium", loc="left")
+        right.loglog(sweep.frequency_hz, sweep.onset_N, color=MODEL, linewidth=1.3)
         right.set_title("amplitude at which the current saturates [N]", fontsize="medium", loc="left")
         for axis in (left.xaxis, right.xaxis, right.yaxis):
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -102,19 +106,21 @@ def large_signal_figure(found: Sequence[LargeSignal]) -> Figure:
     return figure
 
 
-def stability_figure(found: StabilityMap) -> Figure:
-    """Draw where the loop is stable against a mass on a spring, a panel a damper."""
+def stability_figure(stability: StabilityMap) -> Figure:
+    """Draw where the loop is stable against a mass on a spring, a panel per damper."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    columns = min(2, found.damping.size)
-    rows = -(-found.damping.size // columns)
+    columns = min(2, stability.damping.size)
+    rows = -(-stability.damping.size // columns)
     figure, axes = panels(rows, columns, 3.1 * rows, sharex=True, sharey=True)
     colours = ListedColormap(["#cfe3f1", "#f6d9c6"])
-    for index, (damping, stable, edge) in enumerate(zip(found.damping, found.stable, found.boundary, strict=True)):
+    for index, (damping, stable, edge) in enumerate(
+        zip(stability.damping, stability.stable, stability.boundary, strict=True)
+    ):
         axis = axes.ravel()[index]
         axis.pcolormesh(
-            found.mass, found.stiffness, (~stable).T.astype(float), cmap=colours, norm=BoundaryNorm([0, 0.5, 1], 2),
-            shading="nearest", rasterized=True,
+            stability.mass, stability.stiffness, (~stable).T.astype(float), cmap=colours,
+            norm=BoundaryNorm([0, 0.5, 1], 2), shading="nearest", rasterized=True,
         )  # fmt: skip
         if len(edge):
             axis.plot(edge[:, 0], edge[:, 1], ".", color=PLANT_COLOURS[1], markersize=3)
@@ -123,7 +129,7 @@ def stability_figure(found: StabilityMap) -> Figure:
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.minorticks_off()  # hundreds over these decades, behind the map, and slow to draw
-    for axis in axes.ravel()[found.damping.size :]:
+    for axis in axes.ravel()[stability.damping.size :]:
         axis.set_visible(False)
     for axis in axes[-1]:
         axis.set_xlabel("mass on link 2 [kg]")
@@ -147,25 +153,16 @@ def verification_figures(
     return out
 
 
-def verification_section(
+def render_verification(
     verification: Verification | None,
     large: Sequence[LargeSignal],
     coupled: StabilityMap | None,
     simulated: Simulated | None,
     svgs: Mapping[str, str],
-    number: Any,
 ) -> str:
-    """Return the section's HTML: tables, and the figures' <svg> elements by file name.
-
-    `number` shows a number to people (`seaopt.reporting.report.number`).
-    """
-    from jinja2 import Environment
-
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = number
-    source = files("seaopt.reporting").joinpath("verification.html.jinja").read_text(encoding="utf-8")
-    return environment.from_string(source).render(
-        verification=verification, large=large, coupled=coupled, svgs=svgs,
+    """Return the section's HTML: tables, and the figures' <svg> elements by file name."""
+    return render_template(
+        "verification.html.jinja", verification=verification, large=large, coupled=coupled, svgs=svgs,
         passivity=None if simulated is None else simulated.passivity,
         left_out={} if simulated is None else simulated.left_out,
         certified=simulated is not None and simulated.verification is verification,

@@ -105,7 +105,7 @@ def _keep_all(experiment: FitExperiment) -> FitExperiment:
 
 
 def _predict_at_best_level(
-    experiment: FitExperiment, z: Float[np.ndarray, " n"], used: Bool[np.ndarray, "n ny"]
+    experiment: FitExperiment, z: Float[np.ndarray, " unknowns"], used: Bool[np.ndarray, "n ny"]
 ) -> ExperimentResiduals | None:
     """Return the errors of prediction at the level of process noise that predicts the used samples best."""
     from scipy.optimize import minimize_scalar  # deferred: scipy is slow to load

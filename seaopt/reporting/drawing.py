@@ -1,0 +1,52 @@
+"""Figures as files: the same bytes each time, and their <svg> elements for a page."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from seaopt.files import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 130
+
+
+def write_figure(figure: Figure, path: Path | str) -> list[Path]:
+    """Write a figure as SVG and PNG, whose suffixes are added to the path."""
+    return [write_bytes(f"{path}.{kind}", render_figure(figure, kind)) for kind in ("svg", "png")]
+
+
+def render_figure(figure: Figure, kind: str) -> bytes:
+    """Return a figure as a file of a kind, the same bytes each time."""
+    import matplotlib as mpl
+
+    stream = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else None
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "seaopt", "font.size": 9.0}):
+        _lay_out(figure)
+        figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
+    return stream.getvalue()
+
+
+def _lay_out(figure: Figure) -> None:
+    """Lay a figure out, once, and leave it without an engine: for one, even an idle one, `savefig` draws twice."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.set_dpi(DPI)
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+
+
+def inline_svg(svg: str, name: str) -> str:
+    """Return the <svg> element alone, without its size, its ids made unique in the page by a name."""
+    body = re.sub(r'(<image\b[^>]*?)\sid="[^"]*"', r"\1", svg[svg.index("<svg") :])  # named after what they show, twice
+    body = re.sub(r'\bid="', f'id="{name}-', body)
+    body = re.sub(r'(xlink:href|href)="#', rf'\1="#{name}-', body)
+    body = body.replace("url(#", f"url(#{name}-")
+    for size in ("height", "width"):
+        body = re.sub(rf'(<svg[^>]*?)\s{size}="[^"]*"', r"\1", body, count=1)
+    return body
