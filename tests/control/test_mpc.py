@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, sample
 from seaopt.control.mpc.export import export_mpc
-from seaopt.control.mpc.prediction import interpolation, spread_knots
+from seaopt.control.mpc.prediction import interpolate_knots, spread_knots
 from seaopt.errors import ControlError
 
 TS = 1e-3
@@ -271,7 +271,7 @@ def test_overshoot_and_settling_of_a_known_answer(stand, thor):
 def test_knots_reach_from_end_to_end(samples, moves):
     knots = spread_knots(samples, moves)
     assert knots.size == moves and knots[0] == 0 and knots[-1] == samples - 1 and np.all(np.diff(knots) > 0)
-    W = interpolation(knots)
+    W = interpolate_knots(knots)
     assert W.shape == (samples, moves) and W.sum(axis=1) == pytest.approx(1.0)
 
 

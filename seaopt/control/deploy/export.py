@@ -25,7 +25,7 @@ from seaopt.errors import ControlError, FileError
 from seaopt.files import write_text
 
 Precision = Literal["double", "float"]
-LARGEST = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
+LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
 TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja", "{}_gains.h": "gains.h.jinja", "{}_gains.m": "gains.m.jinja"}
 LONGEST_NAME = 25  # C99 promises 31 characters of an external name, and ours end in _reset
 RESERVED = (
@@ -93,7 +93,7 @@ def export(
     ['knee.h', 'knee.c', 'knee_gains.h', 'knee_gains.m']
 
     """
-    if precision not in LARGEST:
+    if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
     prefix = _identifier(name)
     if Path(folder).exists() and not Path(folder).is_dir():
@@ -107,10 +107,15 @@ def export(
         missed = ", ".join(given["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
     law = _law(given, current_limit_A, tracking_time_s)
-    told = _told(given, law) | {"achieved": figures, "precision": precision, "name": prefix, "NAME": prefix.upper()}
+    context = _describe(given, law) | {
+        "achieved": figures,
+        "precision": precision,
+        "name": prefix,
+        "NAME": prefix.upper(),
+    }
     numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
     texts = {
-        pattern.format(prefix): _rendered(template, told | _numbers(given, law, numbers[pattern[-2:]], precision))
+        pattern.format(prefix): _render(template, context | _numbers(given, law, numbers[pattern[-2:]], precision))
         for pattern, template in TEMPLATES.items()
     }
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
@@ -118,24 +123,24 @@ def export(
 
 def _identifier(name: str) -> str:
     """Return a name that C takes."""
-    found = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
-    if not found or found[0].isdigit() or len(found) > LONGEST_NAME:
+    identifier = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+    if not identifier or identifier[0].isdigit() or len(identifier) > LONGEST_NAME:
         raise ControlError(
             f'name = "{name}" cannot begin a name in C; give a letter and up to {LONGEST_NAME - 1} letters or digits'
         )
-    if found.lower() in RESERVED.split():
-        raise ControlError(f'name = "{name}" is a keyword or a header of C; give another, such as {found}_law')
-    return found
+    if identifier.lower() in RESERVED.split():
+        raise ControlError(f'name = "{name}" is a keyword or a header of C; give another, such as {identifier}_law')
+    return identifier
 
 
 def _figures(controller: Controller) -> list[str]:
     """Return what a controller achieves, computed again where its design plant is known."""
     if controller.design is None:
-        return _shown("As stated by the controller, not computed again", asdict(controller.achieved))
-    found = controller.close(*controller.design).figures()
-    if not found.stable:
+        return _format_figures("As stated by the controller, not computed again", asdict(controller.achieved))
+    figures = controller.close(*controller.design).figures()
+    if not figures.stable:
         raise ControlError("the controller's law is not stable on its design plant; tune one that is")
-    return _shown("Achieved on the design plant", asdict(found))
+    return _format_figures("Achieved on the design plant", asdict(figures))
 
 
 def _stated(content: Mapping[str, Any]) -> list[str]:
@@ -146,15 +151,15 @@ def _stated(content: Mapping[str, Any]) -> list[str]:
     for name, value in achieved.items():
         if name in FIGURES and value is not None and (isinstance(value, bool) or not isinstance(value, (int, float))):
             raise FileError(f"controller.json: achieved.{name} is {value!r}, not a number; tune again")
-    return _shown("As stated by controller.json, not computed again", achieved)
+    return _format_figures("As stated by controller.json, not computed again", achieved)
 
 
-def _shown(whence: str, achieved: Mapping[str, Any]) -> list[str]:
+def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
     """Return the lines that the header has on figures."""
-    shown = [text.format(achieved[key]) for key, text in FIGURES.items() if achieved.get(key) is not None]
-    if len(shown) == len(FIGURES):
-        return [f"{whence}: {', '.join(shown[:3])},", f"{', '.join(shown[3:])}."]
-    return [f"{whence}: {', '.join(shown) or 'nothing that was measured'}."]
+    parts = [text.format(achieved[key]) for key, text in FIGURES.items() if achieved.get(key) is not None]
+    if len(parts) == len(FIGURES):
+        return [f"{whence}: {', '.join(parts[:3])},", f"{', '.join(parts[3:])}."]
+    return [f"{whence}: {', '.join(parts) or 'nothing that was measured'}."]
 
 
 def _law(given: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
@@ -168,15 +173,15 @@ def _law(given: Mapping[str, Any], current_limit_A: float | None, tracking_time_
     )
 
 
-def _told(given: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
+def _describe(given: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     """Return what the files say in words."""
     return {
-        "structure": _said(given["structure"]),
-        "measured": _said(given["spec"].measured),
+        "structure": _strip_markup(given["structure"]),
+        "measured": _strip_markup(given["spec"].measured),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         "delay_samples": given["delay_samples"],
         "feasible": given["feasible"],
-        "blocking": _said(", ".join(given["active_constraints"])),
+        "blocking": _strip_markup(", ".join(given["active_constraints"])),
         "limited": math.isfinite(law.current_limit_A),
         "order": law.c.size,
         "storage": max(law.c.size, 1),
@@ -184,7 +189,7 @@ def _told(given: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     }
 
 
-def _said(text: str) -> str:
+def _strip_markup(text: str) -> str:
     """Return text without what would end a comment."""
     return re.sub(r"[^\w .,:;+()<>=-]", "", str(text), flags=re.ASCII)
 
@@ -210,7 +215,7 @@ def _numbers(
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
     rest = law.rest()
-    largest = float(LARGEST[precision])
+    largest = float(LARGEST_NUMBER[precision])
     return {
         "a": [row(values) for values in law.a] or [number(0.0)],
         "b_reference": row(law.b_reference),
@@ -237,7 +242,7 @@ def _numbers(
     }
 
 
-def _rendered(template: str, told: Mapping[str, Any]) -> str:
+def _render(template: str, context: Mapping[str, Any]) -> str:
     from jinja2 import Environment, StrictUndefined, select_autoescape
 
     environment = Environment(
@@ -245,4 +250,4 @@ def _rendered(template: str, told: Mapping[str, Any]) -> str:
         undefined=StrictUndefined,
     )  # fmt: skip
     text = files("seaopt.control.deploy").joinpath("templates", template).read_text(encoding="utf-8")
-    return environment.from_string(text).render(told)
+    return environment.from_string(text).render(context)

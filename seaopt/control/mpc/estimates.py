@@ -19,7 +19,7 @@ def disturbances_of(plant: Plant, noise: NoiseModel, sample_time_s: float) -> li
     return white + [(inputs.index(name), 1.0, (s * root) ** 2) for name, s in noise.input_drift.items() if s > 0.0]
 
 
-def augmented(
+def augment(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, "nx nu"], disturbances: list[tuple[int, float, float]]
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n nu"], Float[np.ndarray, "n n"]]:
     """Return A, B and Q of the plant with its disturbances as states."""
@@ -31,7 +31,7 @@ def augmented(
     return A, np.vstack([b, np.zeros((count, b.shape[1]))]), Q
 
 
-def estimates(
+def list_estimates(
     plant: Plant, params: ParameterSet, matrices: tuple[Any, Any, Any, Any],
     disturbances: list[tuple[int, float, float]],
 ) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:  # fmt: skip

@@ -22,7 +22,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.mpc.estimates import augmented, disturbances_of, estimates
+from seaopt.control.mpc.estimates import augment, disturbances_of, list_estimates
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
@@ -35,7 +35,7 @@ from seaopt.records import record
 from seaopt.simulation.discretisation import expm_with_derivatives
 from seaopt.simulation.simulate import input_samples
 
-LAGS = 20
+WHITENESS_LAGS = 20
 RATE_TOLERANCE = 1e-6  # of the log's period against the estimator's
 
 
@@ -182,8 +182,8 @@ class Estimator:
 
     def values(self, state: EstimatorState) -> dict[str, float]:
         """Return the estimates of the last sample by name, in `units`."""
-        found = self.G @ state.corrected + self.H @ state.applied
-        return dict(zip(self.names, found.tolist(), strict=True))
+        estimates = self.G @ state.corrected + self.H @ state.applied
+        return dict(zip(self.names, estimates.tolist(), strict=True))
 
     def run(self, log: Log) -> EstimatorRun:
         """Filter a log from rest; channels carry the plant's names.
@@ -197,26 +197,26 @@ class Estimator:
 
         """
         u, y = self._samples(log)
-        settled = min(self._settling(), len(log) // 2)
-        late = np.vstack([np.zeros((self.delay_samples, u.shape[1])), u])[: len(log)]
+        settled = min(self._count_settling(), len(log) // 2)
+        delayed = np.vstack([np.zeros((self.delay_samples, u.shape[1])), u])[: len(log)]
         closed = self.A @ (np.eye(len(self.A)) - self.gain @ self.C)
-        drive = late @ (self.B - self.A @ self.gain @ self.D).T + (y - self.offset) @ (self.A @ self.gain).T
-        predicted = np.vstack([np.zeros(len(closed)), recursion(closed, drive)[:-1]])
-        innovations = y - self.offset - predicted @ self.C.T - late @ self.D.T
-        found = (predicted + innovations @ self.gain.T) @ self.G.T + late @ self.H.T
+        drive = delayed @ (self.B - self.A @ self.gain @ self.D).T + (y - self.offset) @ (self.A @ self.gain).T
+        predicted = np.vstack([np.zeros(len(closed)), run_recursion(closed, drive)[:-1]])
+        innovations = y - self.offset - predicted @ self.C.T - delayed @ self.D.T
+        estimates = (predicted + innovations @ self.gain.T) @ self.G.T + delayed @ self.H.T
         return EstimatorRun(
             time=log.time,
-            values=dict(zip(self.names, found.T.copy(), strict=True)),
+            values=dict(zip(self.names, estimates.T.copy(), strict=True)),
             std=self.std,
             innovations=dict(zip(self.outputs, innovations.T.copy(), strict=True)),
             whiteness_p={
-                name: ljung_box(autocorrelation(channel, LAGS)[1:], channel.size)
+                name: ljung_box(autocorrelation(channel, WHITENESS_LAGS)[1:], channel.size)
                 for name, channel in zip(self.outputs, innovations[settled:].T, strict=True)
             },
             settled=settled,
         )
 
-    def _settling(self) -> int:
+    def _count_settling(self) -> int:
         """Samples until an error at the start has shrunk a thousandfold."""
         radius = float(np.max(np.abs(np.linalg.eigvals(self.A @ (np.eye(len(self.A)) - self.gain @ self.C)))))
         return int(np.ceil(np.log(1e-3) / np.log(min(max(radius, 1e-3), 1.0 - 1e-12))))
@@ -299,16 +299,16 @@ def estimator(
     block[:nx, :nx], block[:nx, nx:] = a, b
     whole, _ = expm_with_derivatives(block * sample_time_s, np.zeros((0, nx + nu, nx + nu)))
     disturbances = disturbances_of(plant, noise, sample_time_s)
-    A, B, Q = augmented(whole[:nx, :nx], whole[:nx, nx:], disturbances)
+    A, B, Q = augment(whole[:nx, :nx], whole[:nx, nx:], disturbances)
     columns = [column for column, _, _ in disturbances]
     rows = [list(plant.outputs).index(name) for name in chosen]
     C, D = np.hstack([c, d[:, columns]])[rows], d[rows]
     R = np.diag([noise.sensor_std[name] ** 2 for name in chosen])
-    P = _riccati(plant, chosen, A, C, Q, R)
+    P = _solve_riccati(plant, chosen, A, C, Q, R)
     S = C @ P @ C.T + R
     gain = np.linalg.solve(S, C @ P).T
     keep = np.eye(len(A)) - gain @ C
-    names, units, G, H = estimates(plant, values, (a, b, c, d), disturbances)
+    names, units, G, H = list_estimates(plant, values, (a, b, c, d), disturbances)
     return Estimator(
         plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples, noise=noise,
         A=A, B=B, C=C, D=D, gain=gain, covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
@@ -341,7 +341,7 @@ def _check(
         raise ControlError("noise: nothing but the sensors is noisy; give input_noise or input_drift above zero")
 
 
-def _riccati(
+def _solve_riccati(
     plant: Plant, outputs: tuple[str, ...], A: Float[np.ndarray, "n n"], C: Float[np.ndarray, "ny n"],
     Q: Float[np.ndarray, "n n"], R: Float[np.ndarray, "ny ny"],
 ) -> Float[np.ndarray, "n n"]:  # fmt: skip
@@ -366,7 +366,7 @@ def _riccati(
         ) from error
 
 
-def recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+def run_recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     """Return x with x[k] = a x[k-1] + v[k], x[-1] = 0, by doubling the reach until a's power has died out."""
     x, power, reach = v, a, 1
     while reach < len(v) and np.max(np.abs(power)) > 1e-18:

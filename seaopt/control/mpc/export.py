@@ -13,7 +13,7 @@ from seaopt.control.mpc.quadratic_program import RHO, make_solver
 from seaopt.errors import FileError
 from seaopt.files import write_text
 
-OWN = ("force_mpc.h", "force_mpc.c", "example.c")
+SOURCES = ("force_mpc.h", "force_mpc.c", "example.c")
 LEFT_OUT = ("emosqp.c", "Makefile")  # OSQP's demonstration, which has a main of its own
 
 
@@ -49,13 +49,13 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
             (target / name).unlink(missing_ok=True)
     except OSError as error:
         raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
-    for name in OWN:
+    for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
-    write_text(target / "force_mpc_data.h", _data(mpc))
+    write_text(target / "force_mpc_data.h", _format_data(mpc))
     return target
 
 
-def _data(mpc: ForceMPC) -> str:
+def _format_data(mpc: ForceMPC) -> str:
     kalman, prediction, spec = mpc.kalman, mpc.prediction, mpc.spec
     rows = prediction.knots.size + len(prediction.M)
     sizes = {
@@ -71,23 +71,23 @@ def _data(mpc: ForceMPC) -> str:
         "F": prediction.F, "M": prediction.M, "shift": mpc.shift,
     }  # fmt: skip
     lines = [f"#define FORCE_MPC_{name} {value}" for name, value in sizes.items()]
-    lines += [f"static const OSQPFloat mpc_{name} = {_number(value)};" for name, value in numbers.items() if
+    lines += [f"static const OSQPFloat mpc_{name} = {_format_number(value)};" for name, value in numbers.items() if
               np.isfinite(value)]  # fmt: skip
-    lines += [_array(name, value) for name, value in arrays.items() if value.size]
+    lines += [_format_array(name, value) for name, value in arrays.items() if value.size]
     return "\n".join(
         ["/* Sizes and numbers of one controller. */", "#ifndef FORCE_MPC_DATA_H", "#define FORCE_MPC_DATA_H",
          '#include "osqp_api_types.h"', *lines, "#endif", ""]
     )  # fmt: skip
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"(OSQPFloat){value:.17g}"
 
 
-def _array(name: str, value: Float[np.ndarray, "..."]) -> str:
+def _format_array(name: str, value: Float[np.ndarray, "..."]) -> str:
     shape = "".join(f"[{n}]" for n in value.shape)
     if value.ndim == 1:
-        body = ", ".join(map(_number, value))
+        body = ", ".join(map(_format_number, value))
     else:
-        body = ",\n ".join("{" + ", ".join(map(_number, line)) + "}" for line in value)
+        body = ",\n ".join("{" + ", ".join(map(_format_number, line)) + "}" for line in value)
     return f"static const OSQPFloat mpc_{name}{shape} = {{{body}}};"

@@ -28,8 +28,8 @@ from seaopt.plants import Plant
 
 DECADES = 8  # of the input's noise below what would explain the whole output
 SETTLING = 10  # the first tenth of the log is left out: the filter starts at rest
-LEAST = 200  # samples
-UNSEEN = 1e-6  # of what sensors show of their offsets; a part as small as that is the plant's own place
+MIN_SAMPLES = 200
+UNSEEN_OFFSET = 1e-6  # of what sensors show of their offsets; a part as small as that is the plant's own place
 
 
 def estimate_noise(
@@ -61,8 +61,8 @@ def estimate_noise(
         As `estimator` and `Estimator.run`; or the log is too short.
 
     """
-    if len(log) < LEAST:
-        raise ControlError(f"{log.source} has {len(log)} samples; noise takes at least {LEAST}")
+    if len(log) < MIN_SAMPLES:
+        raise ControlError(f"{log.source} has {len(log)} samples; noise takes at least {MIN_SAMPLES}")
     from scipy.optimize import minimize  # deferred: scipy is slow to load
 
     drive = next(iter(plant.inputs))
@@ -85,7 +85,7 @@ def estimate_noise(
 
     def cost(logs: Float[np.ndarray, " q"]) -> float:
         kalman = filter_of(logs)
-        e = _late(kalman, log)
+        e = _settled_innovations(kalman, log)
         S = kalman.innovation_covariance
         spread = e - e.mean(axis=0)
         return float(np.linalg.slogdet(S)[1] + np.sum(spread * np.linalg.solve(S, spread.T).T) / len(e))
@@ -97,12 +97,12 @@ def estimate_noise(
     simplex = np.vstack([start, start + np.eye(start.size)])
     options = {"xatol": 1e-3, "fatol": 1e-9, "maxfev": 200 * start.size, "initial_simplex": simplex}
     kalman = filter_of(minimize(cost, start, method="Nelder-Mead", options=options).x)
-    return replace(kalman.noise, offset=_offsets(kalman, _late(kalman, log).mean(axis=0)))
+    return replace(kalman.noise, offset=_offsets(kalman, _settled_innovations(kalman, log).mean(axis=0)))
 
 
-def _late(kalman: Estimator, log: Log) -> Float[np.ndarray, "m ny"]:
-    found = kalman.run(log).innovations
-    return np.column_stack([found[name][len(log) // SETTLING :] for name in kalman.outputs])
+def _settled_innovations(kalman: Estimator, log: Log) -> Float[np.ndarray, "m ny"]:
+    innovations = kalman.run(log).innovations
+    return np.column_stack([innovations[name][len(log) // SETTLING :] for name in kalman.outputs])
 
 
 def _third_difference(y: Float[np.ndarray, " n"]) -> float:
@@ -114,5 +114,5 @@ def _offsets(kalman: Estimator, mean: Float[np.ndarray, " ny"]) -> dict[str, flo
     lead = kalman.A @ kalman.gain
     n = len(kalman.A)
     passed = np.eye(mean.size) - kalman.C @ np.linalg.solve(np.eye(n) - kalman.A + lead @ kalman.C, lead)
-    found = np.linalg.lstsq(passed, mean, rcond=UNSEEN)[0]
-    return dict(zip(kalman.outputs, found.tolist(), strict=True))
+    offsets = np.linalg.lstsq(passed, mean, rcond=UNSEEN_OFFSET)[0]
+    return dict(zip(kalman.outputs, offsets.tolist(), strict=True))

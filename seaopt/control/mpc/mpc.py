@@ -28,8 +28,8 @@ from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.noise import NoiseModel
-from seaopt.control.mpc.prediction import Prediction, Regulator, condense, regulator_of_bandwidth, spread_knots
-from seaopt.control.mpc.quadratic_program import make_solver, solved
+from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
+from seaopt.control.mpc.quadratic_program import make_solver, solve_program
 from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.tuning.tuner import current_per_force
 from seaopt.errors import ControlError, suggestion
@@ -114,7 +114,7 @@ class ForceMPC:
     kalman : Estimator
     regulator : Regulator
         What it is without limits.
-    prediction : Prediction
+    prediction : HorizonProgram
         The quadratic program.
     static_gain : float
         N/A.
@@ -129,7 +129,7 @@ class ForceMPC:
     design: tuple[Plant, ParameterSet]
     kalman: Estimator
     regulator: Regulator
-    prediction: Prediction
+    prediction: HorizonProgram
     static_gain: float
     rest: Float[np.ndarray, " nx"]
     shift: Float[np.ndarray, "n n"]
@@ -158,7 +158,7 @@ class ForceMPC:
         xi, u_s, target = self._targets(ahead, reference_N)
         q, low, high = self.program(xi, u_s, last)
         first = (self.shift @ state.plan - u_s) / limit
-        theta, dual, status, info = solved(self.solver, q, low, high, first, state.dual)
+        theta, dual, status, info = solve_program(self.solver, q, low, high, first, state.dual)
         status = status or self._fault(theta, low, high)
         if status:
             theta, dual = np.zeros_like(q), np.zeros_like(low)
@@ -270,7 +270,7 @@ class ForceMPC:
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
         """Return the loop around a plant while no limit is active; its figures are in newtons of motor force."""
         scale = current_per_force(*self.design)
-        reference, measurement = (TransferFunction(num=found.num / scale, den=found.den) for found in self.unlimited())
+        reference, measurement = (TransferFunction(num=law.num / scale, den=law.den) for law in self.unlimited())
         digital = sample(
             plant, params, self.spec.measured, scale, self.spec.sample_time_s, self.spec.delay_samples
         )  # fmt: skip
@@ -337,12 +337,12 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     )  # fmt: skip
     a, b, c = digital.a, digital.b, digital.c
     weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, values, spec.measured)
-    found = regulator_of_bandwidth(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
+    regulator = tune_regulator(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
-    prediction = condense(a, b, weighted, gain, found, knots, spec.current_limit_A, spec.slew_per_sample_A)
+    prediction = condense(a, b, weighted, gain, regulator, knots, spec.current_limit_A, spec.slew_per_sample_A)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
-        spec=spec, design=(plant, values), kalman=kalman, regulator=found, prediction=prediction, static_gain=gain,
+        spec=spec, design=(plant, values), kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
     )  # fmt: skip
 
@@ -371,10 +371,10 @@ def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
             f"{spec.measured} of {plant.name} follows the current at once (d = {digital.d:.3g}); "
             "control the spring's force"
         )
-    held = abs(gain) * spec.current_limit_A
-    if spec.largest_force_N is not None and spec.largest_force_N > held:
+    largest = abs(gain) * spec.current_limit_A
+    if spec.largest_force_N is not None and spec.largest_force_N > largest:
         raise ControlError(
-            f"current_limit_A = {spec.current_limit_A:g} holds {held:.4g} N, less than largest_force_N = "
+            f"current_limit_A = {spec.current_limit_A:g} holds {largest:.4g} N, less than largest_force_N = "
             f"{spec.largest_force_N:g}; raise the one or lower the other"
         )
     return gain

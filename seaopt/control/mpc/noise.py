@@ -50,10 +50,10 @@ class NoiseModel:
 
     def __post_init__(self) -> None:
         for what in ("sensor_std", "input_noise", "input_drift", "offset"):
-            given = getattr(self, what)
-            if not isinstance(given, Mapping):
-                raise ControlError(f"noise: {what} = {given!r}; give a mapping of name to value")
-            for name, value in given.items():
+            levels = getattr(self, what)
+            if not isinstance(levels, Mapping):
+                raise ControlError(f"noise: {what} = {levels!r}; give a mapping of name to value")
+            for name, value in levels.items():
                 if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                     raise ControlError(f"noise: {what} of {name} = {value!r} is not a number; give one")
                 if what != "offset" and value < 0.0:
@@ -91,7 +91,7 @@ class NoiseModel:
         if name not in fit.outputs:
             raise ControlError(f'the fit has no experiment "{name}"; {suggestion(name, fit.outputs)}')
         return cls(
-            sensor_std={output: item.rms_residual for output, item in fit.outputs[name].items()},
+            sensor_std={output: scores.rms_residual for output, scores in fit.outputs[name].items()},
             input_noise=dict(input_noise or {}), input_drift=dict(input_drift or {}),
             offset=dict(fit.nuisance[name].offset),
         )  # fmt: skip

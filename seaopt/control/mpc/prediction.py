@@ -22,11 +22,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.errors import ControlError
 from seaopt.records import record
 
 WEIGHTS = (1e-9, 1e9)  # of rho, over the square of the current per force
-HALF_POWER = np.sqrt(0.5)
 BELOW = 1000  # frequencies of the three decades below the bandwidth at which the force must follow
 
 
@@ -52,7 +52,7 @@ class Regulator:
 
 
 @record(eq=False)
-class Prediction:
+class HorizonProgram:
     """The quadratic program in theta, the knots' deviations from u_s in units of the current limit.
 
     Minimise theta' H theta / 2 + (F s)' theta, s = [xi_0, mu_-1], with rows theta and M theta within bounds.
@@ -74,7 +74,7 @@ class Prediction:
     M: Float[np.ndarray, "m n"]
 
 
-def regulator(
+def solve_regulator(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float, rho: float
 ) -> Regulator:
     """Return the linear-quadratic regulator of w xi over `gain` and current increments."""
@@ -94,7 +94,7 @@ def regulator(
     return Regulator(rho=rho, K_x=K[:nx], K_u=float(K[nx]), Pi=Pi)
 
 
-def regulator_of_bandwidth(
+def tune_regulator(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"],
     w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
 ) -> Regulator:  # fmt: skip
@@ -105,34 +105,34 @@ def regulator_of_bandwidth(
     B, row = np.append(b, 1.0), np.append(c, 0.0)
     below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
 
-    def tracking(found: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
+    def tracking(candidate: Regulator, f: Float[np.ndarray, " m"] = below[-1:]) -> Float[np.ndarray, " m"]:
         """Return abs(F/F_ref); the delay, which does not change it, is left out."""
         z = np.exp(2j * np.pi * f * sample_time_s)[:, None, None]
-        drive = (B * (found.K_x @ rest + found.K_u / gain)).astype(complex)[:, None]
-        closed = A - np.outer(B, np.append(found.K_x, found.K_u))
+        drive = (B * (candidate.K_x @ rest + candidate.K_u / gain)).astype(complex)[:, None]
+        closed = A - np.outer(B, np.append(candidate.K_x, candidate.K_u))
         return np.abs(np.linalg.solve(z * np.eye(nx + 1) - closed, drive)[:, :, 0] @ row)
 
     low, high = (np.log(w) for w in WEIGHTS)
-    if tracking(regulator(a, b, w, gain, np.exp(low)))[0] < HALF_POWER:
+    if tracking(solve_regulator(a, b, w, gain, np.exp(low)))[0] < HALF_POWER:
         raise ControlError(
             f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
         )
-    if tracking(regulator(a, b, w, gain, np.exp(high)))[0] > HALF_POWER:
+    if tracking(solve_regulator(a, b, w, gain, np.exp(high)))[0] > HALF_POWER:
         raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
     for _ in range(60):
         middle = 0.5 * (low + high)
-        if tracking(regulator(a, b, w, gain, np.exp(middle)))[0] > HALF_POWER:
+        if tracking(solve_regulator(a, b, w, gain, np.exp(middle)))[0] > HALF_POWER:
             low = middle
         else:
             high = middle
-    found = regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
-    dips = np.flatnonzero(tracking(found, below) < 0.99 * HALF_POWER)
+    regulator = solve_regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
+    dips = np.flatnonzero(tracking(regulator, below) < 0.99 * HALF_POWER)
     if dips.size:
         raise ControlError(
             f"the force is lost near {below[dips[0]]:.3g} Hz, far below bandwidth_hz = {bandwidth_hz:g}: the plant "
             "has a zero there that no controller fills; design on the stand"
         )
-    return found
+    return regulator
 
 
 def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
@@ -149,20 +149,20 @@ def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
     low, high = 1.0, 10.0
     for _ in range(80):  # the factor for which `moves` - 1 steps reach the end
         factor = 0.5 * (low + high)
-        if _edges(factor, moves)[-1] < samples - 1:
+        if _space_knots(factor, moves)[-1] < samples - 1:
             low = factor
         else:
             high = factor
-    knots = np.round(_edges(high, moves)).astype(int)
+    knots = np.round(_space_knots(high, moves)).astype(int)
     knots[-1] = samples - 1
     return np.maximum(knots, np.arange(moves))
 
 
-def _edges(factor: float, moves: int) -> Float[np.ndarray, " n"]:
+def _space_knots(factor: float, moves: int) -> Float[np.ndarray, " n"]:
     return np.concatenate([[0.0], np.cumsum(factor ** np.arange(moves - 1))])
 
 
-def interpolation(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "samples n"]:
+def interpolate_knots(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "samples n"]:
     """Return W, which draws straight lines between the knots."""
     samples = np.arange(knots[-1] + 1)
     return np.column_stack([np.interp(samples, knots, row) for row in np.eye(knots.size)])
@@ -170,10 +170,10 @@ def interpolation(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "samples n"
 
 def condense(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], w: Float[np.ndarray, " nx"], gain: float,
-    found: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float,
-) -> Prediction:  # fmt: skip
+    regulator: Regulator, knots: Int[np.ndarray, " n"], limit: float, slew_per_sample: float,
+) -> HorizonProgram:  # fmt: skip
     """Return the quadratic program of a horizon; `limit` in A, `slew_per_sample` in A, infinite if there is none."""
-    W = interpolation(knots)
+    W = interpolate_knots(knots)
     N, nx = len(W), b.size
     free, forced = np.eye(nx), np.zeros((nx, N))  # xi_j = free xi_0 + forced mu
     hessian, cross = np.zeros((N, N)), np.zeros((N, nx + 1))
@@ -184,16 +184,16 @@ def condense(
         free, forced = a @ free, a @ forced
         forced[:, j] += b
     step = np.eye(N) - np.eye(N, k=-1)  # mu_j - mu_{j-1}, of which the first has mu_-1
-    hessian += found.rho * step.T @ step
-    cross[0, nx] -= found.rho
+    hessian += regulator.rho * step.T @ step
+    cross[0, nx] -= regulator.rho
     end = np.vstack([forced, np.eye(N)[-1]])
     begin = np.zeros((nx + 1, nx + 1))
     begin[:nx, :nx] = free
-    hessian += end.T @ found.Pi @ end
-    cross += end.T @ found.Pi @ begin
+    hessian += end.T @ regulator.Pi @ end
+    cross += end.T @ regulator.Pi @ begin
     H, F = limit**2 * W.T @ hessian @ W, limit * W.T @ cross
     scale = knots.size / float(np.trace(H))
     steps = np.diff(knots, prepend=knots[0] - 1)
     slopes = (np.eye(knots.size) - np.eye(knots.size, k=-1)) * limit / (slew_per_sample * steps)[:, None]
     rows = knots.size if np.isfinite(slew_per_sample) else 0
-    return Prediction(knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=slopes[:rows])
+    return HorizonProgram(knots=knots, H=0.5 * (H + H.T) * scale, F=F * scale, M=slopes[:rows])

@@ -1,4 +1,4 @@
-"""The quadratic program of a `Prediction` in OSQP (Stellato et al., Math. Prog. Comp. 12, 2020), set up once.
+"""The quadratic program of a `HorizonProgram` in OSQP (Stellato et al., Math. Prog. Comp. 12, 2020), set up once.
 
 Only its vectors change from sample to sample. Each solution starts from a given point with the same penalty rho, so
 that it is a function of what it is given, here and in the C code, whatever was solved before.
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.mpc.prediction import Prediction
+from seaopt.control.mpc.prediction import HorizonProgram
 
 RHO = 0.3  # of ADMM at the start of each program; with slew limits on many knots it has to grow on the way
 SETTINGS: dict[str, Any] = {
@@ -21,7 +21,7 @@ SETTINGS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def make_solver(prediction: Prediction) -> Any:
+def make_solver(prediction: HorizonProgram) -> Any:
     """Return OSQP set up with the program's matrices, and bounds that have no effect yet."""
     import osqp  # deferred: scipy.sparse and jinja2 are slow to load
     from scipy.sparse import csc_matrix
@@ -35,7 +35,7 @@ def make_solver(prediction: Prediction) -> Any:
     return solver
 
 
-def solved(
+def solve_program(
     solver: Any, q: Float[np.ndarray, " n"], low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
     first: Float[np.ndarray, " n"], dual: Float[np.ndarray, " m"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], str, Any]:  # fmt: skip

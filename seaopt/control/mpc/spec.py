@@ -10,8 +10,8 @@ from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError
 from seaopt.records import record
 
-MAX_SAMPLES = 500  # of a horizon
-MAX_DELAY_SAMPLES = 100
+MAX_HORIZON_SAMPLES = 500  # of a horizon
+MAX_MPC_DELAY_SAMPLES = 100
 
 
 @record
@@ -73,7 +73,7 @@ class MPCSpec:
                 self._positive(name)
         if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
-        for name, least, most in (("delay_samples", 0, MAX_DELAY_SAMPLES), ("moves", 2, MAX_SAMPLES)):
+        for name, least, most in (("delay_samples", 0, MAX_MPC_DELAY_SAMPLES), ("moves", 2, MAX_HORIZON_SAMPLES)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise ControlError(f"{name} = {value!r} is not a whole number from {least} to {most}")
@@ -82,10 +82,10 @@ class MPCSpec:
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 "sample more than four times as fast"
             )
-        if not self.moves <= self.samples <= MAX_SAMPLES:
+        if not self.moves <= self.samples <= MAX_HORIZON_SAMPLES:
             raise ControlError(
                 f"horizon_s = {self.horizon_s:g} is {self.samples} samples; it takes {self.moves} (moves) to "
-                f"{MAX_SAMPLES}"
+                f"{MAX_HORIZON_SAMPLES}"
             )
 
     def _positive(self, name: str) -> None:
