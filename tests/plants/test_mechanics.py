@@ -130,7 +130,7 @@ def test_energy_is_conserved(links, drive, spring, parts):
         _, lost, put = books(zip(plant.states, z[:n], strict=True), u, links, drive, spring, parts, p, energy=False)
         return np.r_[rate(z[:n], list(u.values())), lost, put]
 
-    run = solve_ivp(extended, (0, 0.15), np.r_[start, 0, 0], method="DOP853", rtol=1e-13, atol=1e-15)
+    run = solve_ivp(extended, (0, 0.06), np.r_[start, 0, 0], method="DOP853", rtol=1e-13, atol=1e-15)
     first, last = (
         books(zip(plant.states, run.y[:n, k], strict=True), inputs(0), links, drive, spring, parts, p)[0]
         for k in (0, -1)
