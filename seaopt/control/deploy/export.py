@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.controller import GAIN_UNITS, Controller
 from seaopt.control.laws.realisation import RunnableLaw, realise
 from seaopt.control.laws.stored import stored
 from seaopt.errors import ControlError, FileError
@@ -37,7 +37,6 @@ RESERVED = (
     "assert complex ctype errno fenv inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic "
     "stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
 )
-UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N"}
 FIGURES = {
     "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g} N/N",
     "gain_margin_db": "gain margin {:.4g} dB", "phase_margin_deg": "phase margin {:.4g} deg",
@@ -232,7 +231,7 @@ def _numbers(
         "sample_time_s": number(law.sample_time_s),
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
-            {"name": _identifier(key), "value": number(float(value)), "unit": UNITS.get(key, "")}
+            {"name": _identifier(key), "value": number(float(value)), "unit": GAIN_UNITS.get(key, "")}
             for key, value in given["gains"].items()
         ],
         "transfer_functions": [

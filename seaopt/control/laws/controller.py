@@ -23,7 +23,7 @@ from seaopt.plants import Plant
 from seaopt.records import record
 
 SCHEMA = "seaopt/controller/1"
-UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
+GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
 CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
@@ -235,7 +235,7 @@ class Controller:
     def _gain_lines(self) -> list[str]:
         law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
         lines = [
-            "  " + ", ".join(f"{name} = {value:.5g} {UNITS[name]}" for name, value in law.items()),
+            "  " + ", ".join(f"{name} = {value:.5g} {GAIN_UNITS[name]}" for name, value in law.items()),
             "  as current: " + ", ".join(
                 f"{name.split('_A')[0]} = {value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
             ),
@@ -261,7 +261,7 @@ class Controller:
             name.split("_A")[0]: f"{value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
         }
         gains = [
-            (name, f"{value:.5g} {UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
+            (name, f"{value:.5g} {GAIN_UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
             for name, value in self.gains.items()
         ]
         told = [] if self.feasible else [self.explanation]
