@@ -201,7 +201,7 @@ def write_acqtools(folder: Path) -> None:
 
 
 POSE = "float32 x\nfloat32 y\nfloat32 theta\nfloat32 linear_velocity\nfloat32 angular_velocity\n"
-COUNTS = {"/turtle1/pose": 1344, "/turtle1/cmd_vel": 357, "/tf": 2688, "/turtle1/color_sensor": 4258}  # 8647 in all
+COUNTS = {"/turtle1/pose": 1344, "/turtle1/cmd_vel": 357, "/tf": 400, "/turtle1/color_sensor": 6546}  # 8647 in all
 
 
 def write_ros1(folder: Path) -> None:
