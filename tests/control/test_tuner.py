@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -112,24 +113,22 @@ def test_efficiency_changes_the_loop_gain(stand, thor):
     np.testing.assert_allclose(weak, 0.8 * strong)
 
 
-def test_a_sensitivity_over_its_limit_is_told_by_how_much(stand, thor):
+def test_a_sensitivity_over_its_limit_is_stated_by_how_much(stand, thor):
     """abs(S) may lie along -3 dB: where it first exceeds it says nothing of how nearly it is kept."""
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.2, min_sensitivity_bandwidth_hz=20)
     controller = so.tune(stand, thor, spec)
     loop = controller.close(stand, thor)
     reached = np.max(np.abs(loop.sensitivity(np.linspace(0.01, 20.0, 20000))))
-    told = next(item for item in controller.blocked_by if item.startswith("min_sensitivity"))
-    assert told == (f"min_sensitivity_bandwidth_hz, |S| reaches {reached:.4f} below 20 Hz, 0.7071 allowed")
-    assert told in controller.explanation
+    blocked = next(text for text in controller.blocked_by if text.startswith("min_sensitivity_bandwidth_hz"))
+    assert re.findall(r"\d+\.?\d*", blocked) == [f"{reached:.4f}", "20", "0.7071"]
+    assert blocked in controller.explanation
 
 
-@pytest.mark.parametrize(("depth", "told"), [(0.4, False), (1.0, True)])
-def test_a_notch_without_effect_is_told(depth, told, stand, thor):
+@pytest.mark.parametrize(("depth", "noted"), [(0.4, False), (1.0, True)])
+def test_a_notch_without_effect_is_noted(depth, noted, stand, thor):
     controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     gains = {**controller.gains, "notch_frequency_hz": 100.0, "notch_width": 0.2, "notch_depth": depth}
-    assert (
-        f"gain at its centre {depth:g}: of no use, tune without it" in repr(replace(controller, gains=gains))
-    ) is told
+    assert ("tune without it" in repr(replace(controller, gains=gains))) is noted
 
 
 def test_json_round_trip(stand, swing, thor, tmp_path):

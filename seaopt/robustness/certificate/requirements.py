@@ -16,7 +16,7 @@ from seaopt.robustness.certificate.certificate import MonteCarlo, Requirement
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 
-REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
+WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
 
 def design_requirements(controller: Controller, achieved: LoopFigures, values: ParameterSet) -> list[Requirement]:
@@ -71,7 +71,7 @@ def draw_requirements(
     rows = [
         Requirement(
             name="monte_carlo_failures", limit=0.0, value=float(result.failures), met=result.failures == 0,
-            where=witness + (REMEDY if result.failures else ""),
+            where=witness + (WITNESS_REMEDY if result.failures else ""),
         )
     ]  # fmt: skip
     if not result.failures:
@@ -108,6 +108,7 @@ def _require_worst(name: str, case: Worst) -> list[Requirement]:
             limit=1.0,
             value=used,
             met=met,
-            where=f"{name}{'' if case.severity < UNSTABLE else ', UNSTABLE,'} at {where}" + ("" if met else REMEDY),
+            where=f"{name}{'' if case.severity < UNSTABLE else ', UNSTABLE,'} at {where}"
+            + ("" if met else WITNESS_REMEDY),
         )
     ]
