@@ -123,12 +123,12 @@ PAPER_STAND: Excitation = (Chirp(amplitude=2.0, f0_hz=0.01, f1_hz=150.0), Noise(
 PAPER_SWING: Excitation = (Noise(std=3.5, band_hz=150.0),)
 
 
-def scaled(parts: Excitation, factor: float) -> Excitation:
+def scale(parts: Excitation, factor: float) -> Excitation:
     """Return the excitation `factor` times as large.
 
     Examples
     --------
-    >>> scaled(PAPER_STAND, 0.5)[1]
+    >>> scale(PAPER_STAND, 0.5)[1]
     Noise(std=0.5, band_hz=150.0)
 
     """

@@ -13,7 +13,7 @@ from rich.table import Table
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.fit_result import Nuisance
-from seaopt.frequency import Drive, Pair, Survey
+from seaopt.frequency import DriveEstimate, Pair, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
 from seaopt.records import record
@@ -124,7 +124,7 @@ def _under(found: Survey, own: Nuisance) -> Survey:
     return replace(found, clock=replace(found.clock, delay_s=own.delay_s, delay_free=False), gain=own.gain)
 
 
-def _reading(pair: Pair, drive: Drive) -> str:
+def _reading(pair: Pair, drive: DriveEstimate) -> str:
     form = pair.second_order
     assert form is not None
     return (

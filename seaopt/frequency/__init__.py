@@ -1,9 +1,10 @@
 """Frequency responses of logs: H1 estimates, second-order forms, and what a whole log shows."""
 
 from seaopt.frequency.response import FrequencyResponse, h1
-from seaopt.frequency.second_order import Drive, SecondOrder, Uncertain, second_order
+from seaopt.frequency.second_order import DriveEstimate, SecondOrder, Uncertain, second_order
 from seaopt.frequency.survey import Pair, Peak, Survey, survey
 
 __all__ = [
-    "Drive", "FrequencyResponse", "Pair", "Peak", "SecondOrder", "Survey", "Uncertain", "h1", "second_order", "survey",
+    "DriveEstimate", "FrequencyResponse", "Pair", "Peak", "SecondOrder", "Survey", "Uncertain", "h1",
+    "second_order", "survey",
 ]  # fmt: skip

@@ -34,10 +34,10 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, make_model
 
-COHERENT = 0.8  # lines of less coherence are not fitted
-LINES = 8  # the fewest lines that a fit is made of
+MIN_COHERENCE = 0.8  # lines of less coherence are not fitted
+MIN_LINES = 8  # the fewest lines that a fit is made of
 HANN_LINES = 35.0 / 18.0
-STEPS = 20  # of the linear iteration
+LEVY_STEPS = 20  # of the linear iteration
 DELAYS = 41  # tried when the delay is unknown, half a sample apart
 
 
@@ -54,7 +54,7 @@ class Uncertain:
 
 
 @record
-class Drive:
+class DriveEstimate:
     """What a second-order form says of a linear actuator with both links fixed and k known.
 
     Parameters
@@ -148,8 +148,8 @@ class SecondOrder:
         """Return the response from input samples to output samples at frequencies in Hz."""
         return sampled_response(_form(), self.values[:3], self.clock, f)[0][:, 0]
 
-    def drive(self, k: float, force_per_input: float, k_std: float = 0.0) -> Drive:
-        """Return what the form says of the actuator.
+    def drive(self, k: float, force_per_input: float, k_std: float = 0.0) -> DriveEstimate:
+        """Return the actuator's parameters that the form implies.
 
         Parameters
         ----------
@@ -164,8 +164,8 @@ class SecondOrder:
 
         >>> printed = SecondOrder(values=np.array([2166, 39.53, 2279, 0]), covariance=np.zeros((4, 4)),
         ...     clock=Clock(period=1 / 400), unit="N/N", band_hz=(0.1, 60), lines=600, misfit=1)
-        >>> found = printed.drive(655000, 1.0)
-        >>> round(found.m_k_averaged.value, 1), round(found.b_m_averaged.value), round(found.efficiency.value, 3)
+        >>> drive = printed.drive(655000, 1.0)
+        >>> round(drive.m_k_averaged.value, 1), round(drive.b_m_averaged.value), round(drive.efficiency.value, 3)
         (294.7, 11650, 0.95)
 
         """
@@ -174,9 +174,9 @@ class SecondOrder:
         point = np.append(self.values, k)
 
         def figure(of: Callable[[Any], Any], unit: str) -> Uncertain:
-            return _propagated(of, point, whole, unit)
+            return _propagate(of, point, whole, unit)
 
-        return Drive(
+        return DriveEstimate(
             m_k=figure(lambda v: v[4] / v[2], "kg"),
             b_m=figure(lambda v: v[1] * v[4] / v[2], "N s/m"),
             efficiency=figure(lambda v: v[0] / force_per_input / v[2], "-"),
@@ -186,7 +186,7 @@ class SecondOrder:
         )
 
     def _figure(self, of: Callable[[Any], Any], unit: str) -> Uncertain:
-        return _propagated(of, self.values, self.covariance, unit)
+        return _propagate(of, self.values, self.covariance, unit)
 
     def __repr__(self) -> str:
         return (
@@ -216,7 +216,7 @@ def second_order(
     unit : str
         Output unit over input unit.
     use : bool array, shape (m,), optional
-        The frequencies to fit; all coherent ones if left out, see `coherent`.
+        The frequencies to fit; all coherent ones if left out, see `coherent_lines`.
 
     Returns
     -------
@@ -235,37 +235,37 @@ def second_order(
     >>> plant, truth = so.plants.high_impedance(), so.plants.thor()
     >>> log = so.virtual_log(plant, truth, PAPER_STAND, duration_s=20, rate_hz=400, seed=1,
     ...                      sensors=so.Sensors(noise_std={"F1": 2.0}))
-    >>> found = second_order(so.h1(log["I"], log["F1"], log.period), Clock(period=log.period), unit="N/A")
-    >>> abs(found.b.value - 655000 / 295.2) < 3 * found.b.std
+    >>> form = second_order(so.h1(log["I"], log["F1"], log.period), Clock(period=log.period), unit="N/A")
+    >>> abs(form.b.value - 655000 / 295.2) < 3 * form.b.std
     True
 
     """
-    chosen = np.flatnonzero(coherent(estimate) if use is None else use)
-    if chosen.size < LINES:
+    chosen = np.flatnonzero(coherent_lines(estimate) if use is None else use)
+    if chosen.size < MIN_LINES:
         raise LogError(
-            f"{chosen.size} frequencies have a coherence above {COHERENT:g} and a second-order fit takes {LINES}; "
-            "excite more, or use a longer log"
+            f"{chosen.size} frequencies have a coherence above {MIN_COHERENCE:g} and a second-order fit takes "
+            f"{MIN_LINES}; excite more, or use a longer log"
         )
     f, measured = estimate.frequency_hz[chosen], estimate.response[chosen]
     sigma = np.maximum(estimate.relative_std[chosen], 1e-9) * np.abs(measured)
     start = _start(f, measured, sigma, clock)
-    values, slopes, residual = _refined(estimate, chosen, sigma, clock, start)
+    values, slopes, residual = _refine(estimate, chosen, sigma, clock, start)
     degrees = max(residual.size - slopes.shape[1], 1)
     misfit = float(np.sqrt(residual @ residual / degrees))
     covariance = np.zeros((4, 4))
     count = slopes.shape[1]
-    covariance[:count, :count] = _inverse(slopes.T @ slopes) * HANN_LINES * max(1.0, misfit) ** 2
+    covariance[:count, :count] = _invert(slopes.T @ slopes) * HANN_LINES * max(1.0, misfit) ** 2
     return SecondOrder(
         values=values, covariance=covariance, clock=replace(clock, delay_s=float(values[3]), delay_free=False),
         unit=unit, band_hz=(float(f[0]), float(f[-1])), lines=int(f.size), misfit=misfit,
     )  # fmt: skip
 
 
-def coherent(estimate: FrequencyResponse) -> Bool[np.ndarray, " m"]:
+def coherent_lines(estimate: FrequencyResponse) -> Bool[np.ndarray, " m"]:
     """Return which lines have a coherence above 0.8; never the first, beside the mean that stretches are rid of."""
-    found = estimate.coherence > COHERENT
-    found[0] = False
-    return found
+    lines = estimate.coherence > MIN_COHERENCE
+    lines[0] = False
+    return lines
 
 
 @cache
@@ -289,28 +289,28 @@ def _start(
     """Return K, a, b and the delay by linear least squares; the best of several delays where it is unknown."""
     s = 2j * np.pi * f
     delays = clock.delay_s + (0.5 * clock.period * np.arange(DELAYS) if clock.delay_free else np.zeros(1))
-    held = np.sinc(f * clock.period) * np.exp(-0.5 * s * clock.period)
+    hold = np.sinc(f * clock.period) * np.exp(-0.5 * s * clock.period)
     if clock.hold == "first":
-        held = np.sinc(f * clock.period) ** 2 + 0j
-    found = [(*_linear(s, measured, sigma, held * np.exp(-s * delay)), float(delay)) for delay in delays]
-    _, form, delay = min(found, key=lambda item: item[0])
+        hold = np.sinc(f * clock.period) ** 2 + 0j
+    forms = [(*_fit_linear(s, measured, sigma, hold * np.exp(-s * delay)), float(delay)) for delay in delays]
+    _, form, delay = min(forms, key=lambda candidate: candidate[0])
     return np.append(form, delay)
 
 
-def _linear(
+def _fit_linear(
     s: Complex[np.ndarray, " m"], measured: Complex[np.ndarray, " m"], sigma: Float[np.ndarray, " m"],
-    held: Complex[np.ndarray, " m"],
+    hold: Complex[np.ndarray, " m"],
 ) -> tuple[float, Float[np.ndarray, "3"]]:  # fmt: skip
     """Return the cost and K, a, b of the best step of K - a s G - b G = s^2 G, weighted by the step before it."""
-    g, scatter = measured / held, sigma / np.abs(held)
+    g, scatter = measured / hold, sigma / np.abs(hold)
     scale = float(np.sqrt(np.abs(s[0]) * np.abs(s[-1])))
     p = s / scale
     denominator = p**2 + p + 1.0
     best: tuple[float, Float[np.ndarray, "3"]] = (np.inf, np.array([np.abs(g[0]), 1.0, 1.0]))
-    for _ in range(STEPS):
+    for _ in range(LEVY_STEPS):
         weight = 1.0 / (scatter * np.abs(denominator))
         columns = np.stack([np.ones_like(p), -p * g, -g], axis=1) * weight[:, None]
-        form, *_ = np.linalg.lstsq(_stacked(columns), _stacked(p**2 * g * weight), rcond=None)
+        form, *_ = np.linalg.lstsq(_stack(columns), _stack(p**2 * g * weight), rcond=None)
         denominator = p**2 + form[1] * p + form[2]
         residual = (form[0] / denominator - g) / scatter
         cost = float(np.vdot(residual, residual).real)
@@ -319,12 +319,12 @@ def _linear(
     return best[0], best[1] * np.array([scale**2, scale, scale**2])
 
 
-def _stacked(values: Complex[np.ndarray, "m ..."]) -> Float[np.ndarray, "n ..."]:
+def _stack(values: Complex[np.ndarray, "m ..."]) -> Float[np.ndarray, "n ..."]:
     """Return real parts above imaginary parts."""
     return np.concatenate([np.real(values), np.imag(values)])
 
 
-def _refined(
+def _refine(
     estimate: FrequencyResponse, chosen: Int[np.ndarray, " m"], sigma: Float[np.ndarray, " m"], clock: Clock,
     start: Float[np.ndarray, "4"],
 ) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "n c"], Float[np.ndarray, " n"]]:  # fmt: skip
@@ -336,7 +336,7 @@ def _refined(
     count = 4 if clock.delay_free else 3
 
     @lru_cache(maxsize=1)
-    def evaluated(*x: float) -> Complex[np.ndarray, "m n"]:
+    def evaluate(*x: float) -> Complex[np.ndarray, "m n"]:
         """Return residuals and derivatives, in standard deviations; asked for one after the other at the same point."""
         moved = replace(clock, delay_s=x[3]) if clock.delay_free else clock
 
@@ -350,10 +350,10 @@ def _refined(
 
     size = np.append(np.abs(start[:3]), clock.period)[:count]
     low = np.append(np.full(3, -np.inf), 0.0)[:count]
-    found = solve(
-        lambda x: _stacked(evaluated(*x.tolist())[:, 0]),
+    solution = solve(
+        lambda x: _stack(evaluate(*x.tolist())[:, 0]),
         start[:count],
-        jac=lambda x: _stacked(evaluated(*x.tolist())[:, 1:]),
+        jac=lambda x: _stack(evaluate(*x.tolist())[:, 1:]),
         bounds=(low, np.inf),
         x_scale=np.maximum(size, 1e-300),
         method="trf",
@@ -362,17 +362,17 @@ def _refined(
         gtol=1e-9,
     )
     values = np.append(start[:3], clock.delay_s)
-    values[:count] = found.x
-    return values, np.asarray(found.jac), np.asarray(found.fun)
+    values[:count] = solution.x
+    return values, np.asarray(solution.jac), np.asarray(solution.fun)
 
 
-def _inverse(information: Float[np.ndarray, "c c"]) -> Float[np.ndarray, "c c"]:
+def _invert(information: Float[np.ndarray, "c c"]) -> Float[np.ndarray, "c c"]:
     """Return the inverse of an information matrix, scaled to a unit diagonal first."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     return np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
 
 
-def _propagated(
+def _propagate(
     of: Callable[[Any], Any], point: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"], unit: str
 ) -> Uncertain:
     """Return a function of uncertain values, its variance by central differences."""

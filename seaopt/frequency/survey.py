@@ -1,4 +1,4 @@
-"""The frequency responses of one log: from each excited input to each measured output, and what they show.
+"""The frequency responses of one log, from each excited input to each measured output, for `seaopt frf` and the report.
 
 A pair has its H1 estimate, the band in which it can be trusted, its peak and its second-order form. The form is read as
 the source paper reads (16) where the plant says so: two poles, no zero, b = k/m_k.
@@ -17,17 +17,24 @@ from jaxtyping import Bool, Complex, Float
 from seaopt.errors import LogError
 from seaopt.frequency.response import FrequencyResponse, h1
 from seaopt.frequency.sampled import sampled_response
-from seaopt.frequency.second_order import COHERENT, LINES, Drive, SecondOrder, coherent, second_order
+from seaopt.frequency.second_order import (
+    MIN_COHERENCE,
+    MIN_LINES,
+    DriveEstimate,
+    SecondOrder,
+    coherent_lines,
+    second_order,
+)
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Clock, linearised, make_model
 
-SHORTEST = 256  # samples
+MIN_SAMPLES = 256  # samples
 SMOOTH = 5  # lines of which the median coherence decides where a band ends
 NEAR_PEAK = 0.89  # of the peak's height: 1 dB below it
-Response = Callable[[Any], Any]
+ResponseFunction = Callable[[Any], Any]
 
 
 @record
@@ -76,9 +83,9 @@ class Pair:
     @property
     def used(self) -> Bool[np.ndarray, " m"]:
         """The coherent frequencies, those that are compared with models."""
-        return coherent(self.estimate)
+        return coherent_lines(self.estimate)
 
-    def misfit(self, response: Response) -> float:
+    def misfit(self, response: ResponseFunction) -> float:
         """Return how far a response, a function of frequencies in Hz, lies from the estimate.
 
         The root mean square over the coherent frequencies in standard deviations of the estimate; 1 explains the log.
@@ -114,7 +121,7 @@ class Survey:
     gain: Mapping[str, float]
     pairs: tuple[Pair, ...]
 
-    def model(self, pair: Pair, params: ParameterSet) -> Response:
+    def model(self, pair: Pair, params: ParameterSet) -> ResponseFunction:
         """Return the plant's response as the sensors see it, linearised at rest, as a function of frequencies in Hz."""
         model = linearised(make_model(self.plant, params, (), (pair.output,)))
         clock = replace(self.clock, delay_free=False)
@@ -125,7 +132,7 @@ class Survey:
 
         return response
 
-    def drive(self, pair: Pair, params: ParameterSet) -> Drive | None:
+    def drive(self, pair: Pair, params: ParameterSet) -> DriveEstimate | None:
         """Return what a pair's second-order form says of the actuator, with k known, as the source paper reads (16).
 
         None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output.
@@ -192,14 +199,14 @@ def survey(
 
     """
     names = tuple(outputs) or tuple(name for name in plant.outputs if name in log.signals)
-    sources = _excited(plant, log)
+    sources = _excited_inputs(plant, log)
     _check(log, (*sources, *names))
     chosen = clock if clock is not None else Clock(period=log.period)
     pairs = [_pair(plant, log, chosen, source, name, stretch_s) for source in sources for name in names]
     return Survey(plant=plant, clock=chosen, gain=dict(gain or {}), pairs=tuple(pairs))
 
 
-def _excited(plant: Plant, log: Log) -> list[str]:
+def _excited_inputs(plant: Plant, log: Log) -> list[str]:
     present = [name for name in plant.inputs if name in log.signals]
     excited = [name for name in present if np.ptp(log[name]) != 0.0]
     if not excited:
@@ -214,9 +221,9 @@ def _check(log: Log, names: Sequence[str]) -> None:
             f"{log.source}: the log has {len(log.segments)} stretches between gaps and a frequency response takes one; "
             "choose one with slice_s"
         )
-    if len(log) < SHORTEST:
+    if len(log) < MIN_SAMPLES:
         raise LogError(
-            f"{log.source}: {len(log)} samples are too few for a frequency response; use a log of {SHORTEST} or more"
+            f"{log.source}: {len(log)} samples are too few for a frequency response; use a log of {MIN_SAMPLES} or more"
         )
     for name in names:
         lost = int(np.count_nonzero(~np.isfinite(log[name])))
@@ -230,8 +237,8 @@ def _check(log: Log, names: Sequence[str]) -> None:
 def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretch_s: float | None) -> Pair:
     estimate = h1(log[source], log[output], log.period, stretch_s=stretch_s)
     unit = f"{plant.outputs[output]}/{_divisor(plant.inputs[source])}"
-    used = coherent(estimate)
-    form = second_order(estimate, clock, unit=unit, use=used) if np.count_nonzero(used) >= LINES else None
+    used = coherent_lines(estimate)
+    form = second_order(estimate, clock, unit=unit, use=used) if np.count_nonzero(used) >= MIN_LINES else None
     band = _good_band(estimate)
     return Pair(
         source=source, output=output, unit=unit, estimate=estimate, good_band_hz=band, peak=_peak(estimate, band),
@@ -247,7 +254,7 @@ def _good_band(estimate: FrequencyResponse) -> tuple[float, float] | None:
     """Return the widest run of good coherence; a line alone that strays, as estimates do, ends none."""
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 
-    good = median_filter(estimate.coherence, SMOOTH, mode="nearest") > COHERENT
+    good = median_filter(estimate.coherence, SMOOTH, mode="nearest") > MIN_COHERENCE
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
     runs = [(float(estimate.frequency_hz[a]), float(estimate.frequency_hz[b - 1])) for a, b in edges.reshape(-1, 2)]
     return max(runs, key=lambda run: run[1] / run[0], default=None)
@@ -267,7 +274,7 @@ def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak
     near = inside[max(first + 1, 0) : last]
     f, std = estimate.frequency_hz, estimate.relative_std
     at, height = float(f[inside[top]]), float(size[top])
-    if near.size >= LINES:
+    if near.size >= MIN_LINES:
         x = np.log(f[near] / at)
         curve = np.polyfit(x, np.log(np.abs(estimate.response[near])), 3, w=1.0 / np.maximum(std[near], 1e-9))
         dense = np.linspace(x[0], x[-1], 401)
@@ -281,7 +288,7 @@ def _is_form(plant: Plant, values: ParameterSet, pair: Pair) -> bool:
     derived = plant.derived_values()
     if len(plant.states) != 2 or "m_k" not in derived:
         return False
-    point = [item.value for item in values.values()]
+    point = [parameter.value for parameter in values.values()]
     m_k: Any = ca.Function("m_k", [plant.p], [derived["m_k"][0]])(point)
     model = linearised(make_model(plant, values, (), (pair.output,)))
     g, _ = model.matrices(np.zeros(0))
@@ -294,8 +301,8 @@ def _is_form(plant: Plant, values: ParameterSet, pair: Pair) -> bool:
     return bool(through == 0.0 and abs(source[:2] @ b) <= 1e-9 * abs(static) * np.sqrt(stiff))
 
 
-def _pair_dict(found: Survey, pair: Pair, params: ParameterSet) -> dict[str, Any]:
-    estimate, drive = pair.estimate, found.drive(pair, params)
+def _pair_dict(measured: Survey, pair: Pair, params: ParameterSet) -> dict[str, Any]:
+    estimate, drive = pair.estimate, measured.drive(pair, params)
     return {
         "input": pair.source,
         "output": pair.output,
@@ -304,8 +311,8 @@ def _pair_dict(found: Survey, pair: Pair, params: ParameterSet) -> dict[str, Any
         "good_band_hz": pair.good_band_hz,
         "peak": _fields(pair.peak) if pair.peak is not None else None,
         "second_order": _form_dict(pair.second_order) if pair.second_order is not None else None,
-        "actuator": {name: _fields(item) for name, item in _fields(drive).items()} if drive is not None else None,
-        "model_misfit": pair.misfit(found.model(pair, params)),
+        "actuator": {name: _fields(figure) for name, figure in _fields(drive).items()} if drive is not None else None,
+        "model_misfit": pair.misfit(measured.model(pair, params)),
         "frequency_hz": estimate.frequency_hz,
         "real": np.real(estimate.response),
         "imag": np.imag(estimate.response),
@@ -324,5 +331,5 @@ def _form_dict(form: SecondOrder) -> dict[str, Any]:
     }
 
 
-def _fields(item: Any) -> dict[str, Any]:
-    return {name: getattr(item, name) for name in item.__dataclass_fields__}
+def _fields(data: Any) -> dict[str, Any]:
+    return {name: getattr(data, name) for name in data.__dataclass_fields__}

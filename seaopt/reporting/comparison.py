@@ -9,7 +9,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.estimation import DerivedFigure, Experiment, Fit
-from seaopt.frequency import Drive, Pair, Survey, Uncertain, survey
+from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain, survey
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.reporting.bode import Curve, Panel, bode_figure
 from seaopt.simulation import Clock
@@ -119,12 +119,12 @@ def sentence(found: Survey, fit: Fit) -> str:
     return "".join(parts).strip()
 
 
-def _drives(found: Survey, fit: Fit) -> list[tuple[Pair, Drive]]:
+def _drives(found: Survey, fit: Fit) -> list[tuple[Pair, DriveEstimate]]:
     pairs = [(pair, found.drive(pair, fit.parameters)) for pair in found.pairs]
     return [(pair, drive) for pair, drive in pairs if drive is not None]
 
 
-def _reading(pair: Pair, drive: Drive, fit: Fit) -> str:
+def _reading(pair: Pair, drive: DriveEstimate, fit: Fit) -> str:
     """Say what (16) gives for the sprung mass and the damping, and what the fit gives."""
     mass, damping = fit.derived["m_k"], fit.derived["b_m"]
     words = f"{_gap('m_k', drive.m_k, mass)} and {_gap('b_m', drive.b_m, damping)}"

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import SimulationError
+from seaopt.plants.memo import memo
 from seaopt.simulation.discretisation import transition
 from seaopt.simulation.integrator import rate_functions
 from seaopt.simulation.model import Model
@@ -39,16 +40,14 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     ])  # fmt: skip
 
 
+@memo
 def _has_constant(model: Model) -> bool:
     """Tell whether a linear model has a constant term, for some parameters."""
-    if "constant" not in model.functions:
-        both, where = ca.vertcat(model.f, model.h), ca.vertcat(model.x, model.u)
-        rest = ca.substitute(both, where, ca.DM.zeros(where.numel()))
-        model.functions["constant"] = not ca.simplify(rest).is_zero()
-    return bool(model.functions["constant"])
+    both, where = ca.vertcat(model.f, model.h), ca.vertcat(model.x, model.u)
+    return not ca.simplify(ca.substitute(both, where, ca.DM.zeros(where.numel()))).is_zero()
 
 
-def _delayed(model: Model, point: Point) -> bool:
+def _needs_delay(model: Model, point: Point) -> bool:
     """Tell whether the code must know of a delay: the older input of a linear plant matters, or the delay is free."""
     older = point.clock.fraction_s > 0.0 or point.clock.hold == "first"
     return point.clock.delay_free or (model.linear and older)
@@ -67,7 +66,10 @@ def kernel_source(model: Model, layout: Layout, delayed: bool) -> str:
         rates = rate_functions(model)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
-        chains = (_chain("rate", rates.rate_pattern, model.nx), _chain("output", rates.output_pattern, model.ny))
+        chains = (
+            _chain_code("rate", rates.rate_pattern, model.nx),
+            _chain_code("output", rates.output_pattern, model.ny),
+        )
         generated = "\n".join((generate_code(rates.rate, rates.output), *chains))
     return "\n".join((define_constants(constants), _text("layout.h"), generated, _text("pass.c")))
 
@@ -77,7 +79,7 @@ def _text(name: str) -> str:
     return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
 
 
-def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
+def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
     """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives a row."""
     a, b = pattern
     lines = [
@@ -92,27 +94,25 @@ def _chain(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]
     return "\n".join([*lines, "}"])
 
 
+@memo
 def load_passes(model: Model, layout: Layout, delayed: bool) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
-    key = f"kernel {layout} {delayed}"
-    if key not in model.functions:
-        kernel = load_kernel(kernel_source(model, layout, delayed), "seaopt_passes")
-        if kernel is not None:
-            kernel.library.carry_size.restype = ctypes.c_long
-        model.functions[key] = kernel
-    return model.functions[key]
+    kernel = load_kernel(kernel_source(model, layout, delayed), "seaopt_passes")
+    if kernel is not None:
+        kernel.library.carry_size.restype = ctypes.c_long
+    return kernel
 
 
-def _padded(count: int) -> int:
+def _pad_to_vectors(count: int) -> int:
     return (count + 3) // 4 * 4
 
 
 def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray, " m"]:
     """Return D and A of pass.c: rows of [x+; y], forced with derivatives last, and by the state."""
     blocks = transition(model, point.theta, point.clock)
-    nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _delayed(model, point)
+    nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _needs_delay(model, point)
     used = [*range(nx + nu * (1 + delayed))] + ([nx + 2 * nu] if _has_constant(model) else [])
-    d = np.zeros((rows, len(used), _padded(layout.states)))
+    d = np.zeros((rows, len(used), _pad_to_vectors(layout.states)))
     d[:, :, : blocks.shape[0]] = blocks[:, :, used].transpose(1, 2, 0)
     d[:, :nx, 0] = 0.0  # the state itself goes through A
     return np.concatenate([d.ravel(), blocks[0, :, :nx].ravel()])
@@ -136,7 +136,7 @@ def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
 
 
-def _emptied(room: Any, shape: tuple[int, ...]) -> Any:
+def _reuse_or_make(room: Any, shape: tuple[int, ...]) -> Any:
     """Return an array of a shape, in a room that is long enough if there is one: fresh memory costs its first touch."""
     return np.empty(shape) if room is None or len(room) < shape[0] else room[: shape[0]]
 
@@ -193,13 +193,13 @@ class Program:
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
         """Return the program, or None where there is no compiler."""
         layout = layout_of(model.nx, model.ny, model.np, point)
-        kernel = load_passes(model, layout, _delayed(model, point))
+        kernel = load_passes(model, layout, _needs_delay(model, point))
         return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
 
     def _correction(self, point: Point) -> int:
         if point.correction is None:
             return 0
-        padded = np.zeros((self.model.nx, self.model.ny, _padded(self.layout.states)))
+        padded = np.zeros((self.model.nx, self.model.ny, _pad_to_vectors(self.layout.states)))
         padded[:, :, : point.correction.shape[0]] = point.correction.transpose(1, 2, 0)
         return self.memory.constant(padded)
 
@@ -226,9 +226,9 @@ class Program:
         alone = len(edges) == 2 and resume is None and sums and not (outputs or columns or states)
         if alone and self.run_up and edges[1] - edges[0] >= max(PARALLEL, 4 * self.run_up):
             halves, starts, ahead = self._halves(int(edges[0]), int(edges[1]), x0)
-            found = self.run(halves, starts, warm=ahead)
-            gram, loss, count = (np.sum(own, axis=0)[None] for own in (found.gram, found.loss, found.count))
-            return Pass(gram=gram, loss=loss, count=count, last=found.last[1:])
+            parts = self.run(halves, starts, warm=ahead)
+            gram, loss, count = (np.sum(half, axis=0)[None] for half in (parts.gram, parts.loss, parts.count))
+            return Pass(gram=gram, loss=loss, count=count, last=parts.last[1:])
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
         rows = n if shown is None else min(shown, n)
@@ -237,8 +237,8 @@ class Program:
         result = Pass(
             gram=np.zeros((shots, ny, nc, nc)), loss=np.zeros((shots, ny)), count=np.zeros((shots, ny)),
             last=np.zeros((shots, nx, layout.states)),
-            outputs=_emptied(room.outputs if room else None, (rows, ny)) if outputs else None,
-            columns=_emptied(room.columns if room else None, (n, ny, nc)) if columns and self.segment.y else None,
+            outputs=_reuse_or_make(room.outputs if room else None, (rows, ny)) if outputs else None,
+            columns=_reuse_or_make(room.columns if room else None, (n, ny, nc)) if columns and self.segment.y else None,
             states=np.empty((n, nx)) if states else None,
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
@@ -246,13 +246,13 @@ class Program:
         arguments["from"], arguments["to"], arguments["shown"] = edges[:-1] - warm, edges[1:], rows
         arguments["start"], arguments["warm"] = edges[:-1] - warm if resume is None else 0, warm
         arguments["x0"] = row_addresses(start)
-        filled = {"rho": result.loss, "count": result.count, "last": result.last}
-        for name, array in (filled | {"gram": result.gram} if sums else filled).items():
+        sums_of = {"rho": result.loss, "count": result.count, "last": result.last}
+        for name, array in (sums_of | {"gram": result.gram} if sums else sums_of).items():
             arguments[name] = row_addresses(array)
         for name in ("outputs", "columns", "states"):
-            kept = getattr(result, name)
-            if kept is not None:
-                arguments[name] = kept.ctypes.data + kept.strides[0] * (edges[:-1] - first)
+            array = getattr(result, name)
+            if array is not None:
+                arguments[name] = array.ctypes.data + array.strides[0] * (edges[:-1] - first)
         if resume is not None:
             arguments["carry"] = resume.ctypes.data
         self.kernel.run(arguments, (self.memory, result, start, resume), parallel=n >= PARALLEL)
@@ -263,7 +263,7 @@ class Program:
     ) -> Float[np.ndarray, "p p"]:
         """Return the sum over t and s of a(t)' R(t - s) a(s), a the influences into v of the samples that count."""
         ny, p, nc = into.shape
-        width = _padded(p)
+        width = _pad_to_vectors(p)
         padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
         padded[:, :, :p] = into.transpose(0, 2, 1)
         halved[0] *= 0.5

@@ -16,39 +16,38 @@ from typing import Any
 
 import casadi as ca
 
+from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation.model import Model
 
 
-def step_function(model: Model) -> Any:
+@memo
+def step_function(model: Model) -> ca.Function:
     """Return the CasADi function (t, x, u0, u1, p, h) -> (x1, dx1/dx, dx1/d[theta, h])."""
-    if "step" not in model.functions:
-        rate = ca.Function("rate", [model.t, model.x, model.u, model.p], [model.f])
-        t, h = ca.SX.sym("t"), ca.SX.sym("h")
-        x, p = ca.SX.sym("x", model.nx), ca.SX.sym("p", model.p.numel())
-        u0, u1 = ca.SX.sym("u0", model.nu), ca.SX.sym("u1", model.nu)
-        middle = 0.5 * (u0 + u1)
-        k1 = rate(t, x, u0, p)
-        k2 = rate(t + h / 2, x + h / 2 * k1, middle, p)
-        k3 = rate(t + h / 2, x + h / 2 * k2, middle, p)
-        k4 = rate(t + h, x + h * k3, u1, p)
-        x1 = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        results = [x1, ca.densify(ca.jacobian(x1, x)), ca.densify(ca.jacobian(x1, ca.vertcat(p[: model.np], h)))]
-        model.functions["step"] = ca.Function("seaopt_step", [t, x, u0, u1, p, h], results)
-    return model.functions["step"]
+    rate = ca.Function("rate", [model.t, model.x, model.u, model.p], [model.f])
+    t, h = ca.SX.sym("t"), ca.SX.sym("h")
+    x, p = ca.SX.sym("x", model.nx), ca.SX.sym("p", model.p.numel())
+    u0, u1 = ca.SX.sym("u0", model.nu), ca.SX.sym("u1", model.nu)
+    middle = 0.5 * (u0 + u1)
+    k1 = rate(t, x, u0, p)
+    k2 = rate(t + h / 2, x + h / 2 * k1, middle, p)
+    k3 = rate(t + h / 2, x + h / 2 * k2, middle, p)
+    k4 = rate(t + h, x + h * k3, u1, p)
+    x1 = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    results = [x1, ca.densify(ca.jacobian(x1, x)), ca.densify(ca.jacobian(x1, ca.vertcat(p[: model.np], h)))]
+    return ca.Function("seaopt_step", [t, x, u0, u1, p, h], results)
 
 
-def output_function(model: Model) -> Any:
+@memo
+def output_function(model: Model) -> ca.Function:
     """Return the CasADi function (t, x, u, p) -> (y, dy/dx, dy/dtheta)."""
-    if "output" not in model.functions:
-        results = [
-            ca.densify(model.h),
-            ca.densify(ca.jacobian(model.h, model.x)),
-            ca.densify(ca.jacobian(model.h, model.theta)),
-        ]
-        arguments = [model.t, model.x, model.u, model.p]
-        model.functions["output"] = ca.Function("seaopt_output", arguments, results)
-    return model.functions["output"]
+    results = [
+        ca.densify(model.h),
+        ca.densify(ca.jacobian(model.h, model.x)),
+        ca.densify(ca.jacobian(model.h, model.theta)),
+    ]
+    arguments = [model.t, model.x, model.u, model.p]
+    return ca.Function("seaopt_output", arguments, results)
 
 
 @record(eq=False)
@@ -73,29 +72,28 @@ class Rates:
     output_pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]]
 
 
+@memo
 def rate_functions(model: Model) -> Rates:
     """Return the functions of compiled passes."""
-    if "rates" not in model.functions:
-        parts = [part for e in (model.f, model.h) for part in (e, ca.jacobian(e, model.x), ca.jacobian(e, model.theta))]
-        dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)]
-        sizes = [part.nnz() for part in dense]
-        flat = ca.cse(ca.vertcat(*(entry for part in dense for entry in part.nonzeros())))
-        flat, symbols, values = ca.extract_parametric(flat, model.p, {"extract_trivial": True})
-        c, columns = ca.vertcat(*symbols), []
-        for size in sizes:
-            columns.append(flat[:size])
-            flat = flat[size:]
-        arguments, names = [model.t, model.x, model.u, c], ["seaopt_rate", "seaopt_output"]
-        rate, output = (ca.Function(names[i], arguments, columns[3 * i : 3 * i + 3]) for i in range(2))
-        prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
-        pattern = [_places(part) for part in dense]
-        model.functions["rates"] = Rates(
-            prepare=prepare, rate=rate, output=output, rate_pattern=(pattern[1], pattern[2]),
-            output_pattern=(pattern[4], pattern[5]),
-        )  # fmt: skip
-    return model.functions["rates"]
+    parts = [part for e in (model.f, model.h) for part in (e, ca.jacobian(e, model.x), ca.jacobian(e, model.theta))]
+    dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)]
+    sizes = [part.nnz() for part in dense]
+    flat = ca.cse(ca.vertcat(*(entry for part in dense for entry in part.nonzeros())))
+    flat, symbols, values = ca.extract_parametric(flat, model.p, {"extract_trivial": True})
+    c, columns = ca.vertcat(*symbols), []
+    for size in sizes:
+        columns.append(flat[:size])
+        flat = flat[size:]
+    arguments, names = [model.t, model.x, model.u, c], ["seaopt_rate", "seaopt_output"]
+    rate, output = (ca.Function(names[i], arguments, columns[3 * i : 3 * i + 3]) for i in range(2))
+    prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
+    pattern = [_nonzeros(part) for part in dense]
+    return Rates(
+        prepare=prepare, rate=rate, output=output, rate_pattern=(pattern[1], pattern[2]),
+        output_pattern=(pattern[4], pattern[5]),
+    )  # fmt: skip
 
 
-def _places(part: Any) -> list[tuple[int, int]]:
+def _nonzeros(part: Any) -> list[tuple[int, int]]:
     rows, columns = part.sparsity().get_triplet()
     return list(zip(rows, columns, strict=True))

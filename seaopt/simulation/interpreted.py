@@ -13,15 +13,17 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.simulation.discretisation import transition
+from seaopt.plants.memo import memo
+from seaopt.records import record
+from seaopt.simulation.discretisation import Hold, transition
 from seaopt.simulation.integrator import output_function, step_function
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
-BLOCK = 32
-CHUNK = 4096
+LIFTED_SAMPLES = 32  # that are one matrix product
+FOLDED_SAMPLES = 4096  # that CasADi's virtual machine chains in one call
 
-Trace = tuple[
+Trajectory = tuple[
     Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Float[np.ndarray, "n1 nx"], Float[np.ndarray, "nx nj"]
 ]
 
@@ -40,13 +42,13 @@ def interpreted_passes(
     states: bool = False,
 ) -> Pass:
     """Run the shots between neighbouring `edges` in NumPy and CasADi's virtual machine."""
-    held = _held_inputs(segment, point)
+    inputs = _inputs_in_force(segment, point)
     shots = [
-        _shot(model, segment, point, weights, held, (int(a), int(b)), start)
+        _run_shot(model, segment, point, weights, inputs, (int(a), int(b)), start)
         for a, b, start in zip(edges[:-1], edges[1:], x0, strict=True)
     ]
 
-    def joined(name: str, wanted: bool) -> Any:
+    def join(name: str, wanted: bool) -> Any:
         return np.concatenate([shot[name] for shot in shots]) if wanted else None
 
     return Pass(
@@ -54,36 +56,36 @@ def interpreted_passes(
         loss=np.stack([shot["loss"] for shot in shots]),
         count=np.stack([shot["count"] for shot in shots]),
         last=np.stack([shot["last"] for shot in shots]),
-        outputs=joined("outputs", outputs),
-        columns=joined("columns", columns and bool(segment.y)),
-        states=joined("states", states),
+        outputs=join("outputs", outputs),
+        columns=join("columns", columns and bool(segment.y)),
+        states=join("states", states),
     )
 
 
-def _shot(
-    model: Model, segment: Segment, point: Point, weights: Weights, held: Float[np.ndarray, "all w"],
+def _run_shot(
+    model: Model, segment: Segment, point: Point, weights: Weights, forcing: Float[np.ndarray, "all w"],
     rows: tuple[int, int], x0: Float[np.ndarray, " nx"],
 ) -> dict[str, Any]:  # fmt: skip
     layout = layout_of(model.nx, model.ny, model.np, point)
     if model.linear and point.correction is None:
-        y, dy, x, last = _linear_trace(model, point, held[rows[0] : rows[1]], x0)
+        y, dy, x, last = _linear_trajectory(model, point, forcing[rows[0] : rows[1]], x0)
     else:
-        y, dy, x, last = _folded_trace(model, segment, point, held, rows, x0)
+        y, dy, x, last = _folded_trajectory(model, segment, point, forcing, rows, x0)
     ny, nc = model.ny, layout.columns
-    found: dict[str, Any] = {"outputs": y, "states": x[:-1], "last": last}
-    found |= {"gram": np.zeros((ny, nc, nc)), "loss": np.zeros(ny), "count": np.zeros(ny)}
+    shot: dict[str, Any] = {"outputs": y, "states": x[:-1], "last": last}
+    shot |= {"gram": np.zeros((ny, nc, nc)), "loss": np.zeros(ny), "count": np.zeros(ny)}
     if segment.y:
         v, present = _columns(segment, point, weights, layout, rows, y, dy)
-        found["columns"] = v
+        shot["columns"] = v
         for o in range(ny):
             kept = v[present[:, o], o]
-            loss, weight = _robust(kept[:, 0], weights.loss, float(weights.knee[o]))
-            found["gram"][o] = (kept * weight[:, None]).T @ kept
-            found["loss"][o], found["count"][o] = float(np.sum(loss)), float(len(kept))
-    return found
+            loss, weight = _loss_and_weight(kept[:, 0], weights.loss, float(weights.knee[o]))
+            shot["gram"][o] = (kept * weight[:, None]).T @ kept
+            shot["loss"][o], shot["count"][o] = float(np.sum(loss)), float(len(kept))
+    return shot
 
 
-def _robust(
+def _loss_and_weight(
     r: Float[np.ndarray, " n"], loss: str, knee: float
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the loss of each residual and the weight that makes its square's gradient the loss's."""
@@ -99,7 +101,7 @@ def _robust(
     )
 
 
-def _held_inputs(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
+def _inputs_in_force(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
     """Return [u_a, u_b, 1] of every sample."""
     n, u = segment.n, np.column_stack(segment.u)
     rows = segment.lead + np.arange(n)
@@ -107,7 +109,7 @@ def _held_inputs(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
     return np.hstack([ua, ub, np.ones((n, 1))])
 
 
-def _augmented(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any, Any, Any]:
+def _augment(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any, Any, Any]:
     """Return F, B, H, D of the recursion of z = [x, dx/dtheta_1, ..., dx/dx0_1, ...]."""
     nx, ny, count = model.nx, model.ny, blocks.shape[0] - 1
     nt = count + nx
@@ -125,55 +127,60 @@ def _augmented(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any
     return f, b, h, d
 
 
-def _linear_trace(model: Model, point: Point, held: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]) -> Trace:
+def _linear_trajectory(
+    model: Model, point: Point, forcing: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
+) -> Trajectory:
     nx, ny = model.nx, model.ny
-    f, b, h, d = _augmented(model, transition(model, point.theta, point.clock))
-    n, width = held.shape
+    f, b, h, d = _augment(model, transition(model, point.theta, point.clock))
+    n, width = forcing.shape
     nt = f.shape[0] // nx - 1
     z = np.zeros(f.shape[0])
     z[:nx] = x0
     for i in range(nx):
         z[(1 + nt - nx + i) * nx + i] = 1.0
 
-    count = -(-n // BLOCK)
-    padded = np.zeros((count * BLOCK, width))
-    padded[:n] = held
-    inputs = padded.reshape(count, BLOCK * width)
+    count = -(-n // LIFTED_SAMPLES)
+    padded = np.zeros((count * LIFTED_SAMPLES, width))
+    padded[:n] = forcing
+    inputs = padded.reshape(count, LIFTED_SAMPLES * width)
     powers = [np.eye(f.shape[0])]
-    for _ in range(BLOCK):
+    for _ in range(LIFTED_SAMPLES):
         powers.append(powers[-1] @ f)
     observe = np.vstack([h @ power for power in powers[:-1]])
     state_rows = np.vstack([power[:nx] for power in powers[:-1]])
-    reach = np.hstack([power @ b for power in powers[BLOCK - 1 :: -1]])
-    impulse = [d, *(h @ power @ b for power in powers[: BLOCK - 1])]
-    state_impulse = [np.zeros((nx, width)), *(power[:nx] @ b for power in powers[: BLOCK - 1])]
+    reach = np.hstack([power @ b for power in powers[LIFTED_SAMPLES - 1 :: -1]])
+    impulse = [d, *(h @ power @ b for power in powers[: LIFTED_SAMPLES - 1])]
+    state_impulse = [np.zeros((nx, width)), *(power[:nx] @ b for power in powers[: LIFTED_SAMPLES - 1])]
 
     starts = np.empty((count, f.shape[0]))
     driven = inputs @ reach.T
-    whole = powers[BLOCK]
+    whole = powers[LIFTED_SAMPLES]
     for k in range(count):
         starts[k] = z
         z = whole @ z + driven[k]
     stacked = starts @ observe.T + inputs @ _toeplitz(impulse).T
-    x = (starts @ state_rows.T + inputs @ _toeplitz(state_impulse).T).reshape(count * BLOCK, nx)
-    all_outputs = stacked.reshape(count * BLOCK, nt + 1, ny)[:n]
-    last = _last(starts[-1], held[(count - 1) * BLOCK :], f, b).reshape(nt + 1, nx).T
+    x = (starts @ state_rows.T + inputs @ _toeplitz(state_impulse).T).reshape(count * LIFTED_SAMPLES, nx)
+    all_outputs = stacked.reshape(count * LIFTED_SAMPLES, nt + 1, ny)[:n]
+    last = _run_on(starts[-1], forcing[(count - 1) * LIFTED_SAMPLES :], f, b).reshape(nt + 1, nx).T
     return all_outputs[:, 0], all_outputs[:, 1:].transpose(0, 2, 1), np.vstack([x[:n], last[:, 0]]), last
 
 
-def _last(
-    z: Float[np.ndarray, " m"], held: Float[np.ndarray, "k w"], f: Float[np.ndarray, "m m"], b: Float[np.ndarray, "m w"]
+def _run_on(
+    z: Float[np.ndarray, " m"],
+    forcing: Float[np.ndarray, "k w"],
+    f: Float[np.ndarray, "m m"],
+    b: Float[np.ndarray, "m w"],
 ) -> Float[np.ndarray, " m"]:
     """Return the recursion's state after the rest of the last block."""
-    for w in held:
+    for w in forcing:
         z = f @ z + b @ w
     return z
 
 
 def _toeplitz(impulse: list[Float[np.ndarray, "a w"]]) -> Float[np.ndarray, "la lw"]:
     rows, width = impulse[0].shape
-    out = np.zeros((BLOCK * rows, BLOCK * width))
-    for i in range(BLOCK):
+    out = np.zeros((LIFTED_SAMPLES * rows, LIFTED_SAMPLES * width))
+    for i in range(LIFTED_SAMPLES):
         for j in range(i + 1):
             out[i * rows : (i + 1) * rows, j * width : (j + 1) * width] = impulse[i - j]
     return out
@@ -190,31 +197,48 @@ def _blocks(model: Model, data: Any) -> list[Any]:
     return [ca.reshape(part, width, rows).T for part in ca.vertsplit(data, rows * width)]
 
 
-def _advanced(model: Model, point: Point, layout: Layout, z: Any, w: Any, data: Any) -> Any:
+@record
+class _Scheme:
+    """How samples are stepped: all of a `Point` that expressions depend on."""
+
+    hold: Hold
+    delay_free: bool
+    split: bool  # an older input acts for the first part of a period
+    substeps: int
+
+    @classmethod
+    def of(cls, point: Point) -> _Scheme:
+        clock = point.clock
+        return cls(
+            hold=clock.hold, delay_free=clock.delay_free, split=clock.fraction_s > 0.0, substeps=point.substeps
+        )  # fmt: skip
+
+
+def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
     """Return the state and its derivatives one sample on."""
-    clock, steps, nx = point.clock, point.substeps, model.nx
+    steps, nx = scheme.substeps, model.nx
     t, ua, ub = _split(model, w)
     x, s = z[:, 0], z[:, 1:]
-    rest = ca.MX.zeros(nx, layout.states - 1 - model.np - clock.delay_free)
+    rest = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
     if model.linear:
         blocks, v = [block[:nx, :] for block in _blocks(model, data)], ca.vertcat(x, ua, ub, 1.0)
         forced = ca.horzcat(*(ca.mtimes(block, v) for block in blocks[1:]), rest)
         return ca.horzcat(ca.mtimes(blocks[0], v), ca.mtimes(blocks[0][:, :nx], s) + forced)
     step, p = step_function(model), data[:-2]
-    for part in (0, 1) if clock.delay_free or clock.fraction_s > 0.0 else (1,):
+    for part in (0, 1) if scheme.delay_free or scheme.split else (1,):
         h, dh = data[data.numel() - 2 + part] / steps, (-1.0 if part else 1.0) / steps
         for i in range(steps):
             u0 = u1 = ua if part else ub
-            if clock.hold == "first":
+            if scheme.hold == "first":
                 u0, u1 = ua + (ub - ua) * (i / steps), ua + (ub - ua) * ((i + 1) / steps)
             x, a, b = step(t, x, u0, u1, p, h)
-            forced = [b[:, : model.np], b[:, model.np] * dh] if clock.delay_free else [b[:, : model.np]]
+            forced = [b[:, : model.np], b[:, model.np] * dh] if scheme.delay_free else [b[:, : model.np]]
             s = ca.mtimes(a, s) + ca.horzcat(*forced, rest)
             t = t + h
     return ca.horzcat(x, s)
 
 
-def _observed(model: Model, point: Point, layout: Layout, z: Any, w: Any, data: Any) -> Any:
+def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
     """Return the outputs and their derivatives."""
     t, ua, ub = _split(model, w)
     x, s = z[:, 0], z[:, 1:]
@@ -223,13 +247,13 @@ def _observed(model: Model, point: Point, layout: Layout, z: Any, w: Any, data: 
         y, c = ca.mtimes(blocks[0], v), blocks[0][:, : model.nx]
         direct = [ca.mtimes(block, v) for block in blocks[1:]]
     else:
-        y, c, d = output_function(model)(t, x, ub if point.clock.fraction_s > 0.0 else ua, data[:-2])
+        y, c, d = output_function(model)(t, x, ub if scheme.split else ua, data[:-2])
         direct = [d]
-    count = sum(item.shape[1] for item in direct)
+    count = sum(block.shape[1] for block in direct)
     return ca.horzcat(y, ca.mtimes(c, s) + ca.horzcat(*direct, ca.MX.zeros(model.ny, layout.states - 1 - count)))
 
 
-def _corrected(layout: Layout, z: Any, y: Any, w: Any, known: Any) -> Any:
+def _correct(layout: Layout, z: Any, y: Any, w: Any, known: Any) -> Any:
     """Return what the prediction errors take off the next state and its derivatives.
 
     w ends in [measured, present, drift basis]; known is [offset, gain, drift, correction and its derivatives].
@@ -252,21 +276,27 @@ def _corrected(layout: Layout, z: Any, y: Any, w: Any, known: Any) -> Any:
     return ca.mtimes(gains[0], v) + ca.horzcat(ca.MX.zeros(nx, 1), moved)
 
 
-def _program(model: Model, point: Point, layout: Layout, sizes: tuple[int, int]) -> Any:
-    """Return the CasADi functions of CHUNK samples (Z, w, data) -> Z+ and of one (Z, w, data) -> [y, derivatives]."""
-    clock = point.clock
-    key = f"program {layout} {clock.hold} {clock.delay_free} {clock.fraction_s > 0.0} {point.substeps} {sizes}"
-    if key not in model.functions:
-        z, w = ca.MX.sym("z", model.nx, layout.states), ca.MX.sym("w", sizes[0])
-        data = ca.MX.sym("data", sizes[1])
-        plant = data[: _data(model, point).size]
-        y = _observed(model, point, layout, z, w, plant)
-        after = _advanced(model, point, layout, z, w, plant)
-        if layout.corrected:
-            after = after - _corrected(layout, z, y, w[1 + 2 * model.nu :], data[plant.numel() :])
-        sample, output = ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
-        model.functions[key] = sample.mapaccum(CHUNK), output
-    return model.functions[key]
+@memo
+def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int]) -> tuple[Any, Any]:
+    """Return CasADi's (Z, w, data) -> Z+, over FOLDED_SAMPLES, and (Z, w, data) -> [y, derivatives], of one sample.
+
+    The sizes are those of w, of the plant's part of the data, and of all data.
+    """
+    z, w = ca.MX.sym("z", model.nx, layout.states), ca.MX.sym("w", sizes[0])
+    data = ca.MX.sym("data", sizes[2])
+    plant = data[: sizes[1]]
+    y = _observe(model, scheme, layout, z, w, plant)
+    after = _advance(model, scheme, layout, z, w, plant)
+    if layout.corrected:
+        after = after - _correct(layout, z, y, w[1 + 2 * model.nu :], data[sizes[1] :])
+    sample, output = ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
+    return sample.mapaccum(FOLDED_SAMPLES), output
+
+
+@memo
+def _output_map(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int], n: int) -> Any:
+    """Return the outputs' function of `_program` for n samples at once."""
+    return _program(model, layout, scheme, sizes)[1].map(n)
 
 
 def _data(model: Model, point: Point) -> Float[np.ndarray, " m"]:
@@ -276,7 +306,7 @@ def _data(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     return np.concatenate([model.parameters(point.theta), [clock.fraction_s, clock.period - clock.fraction_s]])
 
 
-def _first(x0: Float[np.ndarray, " nx"], layout: Layout) -> Float[np.ndarray, "nx nj"]:
+def _start_of_shot(x0: Float[np.ndarray, " nx"], layout: Layout) -> Float[np.ndarray, "nx nj"]:
     """Return the state and its derivatives at a shot's first sample."""
     z = np.zeros((x0.size, layout.states))
     z[:, 0] = x0
@@ -287,15 +317,15 @@ def _first(x0: Float[np.ndarray, " nx"], layout: Layout) -> Float[np.ndarray, "n
 def _fold(
     function: Any, z: Float[np.ndarray, "nx nj"], w: Float[np.ndarray, "n w"], data: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n1 nx nj"]:
-    """Fold a function of CHUNK samples over all; the last chunk is filled up with repeats, which are dropped."""
+    """Fold a function of FOLDED_SAMPLES over all; the last chunk is filled up with repeats, which are dropped."""
     n, (nx, nj) = len(w), z.shape
     path = np.empty((n + 1, nx, nj))
     path[0] = z
-    for start in range(0, n, CHUNK):
-        part, count = w[start : start + CHUNK], min(CHUNK, n - start)
-        if count < CHUNK:
-            part = np.vstack([part, np.repeat(part[-1:], CHUNK - count, axis=0)])
-        block = np.array(function(path[start], part.T, data)).reshape(nx, CHUNK, nj)
+    for start in range(0, n, FOLDED_SAMPLES):
+        part, count = w[start : start + FOLDED_SAMPLES], min(FOLDED_SAMPLES, n - start)
+        if count < FOLDED_SAMPLES:
+            part = np.vstack([part, np.repeat(part[-1:], FOLDED_SAMPLES - count, axis=0)])
+        block = np.array(function(path[start], part.T, data)).reshape(nx, FOLDED_SAMPLES, nj)
         path[start + 1 : start + 1 + count] = block.transpose(1, 0, 2)[:count]
     return path
 
@@ -304,33 +334,29 @@ def _times(segment: Segment, point: Point, rows: tuple[int, int]) -> Float[np.nd
     return segment.start_s + point.clock.period * np.arange(rows[0], rows[1])
 
 
-def _folded_trace(
-    model: Model, segment: Segment, point: Point, held: Float[np.ndarray, "all w"], rows: tuple[int, int],
+def _folded_trajectory(
+    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "all w"], rows: tuple[int, int],
     x0: Float[np.ndarray, " nx"],
-) -> Trace:  # fmt: skip
+) -> Trajectory:  # fmt: skip
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
-    layout, clock = layout_of(model.nx, model.ny, model.np, point), point.clock
+    layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(point)
     piece = slice(*rows)
-    w, data = np.column_stack([_times(segment, point, rows), held[piece, :-1]]), _data(model, point)
+    w, data = np.column_stack([_times(segment, point, rows), forcing[piece, :-1]]), _data(model, point)
+    plant_size = data.size
     if point.correction is not None:
-        measured, present = _measured(segment, rows)
+        measured, present = _read_measured(segment, rows)
         w = np.hstack([w, measured, present, segment.drift_basis(piece, layout.drift_terms)])
         known = (point.offset, point.gain, point.drift, point.correction)
-        data = np.concatenate([data, *(np.asarray(item).ravel() for item in known)])
-    fold, output = _program(model, point, layout, (w.shape[1], data.size))
-    path = _fold(fold, _first(x0, layout), w, data)
-    n = len(w)
-    split = clock.delay_free, clock.fraction_s > 0.0
-    key = f"output map {n} {layout} {clock.hold} {split} {w.shape[1]} {data.size}"
-    if key not in model.functions:
-        model.functions[key] = output.map(n)
+        data = np.concatenate([data, *(np.asarray(values).ravel() for values in known)])
+    sizes, n = (w.shape[1], plant_size, data.size), len(w)
+    path = _fold(_program(model, layout, scheme, sizes)[0], _start_of_shot(x0, layout), w, data)
     flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)
-    seen = np.array(model.functions[key](flat, w.T, np.repeat(data[:, None], n, 1)))
-    seen = seen.reshape(model.ny, n, layout.states).transpose(1, 0, 2)
-    return seen[:, :, 0], seen[:, :, 1:], path[:, :, 0], path[-1]
+    outputs = _output_map(model, layout, scheme, sizes, n)(flat, w.T, np.repeat(data[:, None], n, 1))
+    y = np.array(outputs).reshape(model.ny, n, layout.states).transpose(1, 0, 2)
+    return y[:, :, 0], y[:, :, 1:], path[:, :, 0], path[-1]
 
 
-def _measured(segment: Segment, rows: tuple[int, int]) -> tuple[Float[np.ndarray, "n ny"], Any]:
+def _read_measured(segment: Segment, rows: tuple[int, int]) -> tuple[Float[np.ndarray, "n ny"], Any]:
     """Return the measured outputs, zero where missing, and which are present."""
     piece = slice(*rows)
     measured = np.column_stack([channel[piece] for channel in segment.y])
@@ -345,7 +371,7 @@ def _columns(
     y: Float[np.ndarray, "n ny"], dy: Float[np.ndarray, "n ny nt"],
 ) -> tuple[Float[np.ndarray, "n ny nc"], Any]:  # fmt: skip
     """Return v of every sample, and which samples count."""
-    measured, present = _measured(segment, rows)
+    measured, present = _read_measured(segment, rows)
     basis = segment.drift_basis(slice(*rows), point.drift_terms)
     drift = basis @ point.drift.T if point.drift_terms else 0.0
     v = np.zeros((len(y), layout.ny, layout.columns))

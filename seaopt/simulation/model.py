@@ -1,4 +1,4 @@
-"""A plant made ready for numbers: fixed parameters put in, free ones left as theta, linear or not found out."""
+"""A plant ready for numbers: fixed parameters put in, free ones left as theta, and whether it is linear."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from jaxtyping import Float
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.memo import memo
 from seaopt.records import record
 
 
@@ -30,7 +31,7 @@ class Model:
         theta, then the other parameters that are not zero, whose values are `constants`: data to compiled code, so that
         other values need no other code. Zeros are put in, and take their terms out.
     outputs : tuple of str
-        The outputs that are computed, in order.
+        The computed outputs, in order.
     linear : bool
         Whether f and h are affine in the state and the input for every theta, and do not depend on time.
 
@@ -48,7 +49,7 @@ class Model:
     f: Any
     h: Any
     linear: bool
-    functions: dict[str, Any] = field(default_factory=dict, repr=False)  # made of the expressions, once each
+    memory: dict[Any, Any] = field(default_factory=dict, repr=False)  # of `memo`: what is made of the expressions
 
     @property
     def nx(self) -> int:
@@ -83,12 +84,10 @@ class Model:
         dG : array, shape (np, nx + ny, nx + nu + 1)
 
         """
-        if "matrices" not in self.functions:
-            self.functions["matrices"] = _matrices(self)
         rows, cols = self.nx + self.ny, self.nx + self.nu + 1
         p = np.append(self.parameters(theta), 0.0)  # room for a number, which an address needs
         g, dg = np.zeros((cols, rows)), np.zeros(self.np * cols * rows + 1)
-        buffer, run = self.functions["matrices"].buffer()  # a fraction of a call's time for small matrices
+        buffer, run = _matrices(self).buffer()  # a fraction of a call's time for small matrices
         buffer.set_arg(0, p.data)
         buffer.set_res(0, g.data)
         buffer.set_res(1, dg.data)
@@ -149,19 +148,18 @@ def linearised(model: Model) -> Model:
     """Return the model linearised at zero state and input."""
     if model.linear:
         return model
-    if "linearised" not in model.functions:
-        model.functions["linearised"] = _linearised(model)
-    return replace(model.functions["linearised"], constants=model.constants)
+    return replace(_linearise(model), constants=model.constants)
 
 
-def _linearised(model: Model) -> Model:
+@memo
+def _linearise(model: Model) -> Model:
     point = ca.vertcat(model.x, model.u)
     both = ca.vertcat(model.f, model.h)
     slope, constant = ca.substitute(
         [ca.jacobian(both, point), both], [point, model.t], [ca.DM.zeros(point.numel()), ca.DM(0)]
     )
     rows: Any = ca.mtimes(slope, point) + constant
-    return replace(model, f=rows[: model.nx], h=rows[model.nx :], linear=True, functions={})
+    return replace(model, f=rows[: model.nx], h=rows[model.nx :], linear=True, memory={})
 
 
 def _is_linear(f: Any, h: Any, t: Any, x: Any, u: Any) -> bool:
@@ -169,7 +167,9 @@ def _is_linear(f: Any, h: Any, t: Any, x: Any, u: Any) -> bool:
     return not ca.depends_on(both, t) and not ca.depends_on(ca.jacobian(both, point), ca.vertcat(t, point))
 
 
+@memo
 def _matrices(model: Model) -> Any:
+    """Return the CasADi function p -> G and its derivatives, see `Model.matrices`."""
     both, point = ca.vertcat(model.f, model.h), ca.vertcat(model.x, model.u)
     origin = ca.DM.zeros(point.numel())
     slope, constant = ca.substitute([ca.jacobian(both, point), both], [point], [origin])

@@ -13,7 +13,7 @@ from seaopt.simulation.interpreted import interpreted_passes
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Pass, Point, Segment, Weights
 
-CHUNK = 1 << 16
+STREAM_SAMPLES = 1 << 16  # of a stream that are in memory at a time
 
 
 def run_passes(
@@ -58,8 +58,10 @@ def run_passes(
     program = Program.make(model, segment, point, chosen)
     if program is not None:
         return program.run(rows, x0, sums=sums, outputs=outputs, shown=shown, columns=columns, states=states)
-    found = interpreted_passes(model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states)
-    return found if shown is None or found.outputs is None else replace(found, outputs=found.outputs[:shown].copy())
+    result = interpreted_passes(
+        model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states
+    )
+    return result if shown is None or result.outputs is None else replace(result, outputs=result.outputs[:shown].copy())
 
 
 def stream(
@@ -69,7 +71,7 @@ def stream(
     x0: Float[np.ndarray, " nx"],
     weights: Weights | None = None,
     *,
-    chunk: int = CHUNK,
+    chunk: int = STREAM_SAMPLES,
     columns: bool = False,
 ) -> Iterator[Pass]:
     """Yield the outputs, and the columns if asked, of one segment chunk by chunk, in the memory of one chunk.
@@ -79,7 +81,7 @@ def stream(
     chosen = weights if weights is not None else Weights.plain(model.ny)
     program = Program.make(model, segment, point, chosen)
     if program is None:
-        yield from _cut(
+        yield from _split_into_chunks(
             interpreted_passes(
                 model, segment, point, chosen, np.array([0, segment.n]), x0[None], outputs=True, columns=columns
             ),
@@ -118,7 +120,7 @@ def double_sum(
     return None if program is None else program.double_sum(x0, into, r)
 
 
-def _cut(whole: Pass, chunk: int) -> Iterator[Pass]:
+def _split_into_chunks(whole: Pass, chunk: int) -> Iterator[Pass]:
     assert whole.outputs is not None
     for start in range(0, len(whole.outputs), chunk):
         piece = slice(start, start + chunk)

@@ -18,7 +18,7 @@ from seaopt.simulation.model import Model, make_model
 from seaopt.simulation.passes import Pass, Point, Segment
 from seaopt.simulation.run import run_passes
 
-MAX_SUBSTEPS = 1024
+MAX_SIMULATION_SUBSTEPS = 1024
 
 
 def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
@@ -33,7 +33,7 @@ def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]
     columns: list[Float[np.ndarray, " n"]] = []
     if plant.inputs and not any(name in log.signals for name in plant.inputs):
         raise LogError(
-            f'{log.source}: has no channel for any input of {plant.name}, no channel "{next(iter(plant.inputs))}"; '
+            f'{log.source}: no input of {plant.name} has a channel: no channel "{next(iter(plant.inputs))}"; '
             f"{suggestion(next(iter(plant.inputs)), log.signals)}"
         )
     for name in plant.inputs:
@@ -113,7 +113,7 @@ def simulate(
     x0 = fill_vector("state", plant.states, initial_state)
     u = input_samples(plant, log)
     clock = Clock(period=log.period, hold=hold, delay_s=delay_s)
-    result = _converged(model, Segment(u=u, start_s=float(log.time[0])), x0, clock, rtol)
+    result = _run_to_tolerance(model, Segment(u=u, start_s=float(log.time[0])), x0, clock, rtol)
     outputs, states = result.outputs, result.states
     assert outputs is not None and states is not None
     if not (np.all(np.isfinite(outputs)) and np.all(np.isfinite(states))):
@@ -131,7 +131,7 @@ def simulate(
     return Log(time=log.time.copy(), signals=signals, source=f"simulation of {plant.name}")
 
 
-def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
+def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
     def run(substeps: int) -> Pass:
         point = Point(
             theta=np.zeros(0),
@@ -154,7 +154,7 @@ def _converged(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clo
         result = finer
         if error <= rtol:
             break
-        if substeps >= MAX_SUBSTEPS:
+        if substeps >= MAX_SIMULATION_SUBSTEPS:
             raise SimulationError(
                 f"plant {model.plant.name}: {substeps} steps a sample leave an error of {error:.1e} of the signal "
                 f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Multisine, Noise, excite, scaled
+from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Multisine, Noise, excite, scale
 from seaopt.errors import SimulationError
 
 
@@ -42,7 +42,7 @@ def test_the_lines_of_a_multisine_are_where_and_as_large_as_asked():
 def test_a_scaled_excitation_is_so_many_times_as_large():
     parts = (*PAPER_STAND, Multisine(amplitudes=(1.0,), frequencies_hz=(3.0,)))
     drive = lambda what: excite(what, duration_s=2, rate_hz=400, rng=np.random.default_rng(5))[1]  # noqa: E731
-    np.testing.assert_allclose(drive(scaled(parts, 0.25)), 0.25 * drive(parts), atol=1e-12)
+    np.testing.assert_allclose(drive(scale(parts, 0.25)), 0.25 * drive(parts), atol=1e-12)
 
 
 def test_a_multisine_needs_as_many_phases_as_lines():

@@ -12,11 +12,11 @@ from seaopt.bench import PAPER_STAND, PAPER_SWING, Chirp, Noise, excite
 from seaopt.errors import EstimationError
 from seaopt.estimation import Chirps, Limits, Multisines, design_experiment, expected_covariance
 from seaopt.estimation.experiment_design.spectrum import (
-    harmonics,
+    choose_harmonics,
     low_peak_phases,
+    make_spectrum,
     optimal_powers,
     schroeder_phases,
-    spectrum,
 )
 from seaopt.simulation import Clock, make_model
 
@@ -31,9 +31,9 @@ GUESS = so.ParameterSet.of(K=(3.0, "N/A"), tau=(0.5, "s"))
 def lines_of(plant, params, *, n, rate_hz, sigma, count=400, band_hz=(0.02, 20.0)):
     names = params.free_names
     model = make_model(plant, params, names, tuple(sigma))
-    places = harmonics(n, rate_hz, band_hz, count)
+    places = choose_harmonics(n, rate_hz, band_hz, count)
     theta = np.array(params.values_of(names))
-    return spectrum(
+    return make_spectrum(
         model, theta, Clock(period=1 / rate_hz), places, n=n, sigma=np.array([*sigma.values()]), channel=0, signals=[-1]
     )
 
@@ -79,7 +79,7 @@ def test_gains_are_those_of_scipys_sampled_plant(stand, thor):
     lines = lines_of(stand, thor.free("J"), n=4000, rate_hz=400, sigma={"F1": 2.0}, count=30, band_hz=(1, 150))
     model = make_model(stand, thor.free("J"), ("J",), ("F1",))
     places, theta = lines.harmonics, np.array([thor["J"].value])
-    found = spectrum(model, theta, Clock(period=1 / 400), places, n=4000, sigma=np.ones(1), channel=0, signals=[0])
+    found = make_spectrum(model, theta, Clock(period=1 / 400), places, n=4000, sigma=np.ones(1), channel=0, signals=[0])
     r, m_k, b_m, k = 0.002 / (6 * np.pi), 0.646 + 3.31e-6 / (0.002 / (6 * np.pi)) ** 2, 1.31e-4, 655e3
     num, den, _ = cont2discrete(([0.0255 / r * k], [m_k, b_m / r**2, k]), 1 / 400)
     _, expected = freqz(num.ravel(), den, 2 * np.pi * places / 4000)

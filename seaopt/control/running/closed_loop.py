@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.loops.sampled_plant import conditions_of
-from seaopt.control.running.loop_kernel import Job, Trace, kernel
-from seaopt.control.running.sampled_loop import DELAY, ENERGY, LoopState, SampledLoop, at_rest, whole_samples
+from seaopt.control.loops.sampled_plant import DELAY, conditions_of
+from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
+from seaopt.control.running.sampled_loop import ENERGY, LoopState, SampledLoop, at_rest, whole_samples
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -41,10 +41,9 @@ from seaopt.records import record
 
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
-MAX_SUBSTEPS = 512
+MAX_LOOP_SUBSTEPS = 512
 RTOL = 1e-6
 RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
-Rows = Float[np.ndarray, "runs n"]
 
 
 @record(eq=False)
@@ -88,15 +87,15 @@ class LoopRun:
     wall_s: float
 
     def __repr__(self) -> str:
-        return told(
+        return describe_runs(
             "LoopRun", f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s", self.current, self.peaks, self.error
         )
 
 
-def told(
+def describe_runs(
     kind: str, span: str, current: Rows, peaks: Mapping[str, Float[np.ndarray, " runs"]], error: float, more: str = ""
 ) -> str:
-    """Say in a line what simulated runs came to: how many, of how many samples, and the largest magnitudes."""
+    """Describe simulated runs in one line: how many, of how many samples, and the largest magnitudes."""
     runs, samples = current.shape
     largest = ", ".join(f"{name} {np.max(value):.4g}" for name, value in peaks.items())
     return (
@@ -170,7 +169,7 @@ def run_loop(
         reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
         noise=_noise(loop, runs, n, seed),
         external=_external(loop.plant, external or {}, n),
-        p=np.array([loop.plant.parameter_values(item) for item in params]).reshape(runs, -1),
+        p=np.array([loop.plant.parameter_values(values) for values in params]).reshape(runs, -1),
         **_lags(loop, params),
         start=start if start is not None else at_rest(loop, runs),
         start_s=start_s,
@@ -178,64 +177,64 @@ def run_loop(
     if job.start.x.shape != (runs, len(loop.plant.states)):
         raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state a run")
     substeps, before, wall_s = _first_guess(loop, params, rtol), None, 0.0
-    execute = kernel(loop)
+    execute = make_kernel(loop)
     while True:
         begin = time.perf_counter()
-        found = execute(job, substeps)
+        arrays = execute(job, substeps)
         wall_s += time.perf_counter() - begin
-        kept = _lost(found) == n
-        error = float(np.max(_errors(found)[kept], initial=0.0))
-        told = bool(np.all(kept)) or (before is not None and bool(np.all(kept | _alike(before, found))))
-        if error <= rtol and told:
-            return _result(loop, job, found, error, substeps, wall_s)
-        if 2 * substeps > MAX_SUBSTEPS:
+        kept = _first_lost_sample(arrays) == n
+        error = float(np.max(_errors(arrays)[kept], initial=0.0))
+        decided = bool(np.all(kept)) or (before is not None and bool(np.all(kept | _lose_alike(before, arrays))))
+        if error <= rtol and decided:
+            return _result(loop, job, arrays, error, substeps, wall_s)
+        if 2 * substeps > MAX_LOOP_SUBSTEPS:
             raise SimulationError(
                 f"plant {loop.plant.name}: {2 * substeps} steps a sample leave an error of {error:.1e} of a state "
                 f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
-                if told
-                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not tell whether the loop runs away "
-                "or they are too long; check the parameters"
+                if decided
+                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not decide whether the loop runs "
+                "away or the steps are too long; check the parameters"
             )
-        substeps, before = 2 * substeps, found
+        substeps, before = 2 * substeps, arrays
 
 
-def _errors(found: Trace) -> Float[np.ndarray, " runs"]:
+def _errors(arrays: LoopArrays) -> Float[np.ndarray, " runs"]:
     """Return the largest error of a sample, over the state's largest value.
 
     A state that rests has rounding for a value: it is measured by the largest of the others.
     """
-    size = np.maximum(found.size, RESTS * np.max(found.size, axis=1, keepdims=True))
+    size = np.maximum(arrays.size, RESTS * np.max(arrays.size, axis=1, keepdims=True))
     scale = np.where(size > 0.0, size, 1.0)
     with np.errstate(invalid="ignore"):
-        return np.nan_to_num(np.max(found.error / scale, axis=1) / 15.0, nan=np.inf)
+        return np.nan_to_num(np.max(arrays.error / scale, axis=1) / 15.0, nan=np.inf)
 
 
-def _lost(found: Trace) -> Int[np.ndarray, " runs"]:
+def _first_lost_sample(arrays: LoopArrays) -> Int[np.ndarray, " runs"]:
     """Return each run's first sample that is not finite; the number of samples where all are."""
-    finite = np.all(np.isfinite(found.states), axis=2) & np.all(np.isfinite(found.y), axis=2)
-    finite[:, -1] &= np.all(np.isfinite(found.x), axis=1)
+    finite = np.all(np.isfinite(arrays.states), axis=2) & np.all(np.isfinite(arrays.y), axis=2)
+    finite[:, -1] &= np.all(np.isfinite(arrays.x), axis=1)
     return np.where(np.all(finite, axis=1), finite.shape[1], np.argmin(finite, axis=1))
 
 
-def _alike(before: Trace, found: Trace) -> Bool[np.ndarray, " runs"]:
+def _lose_alike(before: LoopArrays, after: LoopArrays) -> Bool[np.ndarray, " runs"]:
     """Tell which runs two numbers of steps lose in the same way: about the same sample, states as large before it."""
-    lost = np.stack([_lost(before), _lost(found)])
+    lost = np.stack([_first_lost_sample(before), _first_lost_sample(after)])
     last, rows = np.maximum(np.min(lost, axis=0) - 1, 0), np.arange(lost.shape[1])
     with np.errstate(divide="ignore", invalid="ignore"):
-        size = np.log([np.max(np.abs(item.states[rows, last]), axis=1) for item in (before, found)])
+        size = np.log([np.max(np.abs(arrays.states[rows, last]), axis=1) for arrays in (before, after)])
         return (np.abs(lost[1] - lost[0]) <= 1) & (np.abs(size[1] - size[0]) <= 1.0)
 
 
-def _result(loop: SampledLoop, job: Job, found: Trace, error: float, substeps: int, wall_s: float) -> LoopRun:
+def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, substeps: int, wall_s: float) -> LoopRun:
     names = loop.watched
     return LoopRun(
         time=job.start_s + loop.law.sample_time_s * np.arange(job.reference.shape[1]),
         reference=job.reference,
-        outputs={name: found.y[:, :, i] for i, name in enumerate(names)},
-        current=found.applied,
-        states=found.states,
-        peaks={name: found.peak[:, i] for i, name in enumerate(names)},
-        end=LoopState(x=found.x, z=found.z),
+        outputs={name: arrays.y[:, :, i] for i, name in enumerate(names)},
+        current=arrays.applied,
+        states=arrays.states,
+        peaks={name: arrays.peak[:, i] for i, name in enumerate(names)},
+        end=LoopState(x=arrays.x, z=arrays.z),
         error=error,
         substeps=2 * substeps,
         wall_s=wall_s,
@@ -249,32 +248,34 @@ def _noise(loop: SampledLoop, runs: int, n: int, seed: int) -> Rows:
     return np.tile(std * np.random.default_rng(seed).normal(size=n), (runs, 1))
 
 
-def _external(plant: Plant, given: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:
+def _external(plant: Plant, signals: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:
     names = list(plant.inputs)[1:]
-    for name, values in given.items():
+    for name, values in signals.items():
         if name not in names:
-            raise SimulationError(f'external = {{"{name}": ...}} is no such input; {suggestion(name, names)}')
+            raise SimulationError(
+                f'external has "{name}", which is not another input of {plant.name}; {suggestion(name, names)}'
+            )
         if values.shape != (n,):
             raise SimulationError(f"external {name} has the shape {values.shape}; give ({n},), one value a sample")
-    columns = [given.get(name, np.zeros(n)) for name in names]
+    columns = [signals.get(name, np.zeros(n)) for name in names]
     return np.ascontiguousarray(np.column_stack(columns) if columns else np.zeros((n, 0)), dtype=float)
 
 
 def _lags(loop: SampledLoop, params: Sequence[ParameterSet]) -> dict[str, Any]:
     """Return which commands are in force in each run, and from when; `lag` and `late_s` of a job."""
     queue = loop.waiting
-    lag, late = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
-    for run, item in enumerate(params):
-        delay = conditions_of(loop.plant, item).get(DELAY, 0.0)
+    lag, late_s = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
+    for run, values in enumerate(params):
+        delay = conditions_of(loop.plant, values).get(DELAY, 0.0)
         if not 0.0 <= delay <= loop.longest_delay_s:
             raise SimulationError(
                 f"{DELAY} = {delay:g} is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "
                 "longest of all runs"
             )
-        whole, late[run] = whole_samples(delay, loop.law.sample_time_s)
+        whole, late_s[run] = whole_samples(delay, loop.law.sample_time_s)
         newer = loop.delay_samples + whole
-        lag[run, 0, newer + (late[run] > 0.0)] = lag[run, 1, newer] = 1.0
-    return {"lag": lag.reshape(len(params), -1), "late_s": late}
+        lag[run, 0, newer + (late_s[run] > 0.0)] = lag[run, 1, newer] = 1.0
+    return {"lag": lag.reshape(len(params), -1), "late_s": late_s}
 
 
 def _first_guess(loop: SampledLoop, params: Sequence[ParameterSet], rtol: float) -> int:

@@ -58,7 +58,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibriu
     loop : SampledLoop
         Plant and law; the current's limit is not looked at.
     params : sequence of ParameterSet
-        One a run, with a state of the plant (phi) among them where it is to rest elsewhere.
+        One per run, with a state of the plant (phi) among them where it is to rest elsewhere.
 
     Raises
     ------
@@ -79,18 +79,18 @@ def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibriu
     """
     law, plant = loop.law, loop.plant
     observe = _observe(plant)
-    names, rows = list(plant.outputs), [resting(plant, item) for item in params]
-    found = np.zeros((len(params), 4))
+    names, rows = list(plant.outputs), [resting(plant, values) for values in params]
+    figures = np.zeros((len(params), 4))
     z = np.zeros((len(params), law.c.size + loop.waiting))
-    for run, ((x, u), item) in enumerate(zip(rows, params, strict=True)):
+    for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
         if not (np.any(x) or np.any(u)):
             continue
-        y = np.array(observe(x, u, plant.parameter_values(item))).ravel()
+        y = np.array(observe(x, u, plant.parameter_values(values))).ravel()
         force = float(y[names.index(loop.measured)])
         inner, reference = _law_at_rest(law, force, float(u[0]))
         z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])
-        found[run] = reference, force, u[0], y[-1]
-    reference, force, current, energy = found.T.copy()
+        figures[run] = reference, force, u[0], y[-1]
+    reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
     return Equilibrium(state=state, reference=reference, force=force, current_A=current, energy_J=energy)
 
@@ -101,15 +101,15 @@ def _law_at_rest(law: RunnableLaw, force: float, current_A: float) -> tuple[Floa
     left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
     right = np.append(-law.b_measurement * force, current_A / law.current_per_force_A_per_N + law.d_measurement * force)
     try:
-        found = np.linalg.solve(left, right)
+        rest = np.linalg.solve(left, right)
     except np.linalg.LinAlgError:
-        found = np.full(n + 1, np.nan)
-    if not np.all(np.isfinite(found)):
+        rest = np.full(n + 1, np.nan)
+    if not np.all(np.isfinite(rest)):
         raise ControlError(
             f"no reference makes the law command the {current_A:.4g} A that rest takes at {force:.4g} N; its reference "
             "path is blocked at 0 Hz"
         )
-    return found[:-1], float(found[-1])
+    return rest[:-1], float(rest[-1])
 
 
 @memo

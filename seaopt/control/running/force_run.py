@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.loops.sampled_plant import DELAY, conditions_of
-from seaopt.control.running.closed_loop import MAX_SUBSTEPS, RESTS, RTOL
-from seaopt.control.running.loop_kernel import EXPANDED, runge_kutta
+from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
+from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import whole_samples
 from seaopt.errors import ControlError, SimulationError, suggestion
 from seaopt.parameters import ParameterSet
@@ -29,7 +29,7 @@ from seaopt.plants.plant import output_function
 from seaopt.records import record
 
 State = TypeVar("State")
-FIRST = 2  # coarse steps a sample to begin with
+FIRST_SUBSTEPS = 2  # coarse steps a sample to begin with
 
 
 @record(eq=False)
@@ -137,68 +137,69 @@ def close_loop(
         No number of steps reaches `rtol`.
 
     """
-    late = _checked(plant, params, measured, delay_samples)
-    whole, rest_s = whole_samples(late, sample_time_s)
+    extra_delay_s = _check(plant, params, measured, delay_samples)
+    whole, rest_s = whole_samples(extra_delay_s, sample_time_s)
     newer, n, p = delay_samples + whole, reference.size, ca.DM(plant.parameter_values(params))
-    output, held = output_function(plant), _Held(plant=plant, rtol=rtol)
+    output, integrator = output_function(plant), _Integrator(plant=plant, rtol=rtol)
     row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
     noise = sensor_std * np.random.default_rng(seed).normal(size=n)
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
-    x, law, clock = np.zeros(len(plant.states)), start, sample_time_s * np.arange(n)
-    force, current, took, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
+    x, law, time_s = np.zeros(len(plant.states)), start, sample_time_s * np.arange(n)
+    force, current, law_time_s, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
 
     def inputs(k: int, sample: int) -> list[float]:
         return [(current[sample] if sample >= 0 else 0.0) + disturbance[k], *others]
 
     for k in range(n):
         older = k - newer - (rest_s > 0.0)
-        force[k] = float(output(clock[k], x, inputs(k, min(older, k - 1)), p)[row])
-        began = time.perf_counter()
+        force[k] = float(output(time_s[k], x, inputs(k, min(older, k - 1)), p)[row])
+        call_start_s = time.perf_counter()
         current[k], law = step(law, float(reference[k]), float(force[k] + noise[k]))
-        took[k] = time.perf_counter() - began
+        law_time_s[k] = time.perf_counter() - call_start_s
         states[k] = x
         if rest_s > 0.0:
-            x = held.over(clock[k], x, inputs(k, older), p, rest_s)
-        x = held.over(clock[k] + rest_s, x, inputs(k, k - newer), p, sample_time_s - rest_s)
+            x = integrator.advance(time_s[k], x, inputs(k, older), p, rest_s)
+        x = integrator.advance(time_s[k] + rest_s, x, inputs(k, k - newer), p, sample_time_s - rest_s)
     return ForceRun(
-        time=clock, reference=reference, force=force, current=current, law_time_s=took, state=states,
-        error=held.error, substeps=2 * held.substeps,
+        time=time_s, reference=reference, force=force, current=current, law_time_s=law_time_s, state=states,
+        error=integrator.error, substeps=2 * integrator.substeps,
     )  # fmt: skip
 
 
-def _checked(plant: Plant, params: ParameterSet, measured: str, delay_samples: int) -> float:
+def _check(plant: Plant, params: ParameterSet, measured: str, delay_samples: int) -> float:
     """Return the delay besides the whole samples, s, of arguments that fit together."""
     if measured not in plant.outputs:
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
-    given = conditions_of(plant, params)
-    moved = [name for name, value in given.items() if name != DELAY and value]
+    conditions = conditions_of(plant, params)
+    moved = [name for name, value in conditions.items() if name != DELAY and value]
     if moved:
         raise ControlError(
             f"the parameters hold {', '.join(moved)}, but close_loop starts at rest at zero; leave it out"
         )
-    late = given.get(DELAY, 0.0)
-    if not delay_samples and not late and ca.depends_on(plant.output[list(plant.outputs).index(measured)], plant.u[0]):
+    extra_delay_s = conditions.get(DELAY, 0.0)
+    row = plant.output[list(plant.outputs).index(measured)]
+    if not delay_samples and not extra_delay_s and ca.depends_on(row, plant.u[0]):
         raise ControlError(
             f"{measured} of {plant.name} contains the present current, which a law without delay sets from it; give "
             "delay_samples = 1 or more, or measure another output"
         )
-    return late
+    return extra_delay_s
 
 
 @dataclass(slots=True, kw_only=True)
-class _Held:
+class _Integrator:
     """A plant integrated while its inputs are held, in as many steps as it has needed so far."""
 
     plant: Plant
     rtol: float
-    substeps: int = FIRST
+    substeps: int = FIRST_SUBSTEPS
     error: float = 0.0
     size: Any = 0.0
 
-    def over(self, t: float, x: Float[np.ndarray, " nx"], u: list[float], p: Any, lasting: float) -> Any:
-        """Return the states after a time."""
+    def advance(self, t: float, x: Float[np.ndarray, " nx"], u: list[float], p: Any, lasting: float) -> Any:
+        """Return the state after a time `lasting`, the inputs held."""
         while True:
             coarse, fine = (np.array(end).ravel() for end in _ends(self.plant, self.substeps)(t, x, u, p, lasting))
             size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
@@ -208,7 +209,7 @@ class _Held:
             if error <= self.rtol:
                 self.error, self.size = max(self.error, error), size
                 return fine
-            if 2 * self.substeps > MAX_SUBSTEPS:
+            if 2 * self.substeps > MAX_LOOP_SUBSTEPS:
                 break
             self.substeps *= 2
         if not np.all(np.isfinite(fine)):
@@ -232,4 +233,4 @@ def _ends(plant: Plant, substeps: int) -> Any:
             at = step(t + i * h, at, u, p, h)
         ends.append(at)
     whole = ca.Function("held", [t, x, u, p, lasting], ends)
-    return whole.expand() if substeps <= EXPANDED else whole
+    return whole.expand() if substeps <= MAX_EXPANDED_STEPS else whole

@@ -1,4 +1,4 @@
-"""The numbers of a sampled loop: two CasADi functions, run by compiled code or by CasADi's virtual machine.
+"""Kernels of sampled loops, for `closed_loop`: two CasADi functions, run compiled or by CasADi's virtual machine.
 
 `seaopt_sample` is sensor, law and delay at one sample; `seaopt_advance` is one Runge-Kutta step of the plant.
 Parameters and the law's matrices are data, so that one compilation serves every draw and every controller of a
@@ -22,8 +22,8 @@ from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 
-CHUNK = 250  # samples that the virtual machine chains in one call
-EXPANDED = 8  # coarse steps up to which a sample is one flat list of operations there
+CHAINED_SAMPLES = 250  # samples that the virtual machine chains in one call
+MAX_EXPANDED_STEPS = 8  # coarse steps a sample up to which its operations are one flat list there
 Rows = Float[np.ndarray, "runs n"]
 
 
@@ -46,8 +46,8 @@ class Job:
 
 
 @record(eq=False)
-class Trace:
-    """What a kernel leaves behind: arrays of one row a run."""
+class LoopArrays:
+    """What a kernel leaves behind: arrays of one row per run."""
 
     x: Float[np.ndarray, "runs nx"]
     z: Float[np.ndarray, "runs nz"]
@@ -142,8 +142,8 @@ def _kernels(plant: Plant) -> dict[tuple[object, ...], tuple[Any, Any, Any, dict
     return {}
 
 
-def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:
-    """Return what runs a job: compiled where there is a compiler, CasADi's virtual machine else; once a structure."""
+def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
+    """Return what runs a job: compiled code or, without a compiler, CasADi's virtual machine."""
     sensors = loop.sensors
     structure = (
         loop.measured, loop.law.c.size, loop.waiting, bool(loop.current_step_A),
@@ -158,10 +158,10 @@ def kernel(loop: SampledLoop) -> Callable[[Job, int], Trace]:
     sample, advance, native, chains = kernels[structure]
     constants = _constants(loop)
 
-    def execute(job: Job, substeps: int) -> Trace:
+    def execute(job: Job, substeps: int) -> LoopArrays:
         if native is not None:
-            return _compiled(loop, job, substeps, constants, native)
-        return _interpreted(loop, job, substeps, constants, sample, advance, chains)
+            return _run_compiled(loop, job, substeps, constants, native)
+        return _run_interpreted(loop, job, substeps, constants, sample, advance, chains)
 
     return execute
 
@@ -175,10 +175,10 @@ def _source(loop: SampledLoop, sample: ca.Function, advance: ca.Function) -> str
     return "\n".join((define_constants(constants), generate_code(sample, advance), template))
 
 
-def _empty(loop: SampledLoop, job: Job) -> Trace:
+def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
     runs, n = job.reference.shape
     nx, ny = len(loop.plant.states), len(loop.watched)
-    return Trace(
+    return LoopArrays(
         x=np.array(job.start.x, dtype=float, order="C"), z=np.array(job.start.z, dtype=float, order="C"),
         peak=np.zeros((runs, ny)), error=np.zeros((runs, nx)), size=np.zeros((runs, nx)),
         y=np.zeros((runs, n, ny)), applied=np.zeros((runs, n)), states=np.zeros((runs, n, nx)),
@@ -198,57 +198,58 @@ _ARGUMENTS = np.dtype(
 )
 
 
-def _compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], native: Kernel) -> Trace:
-    trace = _empty(loop, job)
+def _run_compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], native: Kernel) -> LoopArrays:
+    arrays = _allocate(loop, job)
     runs, n = job.reference.shape
     arguments = np.zeros(runs, dtype=_ARGUMENTS)
     arguments["n"], arguments["substeps"] = n, substeps
     arguments["t0"], arguments["period"] = job.start_s, loop.law.sample_time_s
     arguments["late_s"] = job.late_s
     rows = {"p": job.p, "lag": job.lag, "r": job.reference, "w": job.noise} | {
-        name: getattr(trace, name) for name in ("x", "z", "peak", "error", "size", "y", "applied", "states")
+        name: getattr(arrays, name) for name in ("x", "z", "peak", "error", "size", "y", "applied", "states")
     }
     for name, array in rows.items():
         arguments[name] = row_addresses(array)
     arguments["c"], arguments["e"] = c.ctypes.data, job.external.ctypes.data
-    native.run(arguments, (job, c, trace))
-    return trace
+    native.run(arguments, (job, c, arrays))
+    return arrays
 
 
-def _interpreted(
+def _run_interpreted(
     loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], sample: Any, advance: Any,
     chains: dict[tuple[int, int, bool], Any],
-) -> Trace:  # fmt: skip
+) -> LoopArrays:  # fmt: skip
     """Run in CasADi's virtual machine: the same two functions, chained in a third."""
-    trace = _empty(loop, job)
+    arrays = _allocate(loop, job)
     runs, n = job.reference.shape
-    chunk = min(n, CHUNK)
+    chunk = min(n, CHAINED_SAMPLES)
     split = bool(np.any(job.late_s))
     key = (substeps, chunk, split)
     if key not in chains:
         period = _period_function(loop, sample, advance, substeps, split)
-        chains[key] = (period.expand() if substeps <= EXPANDED else period).mapaccum(chunk)
+        chains[key] = (period.expand() if substeps <= MAX_EXPANDED_STEPS else period).mapaccum(chunk)
     times = job.start_s + loop.law.sample_time_s * np.arange(n)
     for run in range(runs):
-        state = np.concatenate([getattr(trace, name)[run] for name in ("x", "z", "peak", "error", "size")])
+        state = np.concatenate([getattr(arrays, name)[run] for name in ("x", "z", "peak", "error", "size")])
         shared = [
-            np.repeat(item[:, None], chunk, axis=1) for item in (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
+            np.repeat(constant[:, None], chunk, axis=1)
+            for constant in (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
         ]
         signals = np.vstack([times, job.external.T, job.reference[run], job.noise[run]])
         for first in range(0, n, chunk):
             count = min(chunk, n - first)
             piece = signals[:, np.minimum(np.arange(first, first + chunk), n - 1)]  # the last one is filled up
             after, y, applied, states = (
-                np.array(item)[:, :count]
-                for item in chains[key](state, piece[:1], piece[1:-2], piece[-2:-1], piece[-1:], *shared)
+                np.array(part)[:, :count]
+                for part in chains[key](state, piece[:1], piece[1:-2], piece[-2:-1], piece[-1:], *shared)
             )
             rows = slice(first, first + count)
-            trace.y[run, rows], trace.applied[run, rows], trace.states[run, rows] = y.T, applied[0], states.T
+            arrays.y[run, rows], arrays.applied[run, rows], arrays.states[run, rows] = y.T, applied[0], states.T
             state = after[:, -1]
         for name in ("x", "z", "peak", "error", "size"):
-            width = getattr(trace, name).shape[1]
-            getattr(trace, name)[run], state = state[:width], state[width:]
-    return trace
+            width = getattr(arrays, name).shape[1]
+            getattr(arrays, name)[run], state = state[:width], state[width:]
+    return arrays
 
 
 def _period_function(loop: SampledLoop, sample: Any, advance: Any, substeps: int, split: bool) -> Any:

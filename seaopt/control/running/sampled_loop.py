@@ -16,7 +16,6 @@ from seaopt.plants import Plant
 from seaopt.records import record
 
 ENERGY = "energy"
-DELAY = "delay_s"  # of a run's parameters: seconds of delay besides the controller's whole samples
 
 
 @record(eq=False)

@@ -16,17 +16,17 @@ from typing import Literal
 
 import numpy as np
 
-from seaopt.bench import Chirp, Excitation, Multisine, scaled
+from seaopt.bench import Chirp, Excitation, Multisine, scale
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.experiment_design.excitation_search import (
+    Candidate,
     Chirps,
-    Found,
+    ExcitationSearch,
     Limits,
     Multisines,
-    Search,
     best_chirp,
     best_multisine,
-    measure_of,
+    make_measure,
     with_fine_steps,
 )
 from seaopt.estimation.experiment_design.information import Bench, make_bench
@@ -60,9 +60,9 @@ class Comparison:
     peaks: Mapping[str, float]
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name} {value:.3g}x" for name, value in self.ratio.items())
+        figures = ", ".join(f"{name} {value:.3g}x" for name, value in self.ratio.items())
         peaks = ", ".join(f"{name} {value:.4g}" for name, value in self.peaks.items())
-        return f"Comparison at equal rms: expected std {told} the design's; peaks {peaks}"
+        return f"Comparison at equal rms: expected std {figures} the design's; peaks {peaks}"
 
 
 @record(eq=False, repr=False)
@@ -115,35 +115,35 @@ class Design:
         """
         u = self.bench.samples(excitation, seed)
         factor = self.rms / float(np.sqrt(np.mean(u**2)))
-        trial = self.bench.refined(u * factor).run(u * factor)
+        trial = self.bench.refine_steps(u * factor).run(u * factor)
         names = self.covariance.names
         covariance = Covariance(names=names, matrix=trial.covariance)
         return Comparison(
-            excitation=scaled(excitation, factor),
+            excitation=scale(excitation, factor),
             covariance=covariance,
             ratio={name: covariance.std(name) / self.covariance.std(name) for name in names},
             peaks=trial.peaks,
         )
 
     def __repr__(self) -> str:
-        own, at = self.limits, f"{self.limits.duration_s:g} s at {self.limits.rate_hz:g} Hz"
-        lines = [f"Design: {_described(self.excitation)}, {at}; criterion {self.criterion}", "  expected of a fit:"]
-        shown = ParameterSet(item for item in self.parameters.values() if item.free)
-        lines += [f"    {line}" for line in repr(shown).splitlines()]
+        limits, at = self.limits, f"{self.limits.duration_s:g} s at {self.limits.rate_hz:g} Hz"
+        lines = [f"Design: {_describe(self.excitation)}, {at}; criterion {self.criterion}", "  expected of a fit:"]
+        free = ParameterSet(parameter for parameter in self.parameters.values() if parameter.free)
+        lines += [f"    {line}" for line in repr(free).splitlines()]
         unit = self.bench.plant.inputs[self.bench.input_name]
-        allowed = {self.bench.input_name: own.peak, **own.peaks}
-        lines.append(f"  {self.bench.input_name}: rms {self.rms:.4g}{_of(own.rms)} {unit}")
-        lines += [f"  {name}: peak {value:.4g}{_of(allowed[name])}" for name, value in self.peaks.items()]
+        allowed = {self.bench.input_name: limits.peak, **limits.peaks}
+        lines.append(f"  {self.bench.input_name}: rms {self.rms:.4g}{_format_limit(limits.rms)} {unit}")
+        lines += [f"  {name}: peak {value:.4g}{_format_limit(allowed[name])}" for name, value in self.peaks.items()]
         return "\n".join(lines)
 
     _repr_html_ = html_text
 
 
-def _of(limit: float | None) -> str:
+def _format_limit(limit: float | None) -> str:
     return "" if limit is None else f" of {limit:.4g}"
 
 
-def _described(excitation: Excitation) -> str:
+def _describe(excitation: Excitation) -> str:
     part = excitation[0]
     if isinstance(part, Multisine):
         f = part.frequencies_hz
@@ -216,19 +216,19 @@ def design_experiment(
     """
     bench = make_bench(
         plant, params, sigma, duration_s=limits.duration_s, rate_hz=limits.rate_hz, offset=offset,
-        initial_state=initial_state, input_name=input_name, watched=_watched(plant, limits),
+        initial_state=initial_state, input_name=input_name, watched=_limited_signals(plant, limits),
     )  # fmt: skip
-    measure = measure_of(bench, criterion)
-    search = Search(bench=bench, limits=limits, measure=measure)
+    measure = make_measure(bench, criterion)
+    search = ExcitationSearch(bench=bench, limits=limits, measure=measure)
     band = _band(None if signal is None else signal.band_hz, limits)
     search = with_fine_steps(search, band)
     if isinstance(signal, Chirps):
-        found = best_chirp(search, band)
+        candidate = best_chirp(search, band)
     else:
-        found = best_multisine(search, band, signal if signal is not None else Multisines())
-    if signal is None and search.peaked(found.trial):
-        found = min(found, best_chirp(search, band), key=lambda item: item.value)
-    return _design(search, found, criterion)
+        candidate = best_multisine(search, band, signal if signal is not None else Multisines())
+    if signal is None and search.is_peak_limited(candidate.trial):
+        candidate = min(candidate, best_chirp(search, band), key=lambda option: option.value)
+    return _design(search, candidate, criterion)
 
 
 def expected_covariance(
@@ -274,15 +274,16 @@ def expected_covariance(
         input_name=input_name,
     )  # fmt: skip
     u = bench.samples(excitation, seed)
-    return Covariance(names=bench.model.free, matrix=bench.refined(u).run(u).covariance)
+    return Covariance(names=bench.model.free, matrix=bench.refine_steps(u).run(u).covariance)
 
 
-def _watched(plant: Plant, limits: Limits) -> tuple[str, ...]:
+def _limited_signals(plant: Plant, limits: Limits) -> tuple[str, ...]:
     known = (*plant.outputs, *plant.states)
     for name in limits.peaks:
         if name not in known:
             raise EstimationError(
-                f'limits: peaks names "{name}", no output or state of {plant.name}; {suggestion(name, known)}'
+                f'limits: peaks names "{name}", which is not an output or state of {plant.name}; '
+                f"{suggestion(name, known)}"
             )
     return tuple(limits.peaks)
 
@@ -297,10 +298,10 @@ def _band(band_hz: tuple[float, float] | None, limits: Limits) -> tuple[float, f
     return low, high
 
 
-def _design(search: Search, found: Found, criterion: str) -> Design:
-    """Report what a search found from steps that are fine enough."""
-    bench = search.bench.refined(search.bench.samples(found.excitation))
-    final = replace(search, bench=bench).within(found.excitation)
+def _design(search: ExcitationSearch, candidate: Candidate, criterion: str) -> Design:
+    """Report a search's best candidate, simulated with steps that are fine enough."""
+    bench = search.bench.refine_steps(search.bench.samples(candidate.excitation))
+    final = replace(search, bench=bench).scale_to_limits(candidate.excitation)
     names = bench.model.free
     covariance = Covariance(names=names, matrix=final.trial.covariance)
     for name in names:
@@ -309,8 +310,8 @@ def _design(search: Search, found: Found, criterion: str) -> Design:
                 f"{name} cannot be told from the other unknowns by any excitation that was tried; "
                 "fix one, give it a prior, or measure another output"
             )
-    told = (replace(bench.params[name], std=covariance.std(name)) for name in names)
+    figures = (replace(bench.params[name], std=covariance.std(name)) for name in names)
     return Design(
-        excitation=final.excitation, criterion=criterion, parameters=bench.params.with_parameters(*told),
+        excitation=final.excitation, criterion=criterion, parameters=bench.params.with_parameters(*figures),
         covariance=covariance, rms=final.trial.rms, peaks=final.trial.peaks, limits=search.limits, bench=bench,
     )  # fmt: skip

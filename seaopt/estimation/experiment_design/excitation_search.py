@@ -15,25 +15,25 @@ from dataclasses import field, replace
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from seaopt.bench import Chirp, Excitation, Multisine, scaled
+from seaopt.bench import Chirp, Excitation, Multisine, scale
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.experiment_design.information import Bench, Trial
 from seaopt.estimation.experiment_design.spectrum import (
     Spectrum,
-    harmonics,
+    choose_harmonics,
     low_peak_phases,
+    make_spectrum,
     optimal_powers,
     schroeder_phases,
-    spectrum,
 )
 from seaopt.records import record
 
-ROUNDS = 4  # of powers, phases, and the peaks that they give
+POWER_ROUNDS = 4  # of powers, phases, and the peaks that they give
 FAINT = 1e-3  # lines with less than this part of the largest power are left out
-NODES = 8  # of the coarse grids of bands
+BAND_NODES = 8  # of the coarse grids of bands
 REFINED_LINES = 8  # of a multisine for a plant that is not linear
 SCALINGS = 20
-MARGIN = 1e-9
+SCALING_MARGIN = 1e-9
 
 
 @record
@@ -63,8 +63,8 @@ class Limits:
     peaks: Mapping[str, float] = field(default_factory=dict[str, float])
 
     def __post_init__(self) -> None:
-        given = {"duration_s": self.duration_s, "rate_hz": self.rate_hz, "rms": self.rms, "peak": self.peak}
-        for name, value in (*given.items(), *self.peaks.items()):
+        numbers = {"duration_s": self.duration_s, "rate_hz": self.rate_hz, "rms": self.rms, "peak": self.peak}
+        for name, value in (*numbers.items(), *self.peaks.items()):
             if value is not None and not 0.0 < value < np.inf:
                 raise EstimationError(f"limits: {name} = {value} is not a limit; give a positive number")
         if self.rms is None and self.peak is None and not self.peaks:
@@ -126,7 +126,7 @@ class Measure:
         return float(np.log(np.trace(self.weight @ covariance)))
 
 
-def measure_of(bench: Bench, criterion: str) -> Measure:
+def make_measure(bench: Bench, criterion: str) -> Measure:
     """Return the criterion of a name: "A", "D" or a free parameter's.
 
     Raises
@@ -153,7 +153,7 @@ def measure_of(bench: Bench, criterion: str) -> Measure:
 
 
 @record(eq=False)
-class Found:
+class Candidate:
     """An excitation within the limits, what it tells, and its criterion."""
 
     excitation: Excitation
@@ -162,27 +162,27 @@ class Found:
 
 
 @record(eq=False)
-class Search:
+class ExcitationSearch:
     """What a search needs: the bench, the limits, the criterion."""
 
     bench: Bench
     limits: Limits
     measure: Measure
 
-    def peaked(self, trial: Trial) -> bool:
+    def is_peak_limited(self, trial: Trial) -> bool:
         """Tell whether a peak, not the rms, limits the excitation."""
         return self.limits.rms is None or bool(trial.rms < 0.99 * self.limits.rms)
 
-    def use(self, trial: Trial) -> float:
+    def largest_use(self, trial: Trial) -> float:
         """Return the largest of all limited quantities over their limits."""
-        own = [0.0 if self.limits.rms is None else trial.rms / self.limits.rms]
+        shares = [0.0 if self.limits.rms is None else trial.rms / self.limits.rms]
         if self.limits.peak is not None:
-            own.append(trial.peaks[self.bench.input_name] / self.limits.peak)
-        own += [trial.peaks[name] / limit for name, limit in self.limits.peaks.items()]
-        return float(np.max(own)) if np.all(np.isfinite(own)) else np.inf
+            shares.append(trial.peaks[self.bench.input_name] / self.limits.peak)
+        shares += [trial.peaks[name] / limit for name, limit in self.limits.peaks.items()]
+        return float(np.max(shares)) if np.all(np.isfinite(shares)) else np.inf
 
-    def within(self, excitation: Excitation) -> Found:
-        """Return the excitation as large as the limits allow.
+    def scale_to_limits(self, excitation: Excitation) -> Candidate:
+        """Scale the excitation to be as large as the limits allow.
 
         Raises
         ------
@@ -192,18 +192,20 @@ class Search:
         """
         u = self.bench.samples(excitation)
         low, high, factor = 0.0, np.inf, 1.0
-        best: Found | None = None
+        best: Candidate | None = None
         for _ in range(SCALINGS):
             trial = self.bench.run(factor * u)
-            use = self.use(trial)
+            use = self.largest_use(trial)
             if use <= 1.0:
                 low = factor
-                best = Found(excitation=scaled(excitation, factor), trial=trial, value=self.measure(trial.covariance))
+                best = Candidate(
+                    excitation=scale(excitation, factor), trial=trial, value=self.measure(trial.covariance)
+                )
                 if use > 0.999:
                     break
             else:
                 high = factor
-            guess = factor / use * (1.0 - MARGIN) if 0.0 < use < np.inf else 0.0
+            guess = factor / use * (1.0 - SCALING_MARGIN) if 0.0 < use < np.inf else 0.0
             factor = guess if low < guess < high else (np.sqrt(low * high) if low > 0.0 else 0.1 * high)
             if not np.isfinite(factor):
                 break
@@ -212,7 +214,7 @@ class Search:
         return best
 
 
-def best_multisine(search: Search, band: tuple[float, float], chosen: Multisines) -> Found:
+def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: Multisines) -> Candidate:
     """Return the best multisine within the limits.
 
     Raises
@@ -227,46 +229,46 @@ def best_multisine(search: Search, band: tuple[float, float], chosen: Multisines
             f"lines = {chosen.lines}, spread = {chosen.spread:g}; give at least 1 line and a spread of 0 to below 1"
         )
     rate = 1.0 / bench.clock.period
-    places = harmonics(bench.n, rate, band, chosen.lines)
+    multiples = choose_harmonics(bench.n, rate, band, chosen.lines)
     signals = [-1, *(bench.place(name) for name in search.limits.peaks)]
-    lines = spectrum(
-        bench.model, bench.theta, bench.clock, places, n=bench.n, sigma=bench.sigma, channel=bench.channel,
+    lines = make_spectrum(
+        bench.model, bench.theta, bench.clock, multiples, n=bench.n, sigma=bench.sigma, channel=bench.channel,
         signals=signals,
     )  # fmt: skip
     if bench.model.linear:
-        return _convex(search, lines, chosen.spread)
-    return _refined(search, _start(search, lines, chosen.spread))
+        return _solve_convex(search, lines, chosen.spread)
+    return _refine(search, _best_start(search, lines, chosen.spread))
 
 
-def _start(search: Search, lines: Spectrum, spread: float) -> Found:
-    """Return the best of the linearised plant's optimum, if it has one, and even spectra between any two of NODES."""
-    best: Found | None = None
+def _best_start(search: ExcitationSearch, lines: Spectrum, spread: float) -> Candidate:
+    """Return the best of the linearised plant's optimum, if any, and even spectra between any two of BAND_NODES."""
+    best: Candidate | None = None
     with suppress(EstimationError):  # linearised, a friction and a damping are one
-        best = _convex(search, lines, spread)
-    nodes = np.linspace(0, lines.harmonics.size - 1, NODES)
+        best = _solve_convex(search, lines, spread)
+    nodes = np.linspace(0, lines.harmonics.size - 1, BAND_NODES)
     for i, low in enumerate(nodes):
         for high in nodes[i:]:
             chosen = np.unique(np.linspace(low, high, REFINED_LINES).round().astype(int))
             powers = np.full(lines.harmonics.size, spread / lines.harmonics.size)
             powers[chosen] += (1.0 - spread) / chosen.size
             kept = powers > 0.0
-            found = search.within(
-                _multisine(search.bench, _chosen(lines, kept), powers[kept], schroeder_phases(powers[kept]))
+            candidate = search.scale_to_limits(
+                _multisine(search.bench, _select_lines(lines, kept), powers[kept], schroeder_phases(powers[kept]))
             )
-            best = found if best is None or found.value < best.value else best
+            best = candidate if best is None or candidate.value < best.value else best
     assert best is not None
     return best
 
 
-def _convex(search: Search, lines: Spectrum, spread: float) -> Found:
+def _solve_convex(search: ExcitationSearch, lines: Spectrum, spread: float) -> Candidate:
     """Alternate powers, within peaks guessed as multiples of each rms, and phases, which give those multiples."""
     limits = search.limits
     share = (1.0 - spread) * np.eye(lines.harmonics.size) + spread / lines.harmonics.size
     information = np.einsum("jk,jab->kab", share, lines.information)
     caps = np.array([np.inf if limits.peak is None else limits.peak, *limits.peaks.values()])
     crest = np.full(caps.size, 2.0)
-    best: Found | None = None
-    for _ in range(ROUNDS if np.any(np.isfinite(caps)) else 1):
+    best: Candidate | None = None
+    for _ in range(POWER_ROUNDS if np.any(np.isfinite(caps)) else 1):
         rows = np.abs(lines.gains) ** 2 * (crest / caps)[:, None] ** 2
         rows = rows[np.isfinite(caps)]
         if limits.rms is not None:
@@ -275,20 +277,20 @@ def _convex(search: Search, lines: Spectrum, spread: float) -> Found:
             information, rows @ share, weight=search.measure.weight, prior=np.diag(search.bench.prior)
         )
         kept = powers > FAINT * np.max(powers)
-        found = search.within(_low_peaks(search, _chosen(lines, kept), powers[kept], caps))
-        if best is not None and found.value >= best.value:
+        candidate = search.scale_to_limits(_low_peaks(search, _select_lines(lines, kept), powers[kept], caps))
+        if best is not None and candidate.value >= best.value:
             break
-        best = found
-        part = found.excitation[0]
+        best = candidate
+        part = candidate.excitation[0]
         assert isinstance(part, Multisine)
         rms = np.sqrt(np.abs(lines.gains[:, kept]) ** 2 @ (np.array(part.amplitudes) ** 2 / 2))
-        peaks = found.trial.peaks
+        peaks = candidate.trial.peaks
         crest = np.array([peaks[search.bench.input_name], *(peaks[name] for name in limits.peaks)]) / rms
     assert best is not None
     return best
 
 
-def _chosen(lines: Spectrum, kept: Bool[np.ndarray, " K"]) -> Spectrum:
+def _select_lines(lines: Spectrum, kept: Bool[np.ndarray, " K"]) -> Spectrum:
     return replace(
         lines,
         harmonics=lines.harmonics[kept],
@@ -298,7 +300,7 @@ def _chosen(lines: Spectrum, kept: Bool[np.ndarray, " K"]) -> Spectrum:
 
 
 def _low_peaks(
-    search: Search, lines: Spectrum, powers: Float[np.ndarray, " K"], caps: Float[np.ndarray, " m"]
+    search: ExcitationSearch, lines: Spectrum, powers: Float[np.ndarray, " K"], caps: Float[np.ndarray, " m"]
 ) -> Excitation:
     """Return the multisine of given powers whose limited signals have the lowest peaks; the input's if none is."""
     sizes = np.where(np.isfinite(caps), caps, 1.0)
@@ -320,34 +322,34 @@ def _multisine(
     return (part,)
 
 
-def _refined(search: Search, start: Found) -> Found:
+def _refine(search: ExcitationSearch, start: Candidate) -> Candidate:
     """Improve amplitudes and phases of the strongest lines on the information of the samples themselves."""
-    search = replace(search, bench=search.bench.refined(search.bench.samples(start.excitation)))
+    search = replace(search, bench=search.bench.refine_steps(search.bench.samples(start.excitation)))
     part = start.excitation[0]
     assert isinstance(part, Multisine)
-    best = search.within(start.excitation)
+    best = search.scale_to_limits(start.excitation)
     amplitudes, phases = np.array(part.amplitudes), np.array(part.phases_rad)
     free = np.sort(np.argsort(amplitudes, kind="stable")[::-1][:REFINED_LINES])
 
-    def made(x: Float[np.ndarray, " m"]) -> Excitation:
+    def build(x: Float[np.ndarray, " m"]) -> Excitation:
         a, phi = amplitudes.copy(), phases.copy()
         a[free], phi[free] = np.exp(x[: free.size]), x[free.size :]
         return (replace(part, amplitudes=tuple(map(float, a)), phases_rad=tuple(map(float, phi))),)
 
     x0 = np.concatenate([np.log(amplitudes[free]), phases[free]])
-    x = _descend(lambda x: _value(search, made(x)), x0)
-    found = search.within(made(x))
-    return found if found.value < best.value else best
+    x = _descend(lambda x: _smooth_criterion(search, build(x)), x0)
+    candidate = search.scale_to_limits(build(x))
+    return candidate if candidate.value < best.value else best
 
 
-def _value(search: Search, excitation: Excitation) -> float:
+def _smooth_criterion(search: ExcitationSearch, excitation: Excitation) -> float:
     """Return the criterion of an excitation scaled to its limits, but for two steps: smooth, and right in the limit."""
     u = search.bench.samples(excitation)
-    first = search.use(search.bench.run(u))
+    first = search.largest_use(search.bench.run(u))
     if not 0.0 < first < np.inf:
         return 1e6
     second = search.bench.run(u / first)
-    use = search.use(second)
+    use = search.largest_use(second)
     value = search.measure(second.covariance)
     return value + search.measure.order * np.log(use) if np.isfinite(value) and np.isfinite(use) else 1e6
 
@@ -355,40 +357,40 @@ def _value(search: Search, excitation: Excitation) -> float:
 def _descend(cost: Callable[[Float[np.ndarray, " m"]], float], x0: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
     from scipy.optimize import minimize  # deferred: 0.3 s
 
-    found = minimize(cost, x0, method="L-BFGS-B", jac="2-point", options={"maxiter": 15, "eps": 1e-4, "maxfun": 300})
-    return np.asarray(found.x)
+    solution = minimize(cost, x0, method="L-BFGS-B", jac="2-point", options={"maxiter": 15, "eps": 1e-4, "maxfun": 300})
+    return np.asarray(solution.x)
 
 
-def with_fine_steps(search: Search, band: tuple[float, float]) -> Search:
+def with_fine_steps(search: ExcitationSearch, band: tuple[float, float]) -> ExcitationSearch:
     """Return the search with integration steps that are fine enough for a chirp over the whole band."""
     if search.bench.model.linear:
         return search
-    found = search.within(_chirp(np.log(band[0]), np.log(band[1])))
-    return replace(search, bench=search.bench.refined(search.bench.samples(found.excitation)))
+    candidate = search.scale_to_limits(_chirp(np.log(band[0]), np.log(band[1])))
+    return replace(search, bench=search.bench.refine_steps(search.bench.samples(candidate.excitation)))
 
 
-def best_chirp(search: Search, band: tuple[float, float]) -> Found:
+def best_chirp(search: ExcitationSearch, band: tuple[float, float]) -> Candidate:
     """Look over a coarse grid of both ends, then refine the best by Nelder and Mead's simplex."""
     from scipy.optimize import minimize  # deferred: 0.3 s
 
-    nodes = np.linspace(np.log(band[0]), np.log(band[1]), NODES)
-    best: Found | None = None
+    nodes = np.linspace(np.log(band[0]), np.log(band[1]), BAND_NODES)
+    best: Candidate | None = None
     ends = np.zeros(2)
     for i, low in enumerate(nodes):
         for high in nodes[i + 1 :]:
-            found = search.within(_chirp(low, high))
-            if best is None or found.value < best.value:
-                best, ends = found, np.array([low, high])
+            candidate = search.scale_to_limits(_chirp(low, high))
+            if best is None or candidate.value < best.value:
+                best, ends = candidate, np.array([low, high])
     assert best is not None
 
     def cost(x: Float[np.ndarray, " 2"]) -> float:
         if not nodes[0] <= x[0] < x[1] - 0.01 or x[1] > nodes[-1]:
             return 1e6
-        return search.within(_chirp(x[0], x[1])).value
+        return search.scale_to_limits(_chirp(x[0], x[1])).value
 
     x = np.asarray(minimize(cost, ends, method="Nelder-Mead", options={"maxfev": 80, "xatol": 1e-3}).x)
-    found = search.within(_chirp(x[0], x[1]))
-    return found if found.value < best.value else best
+    candidate = search.scale_to_limits(_chirp(x[0], x[1]))
+    return candidate if candidate.value < best.value else best
 
 
 def _chirp(low: float, high: float) -> Excitation:

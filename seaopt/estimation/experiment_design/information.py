@@ -17,13 +17,11 @@ from seaopt.bench import Excitation, excite
 from seaopt.errors import EstimationError, suggestion
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.result.covariance import mark_unseen
+from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, STEP_ERROR_SIGMA
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, Pass, Point, Segment, make_model, run_passes
-
-STEP_ERROR_SIGMA = 0.01  # integration error allowed in a measured output, in sigma
-MAX_SUBSTEPS = 256
 
 
 @record(eq=False)
@@ -106,17 +104,17 @@ class Bench:
 
     def run(self, u: Float[np.ndarray, " n"]) -> Trial:
         """Simulate the excitation `u` from rest."""
-        found = self._pass(u, self.substeps)
-        assert found.outputs is not None and found.states is not None
-        signals = np.concatenate([found.outputs, found.states], axis=1)
+        result = self._pass(u, self.substeps)
+        assert result.outputs is not None and result.states is not None
+        signals = np.concatenate([result.outputs, result.states], axis=1)
         peaks = {name: float(np.max(np.abs(signals[:, self.place(name)]))) for name in self.watched}
         return Trial(
-            covariance=self._covariance(found),
+            covariance=self._covariance(result),
             rms=float(np.sqrt(np.mean(u**2))),
             peaks={self.input_name: float(np.max(np.abs(u))), **peaks},
         )
 
-    def refined(self, u: Float[np.ndarray, " n"]) -> Bench:
+    def refine_steps(self, u: Float[np.ndarray, " n"]) -> Bench:
         """Return the bench with integration steps that are fine enough for `u`.
 
         Raises
@@ -153,7 +151,7 @@ class Bench:
         )  # fmt: skip
         return run_passes(self.model, segment, point, np.zeros((1, self.model.nx)), outputs=True, states=True)
 
-    def _covariance(self, found: Pass) -> Float[np.ndarray, "p p"]:
+    def _covariance(self, result: Pass) -> Float[np.ndarray, "p p"]:
         p, nx, m = self.theta.size, self.model.nx, self.sigma.size
         size = p + nx * self.initial + m * self.offset
         total = np.zeros((size, size))
@@ -163,12 +161,12 @@ class Bench:
             if self.offset:
                 rows.append(1 + p + nx)
                 place.append(p + nx * self.initial + o)
-            total[np.ix_(place, place)] += found.gram[0, o][np.ix_(rows, rows)] / sigma**2
+            total[np.ix_(place, place)] += result.gram[0, o][np.ix_(rows, rows)] / sigma**2
         if not np.all(np.isfinite(total)):
             return np.full((p, p), np.inf)
         total[np.arange(p), np.arange(p)] += self.prior
-        back, unseen = invert(total)
-        return mark_unseen(back[:p, :p], unseen[:p])
+        inverted, unseen = invert(total)
+        return mark_unseen(inverted[:p, :p], unseen[:p])
 
 
 def make_bench(

@@ -53,7 +53,7 @@ class Spectrum:
     gains: Complex[np.ndarray, "m K"]
 
 
-def harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Int[np.ndarray, " K"]:
+def choose_harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) -> Int[np.ndarray, " K"]:
     """Return at most `lines` log-spaced multiples of rate_hz/n in a band.
 
     Raises
@@ -63,7 +63,7 @@ def harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) 
 
     Examples
     --------
-    >>> harmonics(400, 400.0, (1.0, 100.0), 3)
+    >>> choose_harmonics(400, 400.0, (1.0, 100.0), 3)
     array([  1,  10, 100])
 
     """
@@ -77,11 +77,11 @@ def harmonics(n: int, rate_hz: float, band_hz: tuple[float, float], lines: int) 
     return np.unique(np.round(np.geomspace(first, last, lines)).astype(int))
 
 
-def spectrum(
+def make_spectrum(
     model: Model,
     theta: Float[np.ndarray, " np"],
     clock: Clock,
-    places: Int[np.ndarray, " K"],
+    multiples: Int[np.ndarray, " K"],
     *,
     n: int,
     sigma: Float[np.ndarray, " nm"],
@@ -94,7 +94,7 @@ def spectrum(
     ----------
     model, theta, clock
         The plant, its free parameters and the hold.
-    places : array, shape (K,)
+    multiples : array, shape (K,)
         The lines, in multiples of 1/(n period).
     n : int
         Samples.
@@ -108,12 +108,12 @@ def spectrum(
     """
     linear = linearised(model)
     blocks = transition(linear, theta, clock)
-    z = np.exp(2j * np.pi * places / n)
+    z = np.exp(2j * np.pi * multiples / n)
     response = np.array([_response(blocks, linear.nx, linear.nu, channel, clock, zk) for zk in z])
     slopes = response[:, 1:, linear.nx : linear.nx + sigma.size] / sigma
     information = n * np.einsum("kio,kjo->kij", slopes, slopes.conj()).real
     order = np.concatenate([response[:, 0, linear.nx :], response[:, 0, : linear.nx], np.ones((z.size, 1))], axis=1)
-    return Spectrum(harmonics=places, information=information, gains=order[:, signals].T)
+    return Spectrum(harmonics=multiples, information=information, gains=order[:, signals].T)
 
 
 def _response(
@@ -182,10 +182,10 @@ def optimal_powers(
     options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "error_on_fail": True}
     solver = ca.nlpsol("powers", "ipopt", nlp, options)
     try:
-        found = solver(x0=np.full(k, 0.9), lbx=0.0, ubg=1.0)
+        solution = solver(x0=np.full(k, 0.9), lbx=0.0, ubg=1.0)
     except RuntimeError as error:
         raise EstimationError("the powers were not found; use fewer lines, or narrow band_hz") from error
-    return np.maximum(np.array(found["x"]).ravel(), 0.0) * even
+    return np.maximum(np.array(solution["x"]).ravel(), 0.0) * even
 
 
 def _cost(total: Any, weight: Float[np.ndarray, "p p"] | None, p: int) -> Any:
@@ -195,10 +195,10 @@ def _cost(total: Any, weight: Float[np.ndarray, "p p"] | None, p: int) -> Any:
         return -2.0 * ca.sum1(ca.log(ca.diag(upper)))
     values, vectors = np.linalg.eigh(weight / np.trace(weight))
     half = vectors * np.sqrt(np.maximum(values, 0.0))
-    return ca.sumsqr(_forward(upper, ca.DM(half), p))
+    return ca.sumsqr(_substitute_forward(upper, ca.DM(half), p))
 
 
-def _forward(upper: Any, right: Any, p: int) -> Any:
+def _substitute_forward(upper: Any, right: Any, p: int) -> Any:
     """Return (R')^-1 B by forward substitution: |.|^2 is then trace(B' (R'R)^-1 B)."""
     rows: list[Any] = []
     for i in range(p):
@@ -234,7 +234,7 @@ def schroeder_phases(powers: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]
 
 
 def low_peak_phases(
-    lines: Complex[np.ndarray, "m K"], places: Int[np.ndarray, " K"], n: int, start: Float[np.ndarray, " K"]
+    lines: Complex[np.ndarray, "m K"], multiples: Int[np.ndarray, " K"], n: int, start: Float[np.ndarray, " K"]
 ) -> Float[np.ndarray, " K"]:
     """Return phases that make the largest of m periodic signals over n samples small.
 
@@ -242,7 +242,7 @@ def low_peak_phases(
     ----------
     lines : array, shape (m, K)
         Signal m is Im sum_k lines[m, k] exp(i (phase_k + 2 pi places_k t/n)).
-    places : array, shape (K,)
+    multiples : array, shape (K,)
         Harmonics.
     n : int
         Samples.
@@ -254,29 +254,29 @@ def low_peak_phases(
 
     phases = start
     for order in ORDERS:
-        found = minimize(
-            lambda x, q: _norm(x, lines, places, n, q), phases, args=(order,), jac=True, method="L-BFGS-B",
+        solution = minimize(
+            lambda x, q: _log_norm(x, lines, multiples, n, q), phases, args=(order,), jac=True, method="L-BFGS-B",
             options={"maxiter": 40},
         )  # fmt: skip
-        phases = np.asarray(found.x)
+        phases = np.asarray(solution.x)
     return phases
 
 
-def _norm(
-    phases: Float[np.ndarray, " K"], lines: Complex[np.ndarray, "m K"], places: Int[np.ndarray, " K"], n: int, q: int
+def _log_norm(
+    phases: Float[np.ndarray, " K"], lines: Complex[np.ndarray, "m K"], multiples: Int[np.ndarray, " K"], n: int, q: int
 ) -> tuple[float, Float[np.ndarray, " K"]]:
     """Return log of the 2q-norm of all signals, and its gradient."""
     turned = lines * np.exp(1j * phases)
-    y = periodic(turned, places, n)
+    y = periodic(turned, multiples, n)
     peak = float(np.max(np.abs(y)))
     power = (y / peak) ** (2 * q)
     total = float(np.sum(power))
-    pull = np.fft.fft(power / np.where(y == 0.0, 1.0, y), axis=1)[:, places] / total
+    pull = np.fft.fft(power / np.where(y == 0.0, 1.0, y), axis=1)[:, multiples] / total
     return np.log(peak) + np.log(total) / (2 * q), np.sum((turned * pull.conj()).real, axis=0)
 
 
-def periodic(lines: Complex[np.ndarray, "m K"], places: Int[np.ndarray, " K"], n: int) -> Float[np.ndarray, "m n"]:
+def periodic(lines: Complex[np.ndarray, "m K"], multiples: Int[np.ndarray, " K"], n: int) -> Float[np.ndarray, "m n"]:
     """Return the signals Im sum_k lines[m, k] exp(2 pi i places_k t/n) over one period of n samples."""
     bins = np.zeros((lines.shape[0], n), dtype=complex)
-    bins[:, places] = lines
+    bins[:, multiples] = lines
     return np.fft.ifft(bins, axis=1).imag * n

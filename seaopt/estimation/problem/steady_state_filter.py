@@ -96,13 +96,13 @@ class SteadyStateFilter:
         self, model: Model, theta: Float[np.ndarray, " np"], period: float
     ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "ny nx"]]:
         key = f"mean derivatives {len(self.places)}"
-        if key not in model.functions:
+        if key not in model.memory:
             columns = [ca.densify(ca.jacobian(e, model.x)) for e in (model.f, model.h)]
             one = ca.Function("derivatives", [model.t, model.x, model.u, model.p], columns)
-            model.functions[key] = one.map(len(self.places))
+            model.memory[key] = one.map(len(self.places))
         m, nx = self.places.shape[0], model.nx
         p = np.repeat(model.parameters(theta)[:, None], m, axis=1)
-        f, h = model.functions[key](0.0, self.places[:, :nx].T, self.places[:, nx:].T, p)
+        f, h = model.memory[key](0.0, self.places[:, :nx].T, self.places[:, nx:].T, p)
         rates, limit = np.array(f).reshape(nx, m, nx), RATE_LIMIT / period
         mean = rates.mean(axis=1)
         diagonal = np.clip(rates[np.arange(nx), :, np.arange(nx)], -limit, limit)

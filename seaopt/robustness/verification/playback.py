@@ -12,7 +12,7 @@ from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.sampled_plant import conditions_of
-from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, run_loop, told
+from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
@@ -129,7 +129,7 @@ class Trace:
 
     def __repr__(self) -> str:
         contacts = f"{len(self.contacts)} contacts; "
-        return told("Trace", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
+        return describe_runs("Trace", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
 
     @property
     def last(self) -> slice:
