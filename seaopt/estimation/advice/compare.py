@@ -48,7 +48,7 @@ from seaopt.records import record
 MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0  # differences of BIC (Kass and Raftery)
 CONTRADICTION = 1.02  # ratio of held-out residuals that contradicts the likelihood
 OCTAVES = 12  # at most, below the Nyquist frequency
-LINES = 4  # lines of the spectrum that the lowest octave has at least
+LOWEST_LINES = 4  # lines of the spectrum that the lowest octave has at least
 
 
 @record(eq=False)
@@ -352,7 +352,7 @@ def _compute_octaves(places: Sequence[FitOutput], residuals: Mapping[str, Residu
         for place, (name, own) in zip(places, residuals.items(), strict=True)
     }
     counts = {name: max(int(np.count_nonzero(r)), 1) for name, r in signals.items()}
-    lowest = LINES / (max(counts.values()) * period)
+    lowest = LOWEST_LINES / (max(counts.values()) * period)
     edges = [0.5 / period]
     while len(edges) <= OCTAVES and edges[-1] / 2.0 > lowest:
         edges.append(edges[-1] / 2.0)

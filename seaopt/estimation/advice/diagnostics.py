@@ -22,7 +22,7 @@ from seaopt.estimation.advice.forecasts import (
     split_samples,
 )
 from seaopt.estimation.advice.score_test import SIGNIFICANCE, Culprit, ScoreTest, correlate_with_inputs, find_culprit
-from seaopt.estimation.problem.correlation import LAGS, QUANTILE, CrossCorrelation, autocorrelation
+from seaopt.estimation.problem.correlation import INPUT_LAGS, QUANTILE, CrossCorrelation, autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitOutput
 from seaopt.estimation.problem.residual_statistics import (
     ExperimentResiduals,
@@ -241,7 +241,7 @@ def _diagnose_output(
     count = int(np.count_nonzero(residual))
     return OutputDiagnostics(
         whiteness_p=whiteness_p,
-        autocorrelation=autocorrelation(residual, min(LAGS, residual.size - 1)),
+        autocorrelation=autocorrelation(residual, min(INPUT_LAGS, residual.size - 1)),
         autocorrelation_bound=QUANTILE / float(np.sqrt(max(count, 1))),
         inputs=correlate_with_inputs(output, residuals),
         free_run=compute_percent(output, free),
@@ -298,7 +298,7 @@ def _try_delay(fit: Fit, experiment: FitExperiment) -> _DelayTrial | None:
     if experiment.slots.delay.index is not None:
         return None
     known, name = experiment.slots.delay.value, experiment.name
-    span = LAGS * experiment.period
+    span = INPUT_LAGS * experiment.period
     delay = Parameter(name="delay_s", value=known, unit="s", free=True, min=0.0, max=known + span)
     trial, z = minimum.problem.rebuild(fit.parameters, minimum.z, {name: replace(experiment.data, delay_s=delay)})
     before = trial.evaluate(z)

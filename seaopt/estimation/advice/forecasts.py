@@ -24,7 +24,7 @@ from seaopt.estimation.result.fit_result import Minimum
 from seaopt.estimation.solver.prediction import add_predictors
 from seaopt.records import record
 
-LEVELS = (np.log(1e-6), np.log(0.1))  # of process noise over the states' size
+NOISE_LEVELS = (np.log(1e-6), np.log(0.1))  # of process noise over the states' size
 RUNAWAY_COST = 1e300  # of a filter that runs away
 LEVEL_TOLERANCE = 0.3  # no finer than the forecast feels
 
@@ -120,5 +120,5 @@ def _predict_at_best_level(
             total = float(np.sum(np.log(np.maximum(squares, 1e-300))))
         return total if np.isfinite(total) else RUNAWAY_COST
 
-    best = minimize_scalar(cost, bounds=LEVELS, method="bounded", options={"xatol": LEVEL_TOLERANCE})
+    best = minimize_scalar(cost, bounds=NOISE_LEVELS, method="bounded", options={"xatol": LEVEL_TOLERANCE})
     return predict(float(best.x)) if best.fun < RUNAWAY_COST else None

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from seaopt.records import record
 
-LAGS = 25
+INPUT_LAGS = 25
 QUANTILE = 2.5758293  # of the standard normal, 99 % two-sided
 
 
@@ -121,7 +121,7 @@ def autocorrelation(r: Float[np.ndarray, " n"], lags: int) -> Float[np.ndarray, 
 
 
 def cross_correlation(
-    residuals: list[Float[np.ndarray, "..."]], inputs: list[Float[np.ndarray, "..."]], lags: int = LAGS
+    residuals: list[Float[np.ndarray, "..."]], inputs: list[Float[np.ndarray, "..."]], lags: int = INPUT_LAGS
 ) -> CrossCorrelation | None:
     """Return the correlation of a residual with an input over some segments; None if either does not move.
 

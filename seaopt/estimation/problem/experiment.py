@@ -22,7 +22,7 @@ from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import same_dimension
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 Mask = Literal["auto", "declared", "none"]
@@ -102,7 +102,7 @@ class Experiment:
     stretches: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not NAME.fullmatch(self.name):
+        if not EXPERIMENT_NAME.fullmatch(self.name):
             raise EstimationError(
                 f'experiment name "{self.name[:40]}" is not a name; start with a letter, then letters, digits, _ and -'
             )
@@ -264,7 +264,7 @@ class Experiment:
         """Return the rows at which a stretch is cut into shots, its ends included."""
         return (stretch.start + cut_into_shots(stretch.stop - stretch.start, self.shots)).tolist()
 
-    def renamed(self, name: str) -> Experiment:
+    def rename(self, name: str) -> Experiment:
         """Return the experiment under another name."""
         return replace(self, name=name)
 

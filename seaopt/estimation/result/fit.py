@@ -123,7 +123,7 @@ def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
             number += 1
             name = f"{experiment.name}{number}"
         seen.add(name)
-        out.append(experiment if name == experiment.name else experiment.renamed(name))
+        out.append(experiment if name == experiment.name else experiment.rename(name))
     return tuple(out)
 
 

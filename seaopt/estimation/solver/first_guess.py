@@ -22,10 +22,10 @@ from seaopt.records import record
 from seaopt.simulation import Model, linearised
 
 CANDIDATES = 128
-REFINED = 8
-POINTS = 60
-EXPLAINED = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
-LONGEST = 1 << 14  # samples of a stretch: resolution enough for a guess
+REFINED_CANDIDATES = 8
+MATCHED_POINTS = 60
+EXPLAINED_MISFIT = 2.0  # rms misfit, in standard deviations of the responses, of a guess that needs no other
+LONGEST_STRETCH = 1 << 14  # samples of a stretch: resolution enough for a guess
 
 
 @record(eq=False)
@@ -60,14 +60,14 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
     prior = unknowns.prior_std[: unknowns.shared]
     spread = np.isinf(prior) & (start != 0.0)
     refined = [_refine(targets, start, low, high, spread)]
-    enough = 0.5 * EXPLAINED**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
+    enough = 0.5 * EXPLAINED_MISFIT**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
     if refined[0][0] > enough:
         candidates = [
             np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
             for _ in range(CANDIDATES)
         ]
         ranked = np.argsort(_misfits(targets, candidates), kind="stable")
-        refined += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED]]
+        refined += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED_CANDIDATES]]
     refined.sort(key=lambda pair: pair[0])
     guesses = [np.concatenate([theta, unknowns.start[unknowns.shared :]]) for _, theta in refined]
     return guesses, refined[0][0] <= enough
@@ -118,7 +118,7 @@ def _measure_target(experiment: FitExperiment) -> _Target | None:
 @lru_cache(maxsize=64)
 def _choose_stretch(n: int) -> int:
     """Return a sixteenth of the log, of a length that is quick to transform, and not too long."""
-    length = min(n // 16, LONGEST)
+    length = min(n // 16, LONGEST_STRETCH)
     fast = [2**a * 3**b for a in range(15) for b in range(9) if 2**a * 3**b <= length]
     return max(fast, default=16)
 
@@ -127,7 +127,7 @@ def _space_by_logarithm(f: Float[np.ndarray, " m"], good: Any) -> Any:
     """Return indices of good frequencies, about evenly spread on a logarithmic axis."""
     candidates = np.flatnonzero(good)
     places = np.log(f[candidates])
-    grid = np.linspace(places[0], places[-1], POINTS)
+    grid = np.linspace(places[0], places[-1], MATCHED_POINTS)
     after = np.clip(np.searchsorted(places, grid), 1, places.size - 1)
     nearest = np.where(grid - places[after - 1] <= places[after] - grid, after - 1, after)
     return candidates[np.unique(nearest)]

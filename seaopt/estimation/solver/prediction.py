@@ -21,7 +21,7 @@ from seaopt.estimation.solver.step_size import EXACT
 from seaopt.simulation import Point, Segment, run_passes
 
 PREDICTION_RADIUS = 100.0  # a plant that is held to the log may be moved far at once
-PLACES = 48  # over which a nonlinear plant is linearised for its filter
+LINEARISED_AT = 48  # over which a nonlinear plant is linearised for its filter
 
 
 def find_predicting_start(
@@ -80,10 +80,10 @@ def measure_noise(y: Float[np.ndarray, " n"], spread: float) -> float:
 def _make_predictor(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> SteadyStateFilter | None:
     """Return a filter whose sizes and places come from its own estimates of the state, after a few rounds."""
     model, samples, point = experiment.model, experiment.segments[0].samples, experiment.point(z)
-    places = np.zeros((PLACES, model.nx + model.nu))
+    places = np.zeros((LINEARISED_AT, model.nx + model.nu))
     size, sensors = _guess_state_size(experiment, point), _estimate_noise(experiment)
     predictor = SteadyStateFilter(size=size, sensors=sensors, places=places, gain=point.gain, follows=False)
-    rows = np.linspace(0, min(samples.n, FIRST_SAMPLES) - 1, PLACES).astype(int)
+    rows = np.linspace(0, min(samples.n, FIRST_SAMPLES) - 1, LINEARISED_AT).astype(int)
     u, y, keep = (tuple(c[:FIRST_SAMPLES] for c in channels) for channels in (samples.inputs, samples.y, samples.keep))
     short = Segment(u=u, y=y, keep=keep, start_s=samples.start_s)
     still = replace(point, clock=replace(point.clock, delay_free=False))

@@ -34,7 +34,7 @@ CLOSE_TO_END = 2e-3  # of tau: near enough for an end of the interval to be inte
 MOST_REFITS = 40  # per end
 NOWHERE = 1e4  # std from the estimate: an end beyond is nowhere
 BETTER_COST = 1e-3  # fall of the cost below the fit's that is no rounding
-MARGIN = 0.15  # of the interval, that the curve shows on either side
+CURVE_MARGIN = 0.15  # of the interval, that the curve shows on either side
 
 
 @record(eq=False, repr=False)
@@ -252,7 +252,7 @@ class _ProfileCurve:
     def fill(self, low: float, high: float, points: int) -> None:
         """Refit at evenly spaced values over the interval and a little beyond."""
         low, high = (end if np.isfinite(end) else far(self.values) for end, far in ((low, min), (high, max)))
-        margin = MARGIN * (high - low)
+        margin = CURVE_MARGIN * (high - low)
         bounds = self.problem.unknowns.low[self.index], self.problem.unknowns.high[self.index]
         for value in np.unique(np.clip(np.linspace(low - margin, high + margin, points), *bounds)):
             if value not in self.values:
