@@ -15,8 +15,7 @@ from seaopt.control.laws.structures import Nominal
 from seaopt.control.tuning.feasibility import sensitivity_possible
 from seaopt.errors import ControlError
 from seaopt.robustness import place_value
-
-from .test_loop import independent
+from tests.control.loops.test_loop import independent
 
 TS = 1e-3
 

@@ -16,7 +16,7 @@ from seaopt.control import DigitalPlant, Loop, TransferFunction
 from seaopt.control.loops import peaks
 from seaopt.control.loops.margins import margins, nu_gap
 from seaopt.errors import ControlError
-from tests.control.test_loop import loop_of
+from tests.control.loops.test_loop import loop_of
 
 INTEGRATING = [("pid", 22, 1.6), ("pid_dob", 22, 1.6), ("pid_dob", 30, 2.0)]
 ONE = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))

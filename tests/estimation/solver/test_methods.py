@@ -19,7 +19,7 @@ from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.steady_state_filter import kalman_gain
 from seaopt.estimation.result.fit import check_choices, complete_parameters
 
-PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
+PROBLEMS = Path(__file__).resolve().parents[3] / "problems"
 METHODS = {
     "output_error": so.OutputError(),
     "multiple_shooting": so.MultipleShooting(segments=20),

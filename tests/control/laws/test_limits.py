@@ -15,7 +15,7 @@ from seaopt.control.laws.verdict import judge_all, list_active, list_broken
 from seaopt.errors import ControlError
 from seaopt.problem.schema import ControllerTable
 
-TUNING = Path(__file__).resolve().parents[2] / "docs" / "tuning.md"
+TUNING = Path(__file__).resolve().parents[3] / "docs" / "tuning.md"
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, min_disk_margin=0.5, max_reference_peak=1.2,
     max_noise_gain=25, passive_band_hz=(1, 60),

@@ -10,7 +10,7 @@ import seaopt as so
 from seaopt.control import close_loop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError, SimulationError
-from tests.control.test_closed_loop import delayed, law, swing_by_hand
+from tests.control.running.test_closed_loop import delayed, law, swing_by_hand
 
 
 def proportional(state, reference, measurement):

@@ -16,7 +16,7 @@ from seaopt.errors import EstimationError
 from seaopt.estimation import compare
 from seaopt.files import to_json
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DRIVES = ("unlumped", "lumped")
 NOISE = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
 

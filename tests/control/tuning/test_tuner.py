@@ -11,8 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.control import Controller
 from seaopt.errors import ControlError, FileError
-
-from .test_loop import independent
+from tests.control.loops.test_loop import independent
 
 LIMITS = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
 

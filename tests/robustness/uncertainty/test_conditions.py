@@ -19,7 +19,7 @@ from seaopt.robustness import batch_figures
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
-from tests.control.test_closed_loop import swing_by_hand
+from tests.control.running.test_closed_loop import swing_by_hand
 
 STEP = Scenario(name="step", phases=(Phase(duration_s=0.12, force_N=30.0), Phase(duration_s=0.28)))
 TS = 1e-3

@@ -13,8 +13,7 @@ import seaopt as so
 from seaopt.cli.frontier import bandwidths
 from seaopt.control import sweep
 from seaopt.errors import ControlError
-
-from .test_loop import independent
+from tests.control.loops.test_loop import independent
 
 PROBLEM = """
 schema = 1
