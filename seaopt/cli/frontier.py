@@ -17,7 +17,7 @@ FRONTIER_NOTE = (
 )
 
 
-def bandwidths(text: str) -> tuple[float, ...]:
+def parse_bandwidths(text: str) -> tuple[float, ...]:
     """Return the bandwidths of LOW:HIGH:STEP, both ends included.
 
     Raises
@@ -27,12 +27,12 @@ def bandwidths(text: str) -> tuple[float, ...]:
 
     Examples
     --------
-    >>> bandwidths("15:25:5")
+    >>> parse_bandwidths("15:25:5")
     (15.0, 20.0, 25.0)
 
     """
     try:
-        low, high, step = (float(item) for item in text.split(":"))
+        low, high, step = (float(number) for number in text.split(":"))
     except ValueError as error:
         raise ControlError(f'--sweep {text}: is not LOW:HIGH:STEP; give three numbers such as "15:60:5"') from error
     if not (0.0 < low <= high < math.inf and 0.0 < step < math.inf):

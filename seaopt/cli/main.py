@@ -34,7 +34,7 @@ def _version(wanted: bool) -> bool:
 
 
 @app.callback()
-def _root(
+def _add_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
@@ -63,14 +63,14 @@ def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) 
     from seaopt.cli.session import Session
 
     session = Session(problem, output)
-    stages = session.planned()
+    stages = session.plan_stages()
     for stage in stages:
-        if stage == "tune" and not session.designable():
+        if stage == "tune" and not session.can_design():
             stages = ["fit", "report"]
             session.run("report")
             break
         session.run(stage)
-    for what in session.left_out(stages):
+    for what in session.explain_left_out(stages):
         session.say(f"left out: {what}")
     _finish(session, json, stages)
 
@@ -158,16 +158,16 @@ def tune(
     ] = None,
 ) -> None:
     """Tune the controller with the fit in DIR; write controller.json."""
-    from seaopt.cli.frontier import bandwidths
+    from seaopt.cli.frontier import parse_bandwidths
     from seaopt.cli.session import Session
 
     stage = "tune" if sweep is None else "sweep"
-    session = Session(problem, output, bandwidths_hz=() if sweep is None else bandwidths(sweep))
+    session = Session(problem, output, bandwidths_hz=() if sweep is None else parse_bandwidths(sweep))
     session.run(stage)
     _finish(session, json, [stage])
 
 
-def _stage(name: str, text: str) -> Callable[..., None]:
+def _make_command(name: str, text: str) -> Callable[..., None]:
     def command(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
         from seaopt.cli.session import Session
 
@@ -179,12 +179,12 @@ def _stage(name: str, text: str) -> Callable[..., None]:
     return command
 
 
-for _name, _text in (
+for _stage_name, _help in (
     ("fit", "Fit the parameters to the logs; write fit.json."),
     ("certify", "Certify the controller in DIR; write robustness.json."),
     ("report", "Write report.html and figures from the results in DIR."),
 ):
-    app.command(_name)(_stage(_name, _text))
+    app.command(_stage_name)(_make_command(_stage_name, _help))
 
 
 @app.command()
@@ -205,10 +205,10 @@ def export(
     json: Json = False,
 ) -> None:
     """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
-    from seaopt.cli.exported import exported
+    from seaopt.cli.export import export_controller
 
     options = {"current_limit_A": current_limit, "tracking_time_s": tracking_time, "allow_infeasible": allow_infeasible}
-    if not exported(results, c, json, precision=precision, name=name, **options):
+    if not export_controller(results, c, json, precision=precision, name=name, **options):
         raise typer.Exit(1)
 
 

@@ -30,7 +30,7 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def made_from(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
+def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
     """Return digests of what a stage reads: of the problem, and of the results before it in the folder, by file.
 
     Parameters
@@ -43,7 +43,7 @@ def made_from(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
         Where the results are; what is not there has no digest.
 
     """
-    read, earlier = _READ[stage]
+    read, earlier = _READ_BY_STAGE[stage]
     out = {"problem": hashlib.sha256(json.dumps(read(problem), sort_keys=True).encode()).hexdigest()}
     for before in earlier:
         path = folder / FILES[before]
@@ -52,25 +52,25 @@ def made_from(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
     return out
 
 
-def _fitted(problem: Problem) -> dict[str, Any]:
+def _read_by_fit(problem: Problem) -> dict[str, Any]:
     """Return what a fit reads: experiments, their plants and these plants' parameters."""
     table = problem.table.model_dump(mode="json", include={"experiment", "fit", "plant", "parameters"})
-    plants = {item.plant for item in problem.table.experiment}
+    plants = {experiment.plant for experiment in problem.table.experiment}
     names = {name for plant in plants for name in problem.plants[plant].parameters}.union(problem.parameters.free_names)
-    table["plant"] = {name: item for name, item in table["plant"].items() if name in plants}
-    table["parameters"] = {name: item for name, item in table["parameters"].items() if name in names}
+    table["plant"] = {name: plant for name, plant in table["plant"].items() if name in plants}
+    table["parameters"] = {name: value for name, value in table["parameters"].items() if name in names}
     return table
 
 
-def _tuned(problem: Problem) -> dict[str, Any]:
-    return _designed(problem, problem.robustness.retune)
+def _read_by_tune(problem: Problem) -> dict[str, Any]:
+    return _read_by_design(problem, problem.robustness.retune)
 
 
-def _swept(problem: Problem) -> dict[str, Any]:
-    return _designed(problem, 0)
+def _read_by_sweep(problem: Problem) -> dict[str, Any]:
+    return _read_by_design(problem, 0)
 
 
-def _designed(problem: Problem, retune: int) -> dict[str, Any]:
+def _read_by_design(problem: Problem, retune: int) -> dict[str, Any]:
     """Return what a design reads: [controller], its plants and values; of [robustness] what has a part in tuning."""
     asked, robustness = _controller(problem), problem.robustness
     ranges = bool(asked.robust_to or asked.draws or retune)
@@ -90,12 +90,12 @@ def _designed(problem: Problem, retune: int) -> dict[str, Any]:
     return out
 
 
-def _certified(problem: Problem) -> dict[str, Any]:
+def _read_by_certify(problem: Problem) -> dict[str, Any]:
     """Return what a certificate reads besides the controller: plants, parameters, and [robustness] but for tuning's."""
     table, plants = problem.table.model_dump(mode="json"), problem.certified_plants()
     robustness = problem.robustness.model_dump(mode="json", exclude={"retune"})
-    own = {"parameters": table["parameters"], "plant": {name: table["plant"][name] for name in plants}}
-    return own | {"robustness": robustness, "design": _controller(problem).plant}
+    sources = {"parameters": table["parameters"], "plant": {name: table["plant"][name] for name in plants}}
+    return sources | {"robustness": robustness, "design": _controller(problem).plant}
 
 
 def _controller(problem: Problem) -> ControllerTable:
@@ -103,10 +103,10 @@ def _controller(problem: Problem) -> ControllerTable:
     return problem.table.controller
 
 
-_READ: dict[str, tuple[Callable[[Problem], dict[str, Any]], tuple[str, ...]]] = {
-    "fit": (_fitted, ()),
-    "frf": (_fitted, ()),
-    "tune": (_tuned, ("fit",)),
-    "sweep": (_swept, ("fit",)),
-    "certify": (_certified, ("fit", "tune")),
+_READ_BY_STAGE: dict[str, tuple[Callable[[Problem], dict[str, Any]], tuple[str, ...]]] = {
+    "fit": (_read_by_fit, ()),
+    "frf": (_read_by_fit, ()),
+    "tune": (_read_by_tune, ("fit",)),
+    "sweep": (_read_by_sweep, ("fit",)),
+    "certify": (_read_by_certify, ("fit", "tune")),
 }

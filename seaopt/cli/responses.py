@@ -8,20 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.fit_result import Nuisance
+from seaopt.formatting import MISSING, format_number, format_table
 from seaopt.frequency import DriveEstimate, Pair, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
 from seaopt.records import record
 from seaopt.reporting import experiment_survey, write_frequency_figure
 
-HEAD = ("experiment", "response", "coherent", "peak", "gain", "natural", "damping", "2nd order", "file")
+TITLES = ("experiment", "response", "coherent", "peak", "gain", "natural", "damping", "2nd order", "file")
 
-NOTE = (
+RESPONSES_NOTE = (
     "coherent: band of coherence above 0.8, peak and natural frequency in Hz; gain, natural and damping: of the "
     "second-order fit; 2nd order, file, fit: how far the second-order fit and the model with the file's and the fitted "
     "values lie from H1, in its standard deviations"
@@ -33,70 +33,70 @@ class Responses:
     """Surveys of the experiments under the file's values and, where DIR has a fit, under its own."""
 
     surveys: Mapping[str, Survey]
-    given: ParameterSet
+    guess: ParameterSet
     fitted: Mapping[str, tuple[Survey, Fit]]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of frf.json, without its schema."""
         content: dict[str, Any] = {}
-        for name, found in self.surveys.items():
-            content[name] = found.to_dict(self.given)
-            for row, pair in zip(content[name]["pairs"], found.pairs, strict=True):
+        for name, survey in self.surveys.items():
+            content[name] = survey.to_dict(self.guess)
+            for row, pair in zip(content[name]["pairs"], survey.pairs, strict=True):
                 row["fitted_misfit"] = self._fitted_misfit(name, pair)
         return {"experiments": content}
 
     def draw(self, path: Path) -> list[Path]:
         """Write the figure as SVG and PNG."""
-        return write_frequency_figure(self.surveys, path, given=self.given, fitted=self.fitted)
+        return write_frequency_figure(self.surveys, path, given=self.guess, fitted=self.fitted)
 
     def verdict(self) -> list[tuple[bool, str]]:
-        """Return one line an experiment: whether every response is coherent enough for a second-order fit."""
+        """Return one line per experiment: whether every response is coherent enough for a second-order fit."""
         lines: list[tuple[bool, str]] = []
-        for name, found in self.surveys.items():
-            poor = [pair.name for pair in found.pairs if pair.second_order is None]
+        for name, survey in self.surveys.items():
+            poor = [pair.name for pair in survey.pairs if pair.second_order is None]
             what = f"too little coherence in {', '.join(poor)}; excite more" if poor else "every response is coherent"
             lines.append((not poor, f"{name}: {what}"))
         return lines
 
     def show(self, console: Console) -> None:
-        """Print a row a response, and what those of the form (16) say of the actuator."""
-        table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
-        titles = (*HEAD, "fit") if self.fitted else HEAD
-        for number, title in enumerate(titles):
-            table.add_column(title, justify="left" if number < 2 else "right", no_wrap=True)
-        for name, found in self.surveys.items():
-            for pair in found.pairs:
-                table.add_row(name, *self._cells(name, found, pair))
-        console.print(table)
-        console.print(NOTE, style="dim", highlight=False, markup=False)
-        for name, found in self.surveys.items():
-            for pair in found.pairs:
-                drive = found.drive(pair, self.given)
+        """Print a row per response, and what those of the form (16) say of the actuator."""
+        titles = (*TITLES, "fit") if self.fitted else TITLES
+        rows = [
+            (name, *self._format_cells(name, survey, pair))
+            for name, survey in self.surveys.items()
+            for pair in survey.pairs
+        ]
+        for line in format_table(rows, titles, "<<" + ">" * len(titles)):
+            console.print(line, highlight=False, markup=False)
+        console.print(RESPONSES_NOTE, style="dim", highlight=False, markup=False)
+        for name, survey in self.surveys.items():
+            for pair in survey.pairs:
+                drive = survey.drive(pair, self.guess)
                 if drive is not None:
-                    console.print(f"{name}: {_reading(pair, drive)}", highlight=False, markup=False)
+                    console.print(f"{name}: {_describe_drive(pair, drive)}", highlight=False, markup=False)
 
-    def _cells(self, name: str, found: Survey, pair: Pair) -> list[str]:
+    def _format_cells(self, name: str, survey: Survey, pair: Pair) -> list[str]:
         band, peak, form = pair.good_band_hz, pair.peak, pair.second_order
         figures = (form.static_gain, form.natural_frequency_hz, form.damping_ratio) if form is not None else ()
-        misfits = [form.misfit if form is not None else None, pair.misfit(found.model(pair, self.given))]
+        misfits = [form.misfit if form is not None else None, pair.misfit(survey.model(pair, self.guess))]
         misfits += [self._fitted_misfit(name, pair)] if self.fitted else []
         return [
             pair.name,
             f"{band[0]:.2g}–{band[1]:.3g}" if band is not None else "none",
-            f"{peak.frequency_hz:.3g}" if peak is not None else "–",
-            *(f"{item.value:.3g}" for item in figures),
-            *(["–"] * (3 - len(figures))),
-            *(f"{item:.3g}" if item is not None else "–" for item in misfits),
+            format_number(None if peak is None else peak.frequency_hz, 3),
+            *(format_number(figure.value, 3) for figure in figures),
+            *([MISSING] * (3 - len(figures))),
+            *(format_number(misfit, 3) for misfit in misfits),
         ]
 
     def _fitted_misfit(self, name: str, pair: Pair) -> float | None:
         if name not in self.fitted:
             return None
-        own, fit = self.fitted[name]
-        return pair.misfit(own.model(pair, fit.parameters))
+        survey, fit = self.fitted[name]
+        return pair.misfit(survey.model(pair, fit.parameters))
 
 
-def responses(
+def estimate_responses(
     experiments: tuple[Experiment, ...], problem: Problem, fit: Fit | None, stretch_s: float | None
 ) -> Responses:
     """Estimate the frequency responses of every experiment.
@@ -113,18 +113,18 @@ def responses(
         try:
             surveys[experiment.name] = experiment_survey(experiment, stretch_s=stretch_s)
             if fit is not None and experiment.name in fit.nuisance:
-                fitted[experiment.name] = (_under(surveys[experiment.name], fit.nuisance[experiment.name]), fit)
+                fitted[experiment.name] = (_adopt_fit(surveys[experiment.name], fit.nuisance[experiment.name]), fit)
         except LogError as error:
             raise LogError(f"{problem.source}: experiment {experiment.name}: {error}") from error
-    return Responses(surveys=surveys, given=problem.parameters, fitted=fitted)
+    return Responses(surveys=surveys, guess=problem.parameters, fitted=fitted)
 
 
-def _under(found: Survey, own: Nuisance) -> Survey:
+def _adopt_fit(survey: Survey, nuisance: Nuisance) -> Survey:
     """Return a survey whose models have a fit's delay and gains."""
-    return replace(found, clock=replace(found.clock, delay_s=own.delay_s, delay_free=False), gain=own.gain)
+    return replace(survey, clock=replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False), gain=nuisance.gain)
 
 
-def _reading(pair: Pair, drive: DriveEstimate) -> str:
+def _describe_drive(pair: Pair, drive: DriveEstimate) -> str:
     form = pair.second_order
     assert form is not None
     return (

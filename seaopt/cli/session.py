@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from seaopt.cli.frontier import print_frontier
-from seaopt.cli.provenance import FILES, made_from
-from seaopt.cli.responses import responses
+from seaopt.cli.provenance import FILES, digest_sources
+from seaopt.cli.responses import estimate_responses
 from seaopt.control import Controller, sweep, tune
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, fit, warn_unidentified
@@ -74,7 +74,7 @@ class Session:
         self._warned: set[str] = set()
         self._console = Console(stderr=True)
 
-    def planned(self) -> list[str]:
+    def plan_stages(self) -> list[str]:
         """Return the stages that the problem has what it takes for."""
         stages = ["fit"] if self.problem.table.experiment else []
         if self.problem.spec is not None:
@@ -83,7 +83,7 @@ class Session:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them")
         return [*stages, "report"]
 
-    def left_out(self, stages: list[str]) -> list[str]:
+    def explain_left_out(self, stages: list[str]) -> list[str]:
         """Return what the file, or the fit, gives reason to expect of a whole run and does not get, and why."""
         source, table = self.problem.source, self.problem.table
         if table.robustness is not None and table.controller is None:
@@ -96,15 +96,15 @@ class Session:
         """Write one line on stderr."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def designable(self) -> bool:
+    def can_design(self) -> bool:
         """Tell whether the fit of this run can be designed with: it converged, or there was none."""
-        found = self.results.get("fit")
-        return found is None or (found.status in ("converged", "not_identifiable") and self._covered(found))
+        fitted: Fit | None = self.results.get("fit")
+        return fitted is None or (fitted.status in ("converged", "not_identifiable") and self._covers(fitted))
 
-    def _covered(self, found: Fit) -> bool:
+    def _covers(self, fitted: Fit) -> bool:
         """Tell whether what the fit leaves open has a range in the problem."""
-        names = found.covariance.names
-        return all(np.isfinite(found.covariance.std(name)) or name in self.problem.ranges for name in names)
+        names = fitted.covariance.names
+        return all(np.isfinite(fitted.covariance.std(name)) or name in self.problem.ranges for name in names)
 
     def run(self, stage: str) -> None:
         """Run one stage and write its result."""
@@ -150,10 +150,10 @@ class Session:
 
     def values(self) -> ParameterSet:
         """Return the parameter values to design with, the file's for what the fit does not have."""
-        found = self.parameters()
-        if isinstance(found, ParameterSet):
-            return found
-        return self.problem.parameters.with_parameters(*found.parameters.values())
+        source = self.parameters()
+        if isinstance(source, ParameterSet):
+            return source
+        return self.problem.parameters.with_parameters(*source.parameters.values())
 
     def _design_values(self, *plants: Plant) -> ParameterSet:
         """Return the values to design with; those that the fit cannot tell, of these plants, are named on stderr."""
@@ -173,7 +173,9 @@ class Session:
     def _write(self, stage: str, content: dict[str, Any]) -> None:
         """Write a result with the digest of what it was made from."""
         self.written.append(
-            write_json(self.folder / FILES[stage], content | {"made_from": made_from(self.problem, stage, self.folder)})
+            write_json(
+                self.folder / FILES[stage], content | {"made_from": digest_sources(self.problem, stage, self.folder)}
+            )
         )
 
     def _read(self, stage: str) -> dict[str, Any]:
@@ -185,7 +187,7 @@ class Session:
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
         content = read_json(path, SCHEMAS[stage])
-        expected = made_from(self.problem, stage, self.folder)
+        expected = digest_sources(self.problem, stage, self.folder)
         if content.get("made_from", expected) != expected:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
         return content
@@ -197,13 +199,13 @@ class Session:
         for experiment, table in zip(self.experiments(), self.problem.table.experiment, strict=True):
             name = experiment.name
             tell(name)
-            runs[name] = self._simulated(experiment)
+            runs[name] = self._simulate_stretches(experiment)
             self.written.append(write_log(runs[name], self.folder / f"simulation_{name}.csv"))
             if table.virtual is not None:
                 self.written.append(write_log(experiment.log, self.folder / f"virtual_{name}.csv"))
         self.results["simulate"] = runs
 
-    def _simulated(self, experiment: Experiment) -> Log:
+    def _simulate_stretches(self, experiment: Experiment) -> Log:
         """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated)."""
         delay, start = experiment.delay_s, experiment.initial_state
         options: dict[str, Any] = {
@@ -240,15 +242,15 @@ class Session:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; add one")
         experiments = self.experiments()
-        fitted = self._present_fit()
-        found = responses(experiments, self.problem, fitted, self.stretch_s)
-        tell(", ".join(found.surveys))
-        self.results["frf"] = found
-        self._write("frf", {"schema": SCHEMAS["frf"], **found.to_dict()})
-        self.written += found.draw(self.folder / "frf")
+        fitted = self._read_fit_if_any()
+        responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s)
+        tell(", ".join(responses.surveys))
+        self.results["frf"] = responses
+        self._write("frf", {"schema": SCHEMAS["frf"], **responses.to_dict()})
+        self.written += responses.draw(self.folder / "frf")
 
-    def _present_fit(self) -> Fit | None:
-        """Return the folder's fit; None where there is none, or with a word where it was made from something else."""
+    def _read_fit_if_any(self) -> Fit | None:
+        """Return the folder's fit; None where there is none, or (noted on stderr) it was made from something else."""
         if not (self.folder / FILES["fit"]).exists():
             return None
         try:
@@ -318,10 +320,10 @@ class Session:
     def _report(self, tell: Callable[[str], None]) -> None:
         results: list[Any] = []
         if self.problem.table.experiment:
-            found = self.parameters()
-            if isinstance(found, Fit) and not found.experiments:
-                self.results["fit"] = found = replace(found, experiments=self.experiments())
-            results.append(found)
+            fitted = self.parameters()
+            if isinstance(fitted, Fit) and not fitted.experiments:
+                self.results["fit"] = fitted = replace(fitted, experiments=self.experiments())
+            results.append(fitted)
         if self.problem.spec is not None and ("tune" in self.results or (self.folder / FILES["tune"]).exists()):
             results.append(self.controller())
             if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
@@ -335,7 +337,7 @@ class Session:
         def drawing(name: str, place: int, count: int) -> None:
             note = f"figure {place} of {count}, {name}"
             tell(note)
-            if not self._console.is_terminal:  # where a stage else is silent until it is done
+            if not self._console.is_terminal:  # where a stage is silent otherwise until it is done
                 self.say(f"{LABELS['report']}: {note}")
 
         page = write_report(results, self.folder / "report.html", title=self.problem.title, progress=drawing)
@@ -349,15 +351,15 @@ class Session:
         return all(good for stage in shown for good, _ in self._verdict(stage))
 
     def _verdict(self, stage: str) -> list[tuple[bool, str]]:
-        found = self.results.get(stage)
+        result = self.results.get(stage)
         if stage == "frf":
-            return found.verdict() if found is not None else []
+            return result.verdict() if result is not None else []
         joint = self.results.get("joint") if stage == "tune" else None
         tuned = [(joint.status == "certified", f"Joint tuning: {joint.summary}")] if joint is not None else []
         return tuned + verdict(
-            found if stage == "fit" else None,
-            found if stage == "tune" else None,
-            found if stage == "certify" else None,
+            result if stage == "fit" else None,
+            result if stage == "tune" else None,
+            result if stage == "certify" else None,
         )
 
     def show(self, as_json: bool, stages: list[str]) -> None:
@@ -370,7 +372,7 @@ class Session:
         console = Console(soft_wrap=True)
         for stage in stages:
             if stage == "simulate":
-                for line in SIMULATED[: 2 if any(item.virtual for item in self.problem.table.experiment) else 1]:
+                for line in SIMULATED[: 2 if any(table.virtual for table in self.problem.table.experiment) else 1]:
                     console.print(line, highlight=False, markup=False)
             elif stage == "frf":
                 self.results[stage].show(console)
@@ -390,9 +392,8 @@ class Session:
             console.print("wrote " + ", ".join(str(path) for path in self.written), highlight=False, markup=False)
 
     def _json(self, stage: str) -> dict[str, Any]:
-        found = self.results[stage]
         if stage == "simulate":
             return {"schema": "seaopt/simulation/1", "files": [str(path) for path in self.written]}
         if stage == "report":
-            return {"schema": "seaopt/report/1", "file": str(found)}
+            return {"schema": "seaopt/report/1", "file": str(self.results[stage])}
         return json.loads((self.folder / FILES[stage]).read_text(encoding="utf-8"))

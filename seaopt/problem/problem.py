@@ -79,7 +79,7 @@ class Problem:
         """Keyword arguments for `seaopt.fit`."""
         table: FitTable = self.table.fit
         return {
-            "method": _method(table),
+            "method": _make_method(table),
             "loss": {"linear": Squares(), "huber": Huber(), "soft_l1": SoftL1()}[table.loss],
             "band_hz": table.band_hz,
             "holdout": table.holdout,
@@ -106,7 +106,7 @@ class Problem:
     @property
     def sensors(self) -> Sensors:
         """What the certificate's simulations read the measured output with."""
-        return _sensors(self.robustness.sensors)
+        return _make_sensors(self.robustness.sensors)
 
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name."""
@@ -117,7 +117,7 @@ class Problem:
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
 
     def remarks(self, parameters: ParameterSet) -> list[str]:
-        """Return what is worth a word about the ranges before certifying at nominal parameters."""
+        """Return remarks on ranges that are valid but may not be meant, at nominal parameters."""
         return range_remarks(self.ranges, self.certified_plants(), parameters)
 
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
@@ -148,35 +148,35 @@ class Problem:
             A log cannot be read, or does not fit its plant.
 
         """
-        found: list[Experiment] = []
+        experiments: list[Experiment] = []
         for table in self.table.experiment:
             try:
-                found.append(self._experiment(table))
+                experiments.append(self._make_experiment(table))
             except SeaoptError as error:
                 text = str(error)
                 named = text if f"experiment {table.name}" in text else f"experiment {table.name}: {text}"
                 raise type(error)(f"{self.source}: {named}") from error
-        return tuple(found)
+        return tuple(experiments)
 
-    def _experiment(self, table: ExperimentTable) -> Experiment:
+    def _make_experiment(self, table: ExperimentTable) -> Experiment:
         plant = self.plants[table.plant]
-        log = self._virtual(plant, table.virtual) if table.virtual else self._read(table)
+        log = self._simulate_bench(plant, table.virtual) if table.virtual else self._read_log(table)
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
-        log = _on_its_clock(log, table).decimate(table.decimate)
+        log = _resample(log, table).decimate(table.decimate)
         sigma = dict(table.sigma)
-        for name, item in table.outputs.items():
-            if isinstance(item, ColumnTable) and item.sigma is not None:
-                sigma[name] = item.sigma
+        for name, column in table.outputs.items():
+            if isinstance(column, ColumnTable) and column.sigma is not None:
+                sigma[name] = column.sigma
         measured = tuple(table.outputs) if not table.virtual else _virtual_outputs(plant, table.virtual)
         return Experiment(
             plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
-            offset=table.offset, gain={name: _unknown(name, "-", item) for name, item in table.gain.items()},
-            delay_s=_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
+            offset=table.offset, gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
+            delay_s=_make_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
             drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask,
         )  # fmt: skip
 
-    def _read(self, table: ExperimentTable) -> Log:
+    def _read_log(self, table: ExperimentTable) -> Log:
         return read_log(
             [self.folder / name for name in list_log_files(table)],
             time=None if table.time is None else make_column(table.time, self.folder),
@@ -186,7 +186,7 @@ class Problem:
             counter=None if table.counter is None else Counter(**table.counter.model_dump()),
         )
 
-    def _virtual(self, plant: Plant, table: VirtualTable) -> Log:
+    def _simulate_bench(self, plant: Plant, table: VirtualTable) -> Log:
         parts: list[Chirp | Noise | Multisine] = []
         if table.excitation.chirp:
             parts.append(Chirp(**table.excitation.chirp.model_dump()))
@@ -203,21 +203,21 @@ class Problem:
             truth[name] = replace(truth[name], value=value)
         return virtual_log(
             plant, ParameterSet(truth.values()), excitation, duration_s=table.duration_s, rate_hz=table.rate_hz,
-            seed=table.seed, sensors=_sensors(table),
+            seed=table.seed, sensors=_make_sensors(table),
         )  # fmt: skip
 
 
-def _on_its_clock(log: Log, table: ExperimentTable) -> Log:
+def _resample(log: Log, table: ExperimentTable) -> Log:
     """Return the log on the uniform clock that the file asks for; as it is, if it asks for none."""
-    asked = table.resample
-    if asked is None:
+    resample = table.resample
+    if resample is None:
         return log
-    if asked == "restamp":
+    if resample == "restamp":
         return log.restamp()
-    return log.resample(rate_hz=asked.rate_hz, rule=make_rule(asked.rule), bridge_s=asked.bridge_s)
+    return log.resample(rate_hz=resample.rate_hz, rule=make_rule(resample.rule), bridge_s=resample.bridge_s)
 
 
-def _method(table: FitTable) -> Method:
+def _make_method(table: FitTable) -> Method:
     if table.segments is not None and table.method != "multiple_shooting":
         raise ProblemError(
             f'[fit] segments = {table.segments} belongs to method = "multiple_shooting", not "{table.method}"; '
@@ -236,17 +236,17 @@ def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
     return noisy or tuple(name for name in ("F1", "F2") if name in plant.outputs) or tuple(plant.outputs)
 
 
-def _sensors(table: SensorsTable) -> Sensors:
+def _make_sensors(table: SensorsTable) -> Sensors:
     return Sensors(**{name: getattr(table, name) for name in SensorsTable.model_fields})
 
 
-def _unknown(name: str, unit: str, item: float | UnknownTable) -> float | Parameter:
-    if not isinstance(item, UnknownTable):
-        return item
-    free = item.free if item.free is not None else item.prior_std is not None
-    known = Parameter(name=name, value=item.value, unit=unit, free=free, prior_std=item.prior_std)
-    low = known.min if item.min is None else item.min
-    return replace(known, min=low, max=known.max if item.max is None else item.max)
+def _make_unknown(name: str, unit: str, table: float | UnknownTable) -> float | Parameter:
+    if not isinstance(table, UnknownTable):
+        return table
+    free = table.free if table.free is not None else table.prior_std is not None
+    known = Parameter(name=name, value=table.value, unit=unit, free=free, prior_std=table.prior_std)
+    low = known.min if table.min is None else table.min
+    return replace(known, min=low, max=known.max if table.max is None else table.max)
 
 
 def demo_path() -> Path:
@@ -276,10 +276,10 @@ def read_problem(path: Path | str) -> Problem:
     source = Path(path)
     table = read_table(source)
     try:
-        plants = {name: _plant(name, item.kind, item.model_extra or {}) for name, item in table.plant.items()}
-        parameters = _parameters(table.parameters, plants)
+        plants = {name: _make_plant(name, plant.kind, plant.model_extra or {}) for name, plant in table.plant.items()}
+        parameters = _make_parameters(table.parameters, plants)
         check_references(table, plants, parameters)
-        spec = _spec(table)
+        spec = _make_spec(table)
     except SeaoptError as error:
         raise type(error)(f"{source}: {error}") from error
     return Problem(
@@ -288,33 +288,34 @@ def read_problem(path: Path | str) -> Problem:
     )  # fmt: skip
 
 
-def _plant(name: str, kind: str, options: Mapping[str, Any]) -> Plant:
+def _make_plant(name: str, kind: str, options: Mapping[str, Any]) -> Plant:
     try:
         return plant_of_kind(kind, **options)
     except SeaoptError as error:
         raise type(error)(f"plant.{name}: {error}") from error
 
 
-def _parameters(given: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:
+def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:
     known = dict(known_parameters())
     for plant in plants.values():
         for name in plant.parameters:
             if name in plant.defaults:
                 known[name] = plant.defaults[name]
             elif name not in known:
-                if name not in given:
+                if name not in tables:
                     raise ProblemError(f"parameters.{name} is missing; plant {plant.name} needs it")
                 known[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
     used = {name for plant in plants.values() for name in plant.parameters}
-    items = {name: known[name] for name in known if name in used or name in given}
-    for name, item in given.items():
+    parameters = {name: known[name] for name in known if name in used or name in tables}
+    for name, value in tables.items():
         if name not in known:
             raise ProblemError(f'parameters: unknown parameter "{name}"; {suggestion(name, known)}')
-        items[name] = _parameter(items[name], item if isinstance(item, ParameterTable) else ParameterTable(value=item))
-    return ParameterSet(items.values())
+        table = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
+        parameters[name] = _make_parameter(parameters[name], table)
+    return ParameterSet(parameters.values())
 
 
-def _parameter(default: Parameter, table: ParameterTable) -> Parameter:
+def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
     from seaopt.units import factor
 
     scale = factor(table.unit, default.unit) if table.unit is not None else 1.0
@@ -325,10 +326,10 @@ def _parameter(default: Parameter, table: ParameterTable) -> Parameter:
     return replace(default, value=table.value * scale, free=free, min=low, max=high, prior_std=prior)
 
 
-def _spec(table: ProblemTable) -> ControllerSpec | None:
+def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    given = table.controller.model_dump(exclude={"plant", "robust_to", "draws", "notch"})
+    fields = table.controller.model_dump(exclude={"plant", "robust_to", "draws", "notch"})
     notch = table.controller.notch
     tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
-    return ControllerSpec(**given, notch=tuned)
+    return ControllerSpec(**fields, notch=tuned)

@@ -1,4 +1,4 @@
-"""What is worth a word about ranges that may stand: an angle past a right one, the screw's mode left out."""
+"""Remarks on ranges that are valid but may not be meant: an angle past a right one, the screw's mode left out."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def range_remarks(
         Its values.
 
     """
-    found: list[str] = []
+    remarks: list[str] = []
     angles = {name for plant in plants.values() for name, unit in plant.states.items() if unit == "rad"}
     for name, (low, high) in ranges.items():
         place = f"robustness.parameters.{name} = [{low:g}, {high:g}]"
         if name == SCREW_MODE and _screw_mode_outside(low, high, plants, nominal):
-            found.append(f"{place} Hz leaves out the nominal mode, so that no draw is like the nominal plant")
+            remarks.append(f"{place} Hz leaves out the nominal mode, so that no draw is like the nominal plant")
         if name in angles and max(-low, high) > 0.5 * math.pi:
             ends = f"{math.degrees(low):.4g} to {math.degrees(high):.4g}"
-            found.append(f"{place} is in rad: {ends} degrees, beyond a right angle; keep it if that is meant")
-    return found
+            remarks.append(f"{place} is in rad: {ends} degrees, beyond a right angle; keep it if that is meant")
+    return remarks
 
 
 def _screw_mode_outside(low: float, high: float, plants: Mapping[str, Plant], nominal: ParameterSet) -> bool:
     """Tell whether the nominal m_n is none of those that put the mode into the range: a higher one needs less mass."""
-    plant = next(item for item in plants.values() if SCREW_MASS in item.parameters)
+    plant = next(plant for plant in plants.values() if SCREW_MASS in plant.parameters)
     ends = (place_value(plant, nominal, SCREW_MODE, end, plants) for end in (low, high))
-    heavy, light = (item[SCREW_MASS].value for item in ends if item is not None)
+    heavy, light = (values[SCREW_MASS].value for values in ends if values is not None)
     return not light <= plant.complete(nominal)[SCREW_MASS].value <= heavy

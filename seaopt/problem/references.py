@@ -13,7 +13,7 @@ from seaopt.problem.schema import ExperimentTable, ProblemTable, SensorsTable
 from seaopt.robustness import check_ranges
 from seaopt.units import unit_after
 
-MOST_DELAY_SAMPLES = 20
+MAX_DELAY_SAMPLES = 20
 
 
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
@@ -25,7 +25,7 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         As said; the message names the key.
 
     """
-    places = [(f"experiment.{item.name}.plant", item.plant) for item in table.experiment]
+    places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
     if table.controller:
         places.append(("controller.plant", table.controller.plant))
         places += [("controller.robust_to", name) for name in table.controller.robust_to]
@@ -33,16 +33,16 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         places += [("robustness.plants", name) for name in table.robustness.plants]
     for place, name in places:
         if name not in plants:
-            raise ProblemError(f'{place} = "{name}" is no [plant] of this file; {suggestion(name, plants)}')
+            raise ProblemError(f'{place} = "{name}" is not a [plant] of this file; {suggestion(name, plants)}')
     _check_measured(table, plants)
     _check_ranges(table, plants, parameters)
     _check_sensors(table, plants)
     seen: set[str] = set()
-    for item in table.experiment:
-        if item.name in seen:
-            raise ProblemError(f'experiment.name = "{item.name}" is used twice; rename one')
-        seen.add(item.name)
-        _check_experiment(item, plants[item.plant])
+    for experiment in table.experiment:
+        if experiment.name in seen:
+            raise ProblemError(f'experiment.name = "{experiment.name}" is used twice; rename one')
+        seen.add(experiment.name)
+        _check_experiment(experiment, plants[experiment.plant])
 
 
 def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
@@ -62,17 +62,17 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 
 
 def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
-    given = table.robustness.sensors if table.robustness else SensorsTable()
+    sensors = table.robustness.sensors if table.robustness else SensorsTable()
     known = {name for plant in plants.values() for name in plant.outputs}
     for kind in SensorsTable.model_fields:
-        for name in getattr(given, kind):
+        for name in getattr(sensors, kind):
             if name not in known:
                 raise ProblemError(f'robustness.sensors.{kind} names "{name}"; {suggestion(name, known)}')
 
 
 def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
-    given = table.robustness.parameters if table.robustness else {}
-    for name, ends in given.items():
+    ranges = table.robustness.parameters if table.robustness else {}
+    for name, ends in ranges.items():
         place = f"robustness.parameters.{name}"
         try:
             check_ranges({name: ends}, plants)
@@ -84,42 +84,42 @@ def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: 
         if name == DELAY and table.controller is not None:
             _check_delay(place, ends[1], table.controller.sample_rate_hz)
     try:
-        check_ranges(given, plants)
+        check_ranges(ranges, plants)
     except SeaoptError as error:
         raise ProblemError(f"robustness.parameters: {error}") from error
 
 
-def _check_own_bounds(place: str, ends: tuple[float, float], item: Parameter) -> None:
-    if ends[0] < item.min or ends[1] > item.max:
+def _check_own_bounds(place: str, ends: tuple[float, float], parameter: Parameter) -> None:
+    if ends[0] < parameter.min or ends[1] > parameter.max:
         raise ProblemError(
-            f"{place}{unit_after(item.unit)} leaves the bounds [{item.min:g}, {item.max:g}] that this file gives "
-            f"{item.name}; keep inside, or change min and max of parameters.{item.name}"
+            f"{place}{unit_after(parameter.unit)} leaves the bounds [{parameter.min:g}, {parameter.max:g}] that this "
+            f"file gives {parameter.name}; keep inside, or change min and max of parameters.{parameter.name}"
         )
 
 
 def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
     """Refuse a delay of many samples: each is a state of every draw's plant, and takes its time."""
-    if longest_s * rate_hz > MOST_DELAY_SAMPLES * (1.0 + 1e-9):
+    if longest_s * rate_hz > MAX_DELAY_SAMPLES * (1.0 + 1e-9):
         raise ProblemError(
             f"{place} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
-            f"takes at most {MOST_DELAY_SAMPLES} ({MOST_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and whole "
+            f"takes at most {MAX_DELAY_SAMPLES} ({MAX_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and whole "
             "samples that are always there belong in controller.delay_samples"
         )
 
 
-def _check_experiment(item: ExperimentTable, plant: Plant) -> None:
-    place = f"experiment.{item.name}"
-    if (item.log is None) == (item.virtual is None):
+def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
+    place = f"experiment.{experiment.name}"
+    if (experiment.log is None) == (experiment.virtual is None):
         raise ProblemError(f"{place}: give either log or virtual, and not both")
-    if item.log is not None:
+    if experiment.log is not None:
         driven = any(name not in plant.optional_inputs for name in plant.inputs)
-        if not item.outputs or (driven and not item.inputs):
+        if not experiment.outputs or (driven and not experiment.inputs):
             raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
-        check_inside(place, item)
-    for kind, given, known in (
-        ("inputs", item.inputs, plant.inputs),
-        ("outputs", item.outputs, plant.outputs),
+        check_inside(place, experiment)
+    for kind, names, known in (
+        ("inputs", experiment.inputs, plant.inputs),
+        ("outputs", experiment.outputs, plant.outputs),
     ):
-        for name in given:
+        for name in names:
             if name not in known:
                 raise ProblemError(f'{place}.{kind} names "{name}"; {suggestion(name, known)}')

@@ -9,7 +9,7 @@ import pytest
 
 import seaopt as so
 from seaopt.cli.main import run
-from seaopt.cli.provenance import made_from
+from seaopt.cli.provenance import digest_sources
 from seaopt.cli.session import Session
 
 BENCH = """
@@ -129,7 +129,9 @@ def test_a_result_counts_what_it_depends_on(write, tmp_path, text, old, new, cha
     assert old in text
     before, after = so.read_problem(write(text)), so.read_problem(write(text.replace(old, new, 1), "after.toml"))
     stages = ("fit", "tune", "certify")
-    moved = [stage for stage in stages if made_from(before, stage, tmp_path) != made_from(after, stage, tmp_path)]
+    moved = [
+        stage for stage in stages if digest_sources(before, stage, tmp_path) != digest_sources(after, stage, tmp_path)
+    ]
     assert moved == changed.split()
 
 

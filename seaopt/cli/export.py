@@ -13,7 +13,7 @@ from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
 
 
-def exported(results: Path, target: Path, json: bool, **options: Any) -> bool:
+def export_controller(results: Path, target: Path, json: bool, **options: Any) -> bool:
     """Write the controller of `results` to `target`, say what was written, and tell whether it is feasible.
 
     Raises
@@ -29,8 +29,8 @@ def exported(results: Path, target: Path, json: bool, **options: Any) -> bool:
     fitted, made_from = results / FILES["fit"], content.get("made_from")
     if made_from is not None and not (isinstance(made_from, dict) and isinstance(made_from.get("problem"), str)):
         raise ProblemError(f"{path}: made_from does not say of which problem file; run seaopt tune again")
-    given = None if made_from is None else made_from.get(fitted.name)
-    if given is not None and fitted.exists() and digest(fitted) != given:
+    expected = None if made_from is None else made_from.get(fitted.name)
+    if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     written = [str(file) for file in export(content, target, **options)]
     if json:
