@@ -18,7 +18,7 @@ from scipy.linalg import expm
 from scipy.optimize import differential_evolution
 
 import seaopt as so
-from seaopt.control import Gains, Loop, current_per_force
+from seaopt.control import Gains, Loop, command_of
 from seaopt.control.laws.structures import Notch
 
 LOWEST_HZ, RATE = 0.1, 2 * np.pi * 0.05
@@ -65,7 +65,7 @@ class Judge:
     def __init__(self, case: Case, controller: so.Controller) -> None:
         spec, self.case = case.spec, case
         self.ts, self.spec = spec.sample_time_s, spec
-        gain = current_per_force(case.plants[0], case.params)
+        gain = command_of(case.plants[0], case.params, "F1").per_effort
         self.held = [self.hold(plant.linearize(case.params), gain) for plant in case.plants]
         nyquist = 0.5 / self.ts
         f = [np.geomspace(1e-3, LOWEST_HZ, 60)[:-1], np.geomspace(LOWEST_HZ, 0.9999 * nyquist, 500)]
@@ -270,7 +270,7 @@ def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float
     started = time.process_time()
     found = so.tune(plant, params, spec)
     tuned_s = time.process_time() - started
-    model, gain = plant.linearize(params), current_per_force(plant, params)
+    model, gain = plant.linearize(params), command_of(plant, params, "F1").per_effort
     row = list(plant.outputs).index(spec.measured)
     given = control.ss(model.A, gain * model.B[:, [0]], model.C[[row]], gain * model.D[[row], :1])
     late = control.tf2ss(*control.pade((0.5 + spec.delay_samples) * spec.sample_time_s, 2))

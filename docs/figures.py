@@ -17,7 +17,7 @@ from seaopt.control import (
     NoiseModel,
     Notch,
     close_loop,
-    current_per_force,
+    command_of,
     estimator,
     force_mpc,
     sample,
@@ -169,7 +169,7 @@ GAINS = Gains(k_p=3.18, k_i=1.31, k_d=0.0328, T_f=1.01e-3, k_ff=1.0)  # 30 Hz on
 def anti_windup() -> None:
     """Step to half again what 9 A can hold, and at 1.5 s to half of it."""
     plant, params = so.plants.high_impedance(), so.plants.thor()
-    gain = current_per_force(plant, params)
+    gain = command_of(plant, params, "F1").per_effort
     a, b, c, _ = sample(plant, params, "F1", gain, 1e-3, 1).delayed()
     pair = GAINS.transfer_functions("pid", 1e-3)
     time = np.arange(4000) * 1e-3
@@ -177,9 +177,7 @@ def anti_windup() -> None:
     axes[1].set_ylabel("current [A]")
     roots = {"(k_ff + k_p)/k_i = 3.2 s": None, "sqrt(T_i T_d) = 0.16 s": 0.158, "none": 1e9}
     for (label, tracking), colour in zip(roots.items(), ("#0072b2", "#d55e00", "#777777"), strict=True):
-        law = realise(
-            *pair, sample_time_s=1e-3, current_per_force_A_per_N=gain, current_limit_A=9.0, tracking_time_s=tracking
-        )
+        law = realise(*pair, sample_time_s=1e-3, per_effort=gain, current_limit_A=9.0, tracking_time_s=tracking)
         x, state, forces, currents = np.zeros(b.size), law.reset(), [], []
         for t in time:
             force = float(c @ x)
@@ -195,7 +193,7 @@ def anti_windup() -> None:
 
 def passivity() -> None:
     plant, params = so.plants.high_impedance(), so.plants.thor()
-    port = port_of(plant, params, "F1", current_per_force(plant, params))
+    port = port_of(plant, params, "F1", command_of(plant, params, "F1").per_effort)
     f = np.geomspace(0.1, 499, 2000)
     _, c_y = GAINS.transfer_functions("pid", 1e-3)
     figure, axes = new(["port impedance", "cosine of its angle"], "|Z| [N s/m]")

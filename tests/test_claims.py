@@ -37,7 +37,7 @@ class Scratch:
     def __init__(self, controller, plant, params):
         model = plant.linearize(params)
         row = list(plant.outputs).index(controller.spec.measured)
-        gain, self.ts = controller.current_per_force_A_per_N, controller.sample_time_s
+        gain, self.ts = controller.command.per_effort, controller.sample_time_s
         self.a, self.b = held(model.A, model.B[:, 0] * gain, self.ts)
         self.c, self.d = model.C[row], model.D[row, 0] * gain
         self.delay, self.law = controller.delay_samples, controller

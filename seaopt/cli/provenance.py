@@ -14,7 +14,7 @@ from typing import Any
 
 from seaopt.problem import Problem
 from seaopt.problem.schema import ControllerTable
-from seaopt.robustness.uncertainty.draws import SCREW_MODE
+from seaopt.robustness.uncertainty.draws import find_modes
 
 FILES = {
     "fit": "fit.json",
@@ -75,7 +75,10 @@ def _read_by_design(problem: Problem, retune: int) -> dict[str, Any]:
     asked, robustness = _controller(problem), problem.robustness
     ranges = bool(asked.robust_to or asked.draws or retune)
     plants = {asked.plant, *asked.robust_to}
-    if retune or (ranges and SCREW_MODE in problem.ranges):  # the first certified plant with the part says how heavy
+    modes = find_modes(problem.certified_plants())
+    if retune or (
+        ranges and not modes.keys().isdisjoint(problem.ranges)
+    ):  # a mode's first plant says what puts it there
         plants |= problem.certified_plants().keys()
     out = problem.table.model_dump(mode="json", include={"controller"})
     out["plant"] = {name: problem.table.plant[name].model_dump(mode="json") for name in sorted(plants)}

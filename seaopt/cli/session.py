@@ -33,7 +33,7 @@ from seaopt.simulation import simulate
 SCHEMAS = {
     "fit": "seaopt/fit/1",
     "frf": "seaopt/frf/1",
-    "tune": "seaopt/controller/1",
+    "tune": "seaopt/controller/2",
     "sweep": "seaopt/frontier/1",
     "certify": "seaopt/robustness/1",
 }

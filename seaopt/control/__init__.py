@@ -1,6 +1,7 @@
 """Loop algebra, controller structures, the tuner, laws that run, the state estimator and predictive control."""
 
 from seaopt.control.deploy.export import export
+from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
@@ -21,13 +22,13 @@ from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.running.sampled_loop import SampledLoop
 from seaopt.control.tuning.corners import corners, draw
 from seaopt.control.tuning.frontier import Frontier, sweep
-from seaopt.control.tuning.tuner import current_per_force, tune
+from seaopt.control.tuning.tuner import tune
 
 __all__ = [
-    "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator", "EstimatorRun",
-    "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "LawState", "Loop", "LoopFigures", "MPCSpec",
-    "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity", "RunnableLaw", "SampledLoop",
-    "TransferFunction", "close_loop", "corners", "current_per_force", "draw", "estimate_noise", "estimator", "export",
+    "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "LawState", "Loop", "LoopFigures",
+    "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity", "RunnableLaw", "SampledLoop",
+    "TransferFunction", "close_loop", "command_of", "corners", "draw", "estimate_noise", "estimator", "export",
     "export_mpc", "force_mpc", "margins", "nu_gap", "passivity", "passivity_rows", "realise", "run_loop", "runnable",
     "sample", "sweep", "tune",
 ]  # fmt: skip

@@ -27,7 +27,8 @@ from seaopt.frequency.second_order import (
 )
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import Plant, SeriesSpring
+from seaopt.plants.plant import evaluate
 from seaopt.records import record
 from seaopt.simulation import Clock, linearised, make_model
 
@@ -137,14 +138,14 @@ class Survey:
 
         None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output.
         """
-        values = self.plant.complete(params)
-        if pair.second_order is None or any(name not in values for name in ("k", "K_tau", "l", "N_p")):
+        values, actuation, spring = self.plant.complete(params), self.plant.actuation, self.plant.spring
+        if pair.second_order is None or actuation is None or spring is None or spring.stiffness is None:
             return None
-        if not _is_form(self.plant, values, pair):
+        if not _is_form(self.plant, spring, values, pair):
             return None
-        k = values["k"]
-        force = values["K_tau"].value * 2 * np.pi * values["N_p"].value / values["l"].value
-        per_input = force * self.gain.get(pair.output, 1.0)
+        k = values[spring.stiffness]
+        lossless = values if actuation.efficiency is None else values.update(**{actuation.efficiency: 1.0})
+        per_input = evaluate(self.plant, actuation.effort, lossless) * self.gain.get(pair.output, 1.0)
         return pair.second_order.drive(k.value, per_input, k_std=k.std or k.prior_std or 0.0)
 
     def to_dict(self, params: ParameterSet) -> dict[str, Any]:
@@ -283,18 +284,17 @@ def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak
     return Peak(frequency_hz=at, magnitude=height, std=float(std[inside[top]]) * height)
 
 
-def _is_form(plant: Plant, values: ParameterSet, pair: Pair) -> bool:
+def _is_form(plant: Plant, spring: SeriesSpring, values: ParameterSet, pair: Pair) -> bool:
     """Tell whether the plant at rest has two poles, no zero from input to output, and b = k/m_k."""
-    derived = plant.derived_values()
-    if len(plant.states) != 2 or "m_k" not in derived:
+    if len(plant.states) != 2 or spring.mass is None or spring.stiffness is None:
         return False
-    point = [parameter.value for parameter in values.values()]
-    m_k: Any = ca.Function("m_k", [plant.p], [derived["m_k"][0]])(point)
     model = linearised(make_model(plant, values, (), (pair.output,)))
     g, _ = model.matrices(np.zeros(0))
     a, b, source = g[:2, :2], g[:2, 2 + list(plant.inputs).index(pair.source)], g[2]
     through = source[2 + list(plant.inputs).index(pair.source)]
-    stiff = values["k"].value / float(m_k)
+    mass, _ = plant.derived_values()[spring.mass]
+    point = [parameter.value for parameter in values.values()]
+    stiff = values[spring.stiffness].value / float(ca.Function("mass", [plant.p], [mass])(point))
     if not np.isclose(np.linalg.det(a), stiff, rtol=1e-6):
         return False
     static = float(source[:2] @ np.linalg.solve(a, b))

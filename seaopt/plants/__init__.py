@@ -6,15 +6,22 @@ from seaopt.plants.modes import Modes, Resonance, modes
 from seaopt.plants.parts import PARTS, wrapped
 from seaopt.plants.plant import Plant, jacobians, state_space
 from seaopt.plants.published import thor
+from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring
 from seaopt.plants.rotary import rotary
 from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
 __all__ = [
     "KINDS",
     "PARTS",
+    "Actuation",
+    "Friction",
+    "Mode",
     "Modes",
     "Plant",
+    "Port",
     "Resonance",
+    "Sensing",
+    "SeriesSpring",
     "export_fmu",
     "high_impedance",
     "jacobians",

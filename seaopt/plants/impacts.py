@@ -18,7 +18,8 @@ screw. H is the second derivative of the plant's declared `energy` by the rates.
 
 A link held at :math:`x_2 = x_c` is the same plant as one held at 0 with q counted from another zero: all that the
 spring knows is :math:`\delta = q + x_2 - x_1`. So a plant without that link takes over with :math:`q + x_2` in
-the place of q.
+the place of q. Which states are the link's, and which coordinate of the drive the spring adds to its motion, by which
+ratio (1 for q, -N for a motor behind a gear), the plant's port says.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ from jaxtyping import Float
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import Plant, output_function
+from seaopt.plants.plant import Plant, evaluate, output_function
+from seaopt.plants.roles import Port
 
 State = Float[np.ndarray, " n"]
-Held = Float[np.ndarray, " m"]
+HeldState = Float[np.ndarray, " m"]
 
 
-def struck(plant: Plant, params: ParameterSet, state: State, output: str, impulse: float) -> State:
+def strike(plant: Plant, params: ParameterSet, state: State, output: str, impulse: float) -> State:
     """Return the state after a blow along an output, a position such as x_2.
 
     Parameters
@@ -66,22 +68,20 @@ def struck(plant: Plant, params: ParameterSet, state: State, output: str, impuls
     --------
     >>> import numpy as np, seaopt as so
     >>> plant = so.plants.two_link("fixed", "mass")
-    >>> after = struck(plant, plant.defaults, np.zeros(4), "x_2", 1.0)
+    >>> after = strike(plant, plant.defaults, np.zeros(4), "x_2", 1.0)
     >>> round(float(after[3]), 5)  # 10 kg and the 0.646 kg that go along, next to nothing of the screw
     0.09394
 
     """
-    inertia, slope = (np.array(item) for item in _inertia(plant, output)(state, plant.parameter_values(params)))
+    inertia, slope = (np.array(block) for block in _inertia(plant, output)(state, plant.parameter_values(params)))
     after = state.copy()
     rates = _pairs(plant)[1]
     after[rates] += np.linalg.solve(inertia, slope.ravel() * impulse)
     return after
 
 
-def caught(
-    plant: Plant, params: ParameterSet, state: State, held: Plant, output: str = "x_2"
-) -> tuple[Held, float, float]:
-    """Return the state of `held` after a link of `plant` is stopped where it is.
+def catch(plant: Plant, params: ParameterSet, state: State, port: Port) -> tuple[HeldState, float, float]:
+    """Return the state of the plant with a port held after its link is stopped where it is.
 
     Parameters
     ----------
@@ -89,15 +89,13 @@ def caught(
         The plant with the moving link; it declares its energy.
     state : array, shape (n,)
         Before the contact.
-    held : Plant
-        The same actuator with that link fixed: its states are those of `plant` but for the link's.
-    output : str
-        The link's position.
+    port : Port
+        Of the link that is caught.
 
     Returns
     -------
     state : array
-        Of `held`, q counted from where the link is held.
+        Of the plant with the port held, the drive's coordinate counted from where the link is held.
     impulse : float
         What stops the link, along its coordinate: N m s of a pendulum, N s of a mass.
     loss : float
@@ -106,14 +104,14 @@ def caught(
     Raises
     ------
     PlantError
-        The two plants are not such a pair.
+        The port does not move, or the plant declares no energy.
 
     """
-    _check_pair(plant, held)
-    inertia = np.array(_inertia(plant, output)(state, plant.parameter_values(params))[0])
+    motion, coordinate, rate = _moving(plant, port)
+    inertia = np.array(_inertia(plant, motion)(state, plant.parameter_values(params))[0])
     places, rates = _pairs(plant)
     names = list(plant.states)
-    (link,) = (k for k, place in enumerate(places) if names[place] not in held.states)
+    link = places.index(names.index(coordinate))
     others = [k for k in range(len(places)) if k != link]
     before, after = state[rates], state[rates].copy()
     after[link] = 0.0
@@ -123,71 +121,73 @@ def caught(
     loss = 0.5 * float(before @ inertia @ before - after @ inertia @ after)
     moved = state.copy()
     moved[rates] = after
-    moved[names.index("q")] += position(plant, params, state, output)
-    return moved[[names.index(name) for name in held.states]], impulse, loss
+    moved += offset(plant, params, state, port)
+    return moved[[k for k, name in enumerate(names) if name not in (coordinate, rate)]], impulse, loss
 
 
-def released(
-    held: Plant, state: Held, plant: Plant, params: ParameterSet, link: Mapping[str, float], output: str = "x_2"
-) -> State:
-    """Return the state of `plant` after its link is let go at the position `link`, as the reverse of `caught`.
+def release(plant: Plant, params: ParameterSet, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
+    """Return the state of a plant after the link at a port is let go at the position `link`, as the reverse of `catch`.
 
     Parameters
     ----------
-    held, state
-        The actuator with the link fixed, and its state.
     plant, params
         The actuator with the link free.
+    port : Port
+        Of the link that is let go.
+    held : array
+        The state of the plant with the port held.
     link : mapping of name to float
         The link's coordinate when it is let go, such as {"phi": 0.3}; zero where left out. Its rate is zero.
-    output : str
-        The link's position.
 
     Raises
     ------
     PlantError
-        The two plants are not such a pair, or `link` names no state.
+        The port does not move, or `link` names no state of its link.
 
     """
-    _check_pair(plant, held)
-    known = dict(zip(held.states, state, strict=True))
+    _, *own = _moving(plant, port)
     for name in link:
-        if name not in plant.states or name in known:
-            raise PlantError(f'link = {{"{name}": ...}} is no state of the link of {plant.name}; '
-                             + suggestion(name, [n for n in plant.states if n not in known]))  # fmt: skip
-    after = np.array([{**link, **known}.get(name, 0.0) for name in plant.states], dtype=float)
-    after[list(plant.states).index("q")] -= position(plant, params, after, output)
-    return after
+        if name not in own:
+            raise PlantError(
+                f'link = {{"{name}": ...}} is not a state of the link of {plant.name}; {suggestion(name, own)}'
+            )
+    rest = iter(held)
+    after = np.array([link.get(name, 0.0) if name in own else next(rest) for name in plant.states], dtype=float)
+    return after - offset(plant, params, after, port)
 
 
-def is_pair(plant: Plant, held: Plant) -> bool:
-    """Tell whether `held` is the actuator of `plant` with a link fixed.
+def offset(plant: Plant, params: ParameterSet, state: State, port: Port) -> State:
+    """Return what a plant's state has to move by for its spring to stay as it is when the port goes to zero."""
+    out = np.zeros(len(plant.states))
+    if port.motion is not None and port.drive is not None:
+        ratio = evaluate(plant, port.ratio, params)
+        out[list(plant.states).index(port.drive)] = ratio * position(plant, params, state, port.motion)
+    return out
 
-    It has the states of `plant` but for one coordinate, other than q, and its rate, and with those at zero the same
-    energy.
+
+def check_held(plant: Plant, held: Plant) -> None:
+    """Refuse a plant that is not another with its first port held, as far as the names of their states tell.
+
+    Raises
+    ------
+    PlantError
+        As said.
+
     """
-    left = [name for name in plant.states if name not in held.states]
-    if plant.energy is None or held.energy is None or "q" not in held.states or len(left) != 2:
-        return False
-    if not set(held.states) < set(plant.states) or not set(held.parameters) <= set(plant.parameters):
-        return False
-    numbers = dict(
-        zip((*held.states, *plant.parameters), np.random.default_rng(0).uniform(0.5, 1.5, 999), strict=False)
-    )
-    energies = [
-        float(ca.Function("energy", [item.x, item.p], [item.stored_energy()])(
-            [numbers.get(name, 0.0) for name in item.states], [numbers[name] for name in item.parameters]
-        ))
-        for item in (plant, held)
-    ]  # fmt: skip
-    return bool(np.isclose(*energies, rtol=1e-9))
-
-
-def _check_pair(plant: Plant, held: Plant) -> None:
-    if not is_pair(plant, held):
+    port = plant.port
+    link = (port.coordinate, port.rate) if port is not None else ()
+    if not link or tuple(held.states) != tuple(name for name in plant.states if name not in link):
         raise PlantError(
             f"{held.name} is not {plant.name} with a link fixed; give two plants with the same drive, spring and parts"
         )
+
+
+def _moving(plant: Plant, port: Port) -> tuple[str, str, str]:
+    if port.motion is None or port.coordinate is None or port.rate is None:
+        raise PlantError(
+            f"the port of {plant.name} does not move, or does not say how; give motion, coordinate and rate"
+        )
+    return port.motion, port.coordinate, port.rate
 
 
 def _pairs(plant: Plant) -> tuple[list[int], list[int]]:

@@ -39,7 +39,9 @@ Around any plant:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -48,6 +50,7 @@ import casadi as ca
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants.plant import Plant
+from seaopt.plants.roles import Port
 from seaopt.records import record
 
 Part = Literal[
@@ -83,7 +86,6 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
 }  # fmt: skip
 INSIDE = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
-FORCES = ("F1", "F2")
 
 
 def parameters(parts: Sequence[str]) -> list[Parameter]:
@@ -181,7 +183,9 @@ _FILTERS = {
 }
 
 
-def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, outputs: Sequence[str] = FORCES) -> Plant:
+def wrapped(
+    plant: Plant, parts: Sequence[str], *, source: str | None = None, outputs: Sequence[str] | None = None
+) -> Plant:
     """Return a plant behind its current loop and delays, read through its load cells; any plant will do.
 
     Parameters
@@ -192,8 +196,8 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
         Of current_loop, load_cell, command_delay and measurement_delay, each once.
     source : str, optional
         The input that passes current loop and command delay; the first if left out.
-    outputs : sequence of str
-        The outputs that pass load cell and measurement delay; those that the plant has.
+    outputs : sequence of str, optional
+        The outputs that pass load cell and measurement delay; those that are regulated if left out.
 
     Raises
     ------
@@ -208,6 +212,8 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
 
     """
     check_parts(parts)
+    if outputs is None:
+        outputs = plant.sensing.regulated if plant.sensing is not None else ()
     for part in parts:
         if part in INSIDE:
             raise PlantError(
@@ -225,9 +231,8 @@ def wrapped(plant: Plant, parts: Sequence[str], *, source: str | None = None, ou
         else:
             signals = [name for name in outputs if name in plant.outputs]
             if not signals:
-                raise PlantError(
-                    f"plant {plant.name} has none of the outputs {', '.join(outputs)} that {part} reads; name others"
-                )
+                listed = f"none of the outputs {', '.join(outputs)}" if outputs else "no regulated output"
+                raise PlantError(f"plant {plant.name} has {listed} that {part} reads; name others")
         plant = _filtered(plant, part, signals)
     return plant
 
@@ -245,7 +250,7 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         """Return inner inputs, inner outputs' replacement, and derivatives of the filters' states."""
         filters = law(p, parameter)
         states = {signal: ca.vertcat(*(getattr(x, name) for name in own[signal])) for signal in signals}
-        inner_u = {name: getattr(u, name) for name in plant.inputs}
+        inner_u = dict(vars(u))
         if where == "input":
             passed = {s: ca.mtimes(filters.c, states[s]) + filters.d * inner_u[s] for s in signals}
             sources, inner_u = dict(inner_u), inner_u | passed
@@ -260,10 +265,15 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
             rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
         return inner_u, dict(out), rates
 
-    def port() -> Plant:
-        inner = plant.port() if plant.port is not None else plant
+    def filtered_as_well(make: Callable[[], Plant]) -> Plant:
+        inner = make()
         known = inner.inputs if where == "input" else inner.outputs
         return _filtered(inner, part, [signal for signal in signals if signal in known])
+
+    def port_behind(port: Port) -> Port:
+        makers = {"held": port.held, "probe": port.probe}
+        behind = {name: partial(filtered_as_well, make) for name, make in makers.items() if make is not None}
+        return replace(port, **behind)
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         inner_u, _, rates = split(t, x, u, p)
@@ -283,5 +293,10 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         derived=plant.derived,
         optional_inputs=plant.optional_inputs,
         energy=plant.energy,
-        port=None if plant.port is None else port,
+        actuation=plant.actuation,
+        sensing=plant.sensing,
+        spring=plant.spring,
+        ports=tuple(port_behind(port) for port in plant.ports),
+        friction=plant.friction,
+        mode=plant.mode,
     )

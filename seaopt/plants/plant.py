@@ -21,12 +21,14 @@ from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
+from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring
 from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
+SLIDING = 1e6  # m/s or rad/s: a speed at which dry friction has its last level
 Matrices = tuple[
     Float[np.ndarray, "nx nx"],
     Float[np.ndarray, "nx nu"],
@@ -56,15 +58,16 @@ class Plant:
     energy : callable ``(x, p) -> expression``, optional
         Kinetic and potential energy, J, of a mechanical plant whose states come as pairs of a coordinate and its rate,
         the coordinate first; states of filters around it may follow.
-    port : callable ``() -> Plant``, optional
-        Makes the same actuator with link 1 held and a mass m_2 on link 2 (states x_2 and v_2, input Fe2), for the
-        impedance that it shows at link 2.
+    actuation, sensing, spring, ports, friction, mode : roles, optional
+        What a controller commands and what effort that makes, what is measured, the elastic element, where the world
+        touches it (the port that is loaded and looked at first), friction by name, and a mode that ranges may name:
+        `seaopt.plants.roles`.
 
     Raises
     ------
     PlantError
         A name is used twice or is not an identifier, a parameter has no unit, an equation is missing or unknown,
-        an output depends on nothing, or a state is never driven.
+        an output depends on nothing, a state is never driven, or a role names what the plant does not have.
 
     Examples
     --------
@@ -94,7 +97,12 @@ class Plant:
     derived: Derived | None = None
     optional_inputs: frozenset[str] = frozenset()
     energy: Energy | None = None
-    port: Callable[[], Any] | None = field(default=None, repr=False)
+    actuation: Actuation | None = field(default=None, repr=False)
+    sensing: Sensing | None = field(default=None, repr=False)
+    spring: SeriesSpring | None = field(default=None, repr=False)
+    ports: tuple[Port, ...] = field(default=(), repr=False)
+    friction: Mapping[str, Friction] = field(default_factory=dict[str, Friction], repr=False)
+    mode: Mode | None = field(default=None, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
     u: Any = field(init=False, repr=False)
@@ -112,12 +120,26 @@ class Plant:
         }
         time = ca.SX.sym("t")
         spaces = [SimpleNamespace(**symbols[key]) for key in "xup"]
+        x, u, p = spaces
+        for name, friction in self.friction.items():
+            setattr(u, name, friction.force(friction.velocity(x, p), p))
         put(self, "t", time)
         for key, named in symbols.items():
             put(self, key, ca.vertcat(*named.values()) if named else ca.SX(0, 1))
         put(self, "dynamics", _stack(self, "f", _called(self, "f", self.f, time, *spaces), self.states))
         put(self, "output", _stack(self, "h", _called(self, "h", self.h, time, *spaces), self.outputs))
         _check_structure(self)
+        _check_roles(self)
+
+    @property
+    def port(self) -> Port | None:
+        """The port that is loaded, struck, held and looked at: the first; None without any."""
+        return self.ports[0] if self.ports else None
+
+    @property
+    def moves(self) -> bool:
+        """Whether a link moves: at some port, the world does not hold the plant."""
+        return any(port.motion is not None for port in self.ports)
 
     @property
     def defaults(self) -> ParameterSet:
@@ -227,6 +249,21 @@ class Plant:
     _repr_html_ = html_text
 
 
+def evaluate(plant: Plant, expression: Expression, params: ParameterSet) -> float:
+    """Return the value of a role's expression of the parameters."""
+    values = plant.complete(params)
+    return float(expression(SimpleNamespace(**{name: parameter.value for name, parameter in values.items()})))
+
+
+def dry_friction_effort(plant: Plant, params: ParameterSet) -> float:
+    """Return the effort at the spring that dry friction takes when everything slides fast."""
+    values = plant.complete(params)
+    p = SimpleNamespace(**{name: parameter.value for name, parameter in values.items()})
+    return sum(
+        abs(float(friction.effort(p)) * float(friction.force(SLIDING, p))) for friction in plant.friction.values()
+    )
+
+
 @memo
 def dynamics_function(plant: Plant) -> Any:
     """Return the CasADi function (x, u, p) -> f at t = 0."""
@@ -250,6 +287,24 @@ def jacobians(plant: Plant) -> Any:
     ]
     blocks = [ca.substitute(block, plant.t, 0.0) for block in blocks]
     return ca.Function("jacobians", [plant.x, plant.u, plant.p], blocks)
+
+
+@memo
+def _deflection_slope(plant: Plant) -> Any:
+    """Return the CasADi function (x, p) -> derivative of the spring's deflection by the states."""
+    assert plant.spring is not None
+    x, p = (
+        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
+        for names, symbols in ((plant.states, plant.x), (plant.parameters, plant.p))
+    )
+    slope = ca.jacobian(ca.SX(plant.spring.deflection(x, p)), plant.x)
+    return ca.Function("deflection", [plant.x, plant.p], [ca.densify(slope)])
+
+
+def deflection_row(plant: Plant, params: ParameterSet) -> Float[np.ndarray, " nx"]:
+    """Return the spring's deflection as a row of weights of the states, at zero."""
+    zero = np.zeros(len(plant.states))
+    return np.array(_deflection_slope(plant)(zero, plant.parameter_values(params))).ravel()
 
 
 def state_space(
@@ -323,7 +378,7 @@ def _check_names(plant: Plant) -> None:
                     f'plant {plant.name}: "{name}" in {group} has no unit; give one, "-" for a pure number'
                 )
     seen: dict[str, str] = {}
-    for group in ("states", "inputs", "parameters"):
+    for group in ("states", "inputs", "parameters", "friction"):
         for name in getattr(plant, group):
             if not name.isidentifier():
                 raise PlantError(f'plant {plant.name}: "{name}" in {group} is not a name; use letters, digits and _')
@@ -342,6 +397,39 @@ def _check_names(plant: Plant) -> None:
     unknown = sorted(plant.optional_inputs - set(plant.inputs))
     if unknown:
         raise PlantError(f"plant {plant.name}: optional input {unknown[0]} is not an input; add it to inputs")
+
+
+def _check_roles(plant: Plant) -> None:
+    """Refuse a role that names what the plant does not have."""
+    signals = {**plant.outputs, **plant.states}
+    named: list[tuple[str, str | None, Mapping[str, Any]]] = []
+    if plant.actuation is not None:
+        named += [("actuation.input", plant.actuation.input, plant.inputs),
+                  ("actuation.efficiency", plant.actuation.efficiency, plant.parameters)]  # fmt: skip
+    if plant.sensing is not None:
+        named += [("sensing.regulated", name, plant.outputs) for name in plant.sensing.regulated]
+        fields = ("motor_position", "motor_speed", "link_position")
+        named += [(f"sensing.{name}", getattr(plant.sensing, name), signals) for name in fields]
+    if plant.spring is not None:
+        named.append(("spring.stiffness", plant.spring.stiffness, plant.parameters))
+        named += [
+            (f"spring.{name}", getattr(plant.spring, name), plant.derived_values()) for name in ("mass", "damping")
+        ]
+    for port in plant.ports:
+        named += [("port.motion", port.motion, plant.outputs), ("port.effort", port.effort, plant.inputs)]
+        fields = ("coordinate", "rate", "drive")
+        named += [(f"port.{name}", getattr(port, name), plant.states) for name in fields]
+        named += [("port.payload", name, plant.parameters) for name in port.payload]
+    if plant.mode is not None:
+        named += [("mode.parameter", plant.mode.parameter, plant.parameters)]
+        named += [("mode.state", plant.mode.state, plant.states)]
+    for role, name, known in named:
+        if name is not None and name not in known:
+            raise PlantError(f'plant {plant.name}: {role} = "{name}" is not one of its own; {suggestion(name, known)}')
+    if plant.actuation is not None and plant.actuation.input != next(iter(plant.inputs)):
+        raise PlantError(
+            f'plant {plant.name}: actuation.input = "{plant.actuation.input}" is not the first input; put it first'
+        )
 
 
 # Units that need no look-up: asking pint costs 0.2 s the first time.

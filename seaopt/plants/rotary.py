@@ -11,6 +11,7 @@ import casadi as ca
 from seaopt.parameters import Parameter
 from seaopt.plants.parts import Part, wrapped
 from seaopt.plants.plant import Plant
+from seaopt.plants.roles import Actuation, Port, Sensing, SeriesSpring
 
 _PARAMETERS = (
     Parameter(name="J_m", value=1e-4, unit="kg m^2", min=1e-15, description="motor inertia"),
@@ -102,5 +103,16 @@ def rotary(parts: Sequence[Part] = ()) -> Plant:
         h=h,
         derived=derived,
         energy=energy,
-    )
-    return wrapped(plant, parts, outputs=("tau_s",))
+        actuation=Actuation(input="I", effort=lambda p: p.N * p.K_tau, unit="N m"),
+        sensing=Sensing(
+            regulated=("tau_s",), motor_position="theta_m", motor_speed="thetad_m", link_position="theta_l"
+        ),
+        spring=SeriesSpring(deflection=lambda x, p: x.theta_m / p.N - x.theta_l, unit="rad", stiffness="k_s"),
+        ports=(
+            Port(
+                motion="theta_l", coordinate="theta_l", rate="thetad_l", payload=("J_l",), drive="theta_m",
+                ratio=lambda p: -p.N,
+            ),
+        ),
+    )  # fmt: skip
+    return wrapped(plant, parts)

@@ -40,6 +40,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -50,8 +51,10 @@ from seaopt.plants import parts as part_laws
 from seaopt.plants.parts import Part
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import ACTUATOR, GRAVITY, link_mass, pendulum
+from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring
 from seaopt.records import record
 
+AT_REST = SimpleNamespace(I=0.0, F_f=0.0)  # inputs and friction
 Drive = Literal["unlumped", "lumped"]
 Spring = Literal["link1", "link2"]
 Link = Literal["fixed", "mass", "pendulum"]
@@ -78,6 +81,11 @@ def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[A
         "natural_frequency_hz": (ca.sqrt(p.k / swinging) / (2 * math.pi), "Hz"),
         "damping_ratio": (b_m / (2 * ca.sqrt(p.k * swinging)), "-"),
     }
+
+
+def effort_per_current(p: Any) -> Any:
+    """Return F_m of one ampere (3), N/A."""
+    return p.eta * (p.K_tau / _drive_figures(p)[0])
 
 
 @record
@@ -121,6 +129,7 @@ class _Motion:
     rates: list[tuple[Any, Any]]
     forces: tuple[Any, Any]
     links: tuple[_LinkModel, _LinkModel]
+    compression: Any
     energy: Any
 
 
@@ -138,7 +147,7 @@ class _Build:
 def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     """Lagrange's equations of the module docstring."""
     links = tuple(_link_model(build.links[i], i + 1, build.suffixes[i], x, p) for i in (0, 1))
-    r, rotary, b_m = _drive_figures(p)
+    _, rotary, b_m = _drive_figures(p)
     unlumped, screw = build.drive == "unlumped", "screw_mode" in build.parts
     moving = [link for link in links if link.coordinate is not None]
     y = ca.vertcat(x.q, *([x.s] if screw else []), *(link.coordinate for link in moving))
@@ -171,7 +180,7 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     # T = yd' H(y) yd / 2, so that H ydd = Q - dV/dy - (dH/dt yd - dT/dy).
     inertia, _ = ca.hessian(kinetic, yd)
     gyroscopic = ca.jtimes(ca.gradient(kinetic, yd), y, yd) - ca.gradient(kinetic, y)
-    motor = p.eta * (p.K_tau / r) * u.I - b_m * x.qd - part_laws.dry_friction(build.parts, x.qd, p)
+    motor = effort_per_current(p) * u.I - b_m * x.qd - u.F_f
     # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
     external = getattr(u, "Fe1", 0.0) * ca.gradient(x_1, y) + getattr(u, "Fe2", 0.0) * ca.gradient(x_2, y)
     damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping for link in moving))
@@ -189,7 +198,7 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     stored = kinetic + potential + part_laws.spring_energy(build.parts, compression, p)
     return _Motion(
         rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]),
-        energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
+        compression=compression, energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
     )  # fmt: skip
 
 
@@ -242,10 +251,12 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         return {name: values[name] for name in outputs}
 
     def energy(x: Any, p: Any) -> Any:
-        return _motion(x, SimpleNamespace(I=0.0), p, build).energy
+        return _motion(x, AT_REST, p, build).energy
 
-    inside = [part for part in build.parts if part in part_laws.INSIDE]
-    held = replace(build, links=("fixed", "mass"), suffixes=("1", "2"), parts=tuple(inside))
+    def deflection(x: Any, p: Any) -> Any:
+        return _motion(x, AT_REST, p, build).compression
+
+    housing_rides = build.drive == "unlumped" and build.spring == "link2"
     plant = Plant(
         name=name,
         states=states,
@@ -254,12 +265,63 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         parameters={item.name: item for item in parameters},
         f=f,
         h=h,
-        derived=lambda p: derived_figures(p, housing_rides=build.drive == "unlumped" and build.spring == "link2"),
+        derived=lambda p: derived_figures(p, housing_rides=housing_rides),
         optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
         energy=energy if part_laws.stores_in_closed_form(build.parts) else None,
-        port=lambda: _actuator(f"port of {name}", held, external=True),
+        actuation=Actuation(input="I", effort=effort_per_current, unit="N", efficiency="eta"),
+        sensing=Sensing(
+            regulated=("F1", "F2"),
+            motor_position="q",
+            motor_speed="qd",
+            link_position="x_2" if "x_2" in outputs else None,
+        ),
+        spring=SeriesSpring(
+            deflection=deflection,
+            unit="m",
+            stiffness="k",
+            mass=None if housing_rides else "m_k",
+            damping=None if housing_rides else "b_m",
+        ),
+        ports=_ports(name, build, external),
+        friction={
+            "F_f": Friction(
+                velocity=lambda x, p: x.qd, force=lambda v, p: part_laws.dry_friction(build.parts, v, p), unit="N"
+            )
+        },
+        mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in build.parts else None,
     )
     return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])
+
+
+def _ports(name: str, build: _Build, external: bool) -> tuple[Port, ...]:
+    """Return the ports at link 2 and, where it moves, at link 1."""
+    inside = tuple(part for part in build.parts if part in part_laws.INSIDE)
+    bare = replace(build, links=("fixed", "mass"), suffixes=("1", "2"), parts=inside)
+    ports: list[Port] = []
+    for number, ratio in ((2, 1.0), (1, -1.0)):  # the spring's compression is q + x_2 - x_1
+        link, suffix = build.links[number - 1], build.suffixes[number - 1]
+        links = (build.links[0], "fixed") if number == 2 else ("fixed", build.links[1])
+        probe = partial(_actuator, f"port of {name}", bare, external=True) if number == 2 else None
+        if link == "fixed":
+            ports += [Port(probe=probe)] if number == 2 else []
+            continue
+        mass = link == "mass"
+        ports.append(
+            Port(
+                motion=f"x_{number}",
+                coordinate=f"x_{number}" if mass else f"phi{suffix}",
+                rate=f"v_{number}" if mass else f"phid{suffix}",
+                effort=f"Fe{number}" if external else None,
+                payload=(f"m_{number}",) if mass else (f"I_p{suffix}", f"m{suffix}"),
+                held=partial(
+                    _actuator, f"{name}, link {number} held", replace(build, links=links, parts=inside), external
+                ),
+                drive="q",
+                ratio=lambda p, ratio=ratio: ratio,
+                probe=probe,
+            )
+        )
+    return tuple(ports)
 
 
 def two_link(

@@ -229,11 +229,12 @@ def _make_method(table: FitTable) -> Method:
 
 
 def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
-    """Return the outputs a virtual experiment measures: as listed, else those with noise, else the forces."""
+    """Return the outputs a virtual experiment measures: as listed, else those with noise, else the regulated ones."""
     if table.outputs:
         return tuple(table.outputs)
     noisy = tuple(name for name in plant.outputs if name in table.noise_std)
-    return noisy or tuple(name for name in ("F1", "F2") if name in plant.outputs) or tuple(plant.outputs)
+    forces = plant.sensing.regulated if plant.sensing is not None else ()
+    return noisy or forces or tuple(plant.outputs)
 
 
 def _make_sensors(table: SensorsTable) -> Sensors:

@@ -115,7 +115,10 @@ def sentence(found: Survey, fit: Fit) -> str:
     odd = [name for name, form, model in zip(names, forms, away, strict=True) if form > FAR * max(model, 1.0)]
     if odd:
         parts.append(f"{_listed(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
-    parts += [_reading(pair, drive, fit) for pair, drive in _drives(found, fit)[:1]]
+    spring = found.plant.spring
+    if spring is not None and spring.mass is not None and spring.damping is not None:
+        derived = fit.derived[spring.mass], fit.derived[spring.damping]
+        parts += [_reading(pair, drive, *derived) for pair, drive in _drives(found, fit)[:1]]
     return "".join(parts).strip()
 
 
@@ -124,9 +127,8 @@ def _drives(found: Survey, fit: Fit) -> list[tuple[Pair, DriveEstimate]]:
     return [(pair, drive) for pair, drive in pairs if drive is not None]
 
 
-def _reading(pair: Pair, drive: DriveEstimate, fit: Fit) -> str:
+def _reading(pair: Pair, drive: DriveEstimate, mass: DerivedFigure, damping: DerivedFigure) -> str:
     """Say what (16) gives for the sprung mass and the damping, and what the fit gives."""
-    mass, damping = fit.derived["m_k"], fit.derived["b_m"]
     words = f"{_gap('m_k', drive.m_k, mass)} and {_gap('b_m', drive.b_m, damping)}"
     averaged = ""
     if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:

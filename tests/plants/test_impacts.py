@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 import seaopt as so
 from seaopt.errors import PlantError
 from seaopt.plants import wrapped
-from seaopt.plants.impacts import caught, is_pair, released, struck
+from seaopt.plants.impacts import catch, check_held, release, strike
 
 spec = importlib.util.spec_from_file_location("mechanics", Path(__file__).with_name("test_mechanics.py"))
 mechanics = importlib.util.module_from_spec(spec)
@@ -91,7 +91,7 @@ def test_a_blow_is_a_strong_short_force(link2, drive, spring):
     plant = so.plants.two_link("fixed", link2, drive=drive, spring=spring)
     params = plant.defaults
     x = moving(link2)
-    after = struck(plant, params, x, "x_2", 0.7)
+    after = strike(plant, params, x, "x_2", 0.7)
     np.testing.assert_allclose(after, braked(plant, params, x, lambda v: 0.7e7, 1e-7), rtol=1e-4, atol=1e-6)
 
 
@@ -100,21 +100,20 @@ def test_a_blow_is_a_strong_short_force(link2, drive, spring):
 @pytest.mark.parametrize("spring", ["link1", "link2"])
 def test_a_catch_is_a_stiff_brake(link2, drive, spring):
     plant = so.plants.two_link("fixed", link2, drive=drive, spring=spring)
-    fixed = so.plants.two_link("fixed", "fixed", drive=drive, spring=spring)
     params = plant.defaults
     x = moving(link2)
     slow = braked(plant, params, x, lambda v: -1e9 * v, 2e-6)
     assert abs(slow[3]) < 1e-4
-    state, _, loss = caught(plant, params, x, fixed)
+    state, _, loss = catch(plant, params, x, plant.port)
     assert state[1] == pytest.approx(slow[1], abs=1e-4)
     kinetic = energy_of(plant, params)(x) - energy_of(plant, params)(np.r_[x[0], state[1], x[2], 0.0])
     assert loss == pytest.approx(kinetic, rel=1e-9)
 
 
-def test_the_unlumped_catch_by_hand(stand, swing, thor):
+def test_the_unlumped_catch_by_hand(swing, thor):
     """The sprung mass's momentum goes into m_l + M; the torque impulse stops I_p and what m_l loses."""
     x = np.array([2e-4, 0.03, 0.3, 2.0])
-    state, impulse, _ = caught(swing, thor, x, stand)
+    state, impulse, _ = catch(swing, thor, x, swing.port)
     big = thor["J"].value / (0.002 / (6 * np.pi)) ** 2
     speed = 0.0725 * np.cos(0.3) * 2.0
     after = 0.03 + 0.646 / (big + 0.646) * speed
@@ -124,30 +123,49 @@ def test_the_unlumped_catch_by_hand(stand, swing, thor):
     assert impulse == pytest.approx(0.646 * 0.0725 * np.cos(0.3) * after - momentum, rel=1e-9)
 
 
-def test_letting_go_keeps_the_spring(stand, swing, thor):
+def test_letting_go_keeps_the_spring(swing, thor):
     held = np.array([1.5e-4, 0.01])
-    x = released(stand, held, swing, thor, {"phi": -0.7})
+    x = release(swing, thor, swing.port, held, {"phi": -0.7})
     assert x[0] + 0.0725 * np.sin(-0.7) == pytest.approx(1.5e-4)
     assert (x[1], x[2], x[3]) == (0.01, -0.7, 0.0)
-    again, impulse, loss = caught(swing, thor, x, stand)
+    again, impulse, loss = catch(swing, thor, x, swing.port)
     np.testing.assert_allclose(again, held)
     assert abs(impulse) < 1e-3  # what m_l moves with q is taken along
     assert loss == pytest.approx(0.0, abs=1e-12)
 
 
-def test_pairs_are_the_same_actuator(stand, swing):
-    assert is_pair(swing, stand)
-    assert not is_pair(stand, swing)
-    assert not is_pair(swing, so.plants.high_impedance(spring="link2"))
-    assert is_pair(wrapped(swing, ["load_cell"]), wrapped(stand, ["load_cell"]))
-    with pytest.raises(PlantError, match="with a link fixed"):
-        caught(swing, so.plants.thor(), np.zeros(4), so.plants.rotary())
+@pytest.mark.parametrize("parts", [(), ("load_cell",), ("stribeck", "screw_mode", "command_delay")])
+@pytest.mark.parametrize("link2", ["pendulum", "mass"])
+@pytest.mark.parametrize("drive", ["unlumped", "lumped"])
+@pytest.mark.parametrize("spring", ["link1", "link2"])
+def test_the_port_makes_the_same_actuator_with_its_link_fixed(link2, drive, spring, parts):
+    plant = so.plants.two_link("fixed", link2, drive=drive, spring=spring, parts=parts)
+    fixed = so.plants.two_link("fixed", "fixed", drive=drive, spring=spring, parts=parts)
+    held, params = plant.port.held(), plant.defaults.with_parameters()
+    assert (held.states, held.inputs, held.outputs) == (fixed.states, fixed.inputs, fixed.outputs)
+    x, u = 1e-3 * np.random.default_rng(4).normal(size=len(held.states)), [0.7, 0.0, 0.0]
+    for plant_of in ("dynamics", "output"):
+        values = [
+            ca.Function("f", [item.x, item.u, item.p], [getattr(item, plant_of)])(x, u, item.parameter_values(params))
+            for item in (held, fixed)
+        ]
+        np.testing.assert_array_equal(*(np.array(item) for item in values))
+
+
+def test_a_held_plant_has_the_states_that_are_left(stand, swing):
+    check_held(swing, stand)
+    check_held(wrapped(swing, ["load_cell"]), wrapped(stand, ["load_cell"]))
+    for plant, held in ((stand, swing), (swing, swing), (swing, so.plants.rotary())):
+        with pytest.raises(PlantError, match="with a link fixed"):
+            check_held(plant, held)
 
 
 def test_bad_blows_and_releases(stand, swing, thor):
     with pytest.raises(PlantError, match="x_3"):
-        struck(swing, thor, np.zeros(4), "x_3", 1.0)
+        strike(swing, thor, np.zeros(4), "x_3", 1.0)
     with pytest.raises(PlantError, match="depends on more than positions"):
-        struck(swing, thor, np.zeros(4), "F2", 1.0)
+        strike(swing, thor, np.zeros(4), "F2", 1.0)
     with pytest.raises(PlantError, match="theta"):
-        released(stand, np.zeros(2), swing, thor, {"theta": 0.1})
+        release(swing, thor, swing.port, np.zeros(2), {"theta": 0.1})
+    with pytest.raises(PlantError, match="does not move"):
+        catch(stand, thor, np.zeros(2), stand.port)

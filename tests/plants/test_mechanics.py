@@ -332,7 +332,7 @@ def test_unknown_parts_are_refused(stand):
     with pytest.raises(PlantError, match='did you mean "backlash"'):
         so.plants.high_impedance(parts=("backlas",))
     with pytest.raises(PlantError, match="none of the outputs"):
-        wrapped(so.plants.rotary(), ["load_cell"])
+        wrapped(so.plants.rotary(), ["load_cell"], outputs=("F1", "F2"))
     with pytest.raises(PlantError, match='no input "V"'):
         wrapped(stand, ["current_loop"], source="V")
 

@@ -166,7 +166,7 @@ def _law(given: Mapping[str, Any], current_limit_A: float | None, tracking_time_
         given["reference"],
         given["measurement"],
         sample_time_s=given["sample_time_s"],
-        current_per_force_A_per_N=given["current_per_force_A_per_N"],
+        per_effort=given["command"].per_effort,
         current_limit_A=given["spec"].current_limit_A if current_limit_A is None else current_limit_A,
         tracking_time_s=tracking_time_s,
     )
@@ -227,7 +227,8 @@ def _numbers(
         "rest_measurement": row(rest[1]),
         "force_limit_N": number(min(law.force_limit_N, largest)),
         "current_limit_A": number(min(law.current_limit_A, largest)),
-        "current_per_force": number(law.current_per_force_A_per_N),
+        "per_effort": number(law.per_effort),
+        "per_effort_unit": given["command"].per_effort_unit,
         "sample_time_s": number(law.sample_time_s),
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [

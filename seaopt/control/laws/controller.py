@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from seaopt.control.laws.command import Command, actuation_notes
 from seaopt.control.laws.limits import Limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.stored import stored
@@ -22,9 +23,8 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 
-SCHEMA = "seaopt/controller/1"
+SCHEMA = "seaopt/controller/2"
 GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
-CURRENT_UNITS = {"k_p_A_per_N": "A/N", "k_i_A_per_Ns": "A/(N s)", "k_d_As_per_N": "A s/N", "k_ff_A_per_N": "A/N"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
@@ -32,7 +32,7 @@ _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 @record(eq=False)
 class Controller:
-    """F_m = C_r F_ref - C_y F_meas, commanded as the current I = current_per_force_A_per_N F_m.
+    """F_m = C_r F_ref - C_y F_meas, commanded as the input of the plant that makes that effort.
 
     Parameters
     ----------
@@ -46,8 +46,8 @@ class Controller:
         Whole samples from measurement to output, besides the hold.
     reference, measurement : TransferFunction
         C_r and C_y.
-    current_per_force_A_per_N : float
-        Of the design plant.
+    command : Command
+        What is commanded for an effort, of the design plant.
     spec : ControllerSpec
         What was asked.
     achieved : LoopFigures
@@ -76,7 +76,7 @@ class Controller:
     delay_samples: int
     reference: TransferFunction
     measurement: TransferFunction
-    current_per_force_A_per_N: float
+    command: Command
     spec: ControllerSpec
     achieved: LoopFigures
     feasible: bool
@@ -109,7 +109,8 @@ class Controller:
             return ()
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
-        return (*warn_unidentified(values, None if self.robust_to else plant.parameters), *self._noise_notes())
+        resting = warn_unidentified(values, None if self.robust_to else plant.parameters)
+        return (*resting, *actuation_notes(plant, self.command), *self._noise_notes())
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
@@ -122,19 +123,21 @@ class Controller:
         )
 
     @property
-    def engineering(self) -> dict[str, float]:
-        """The gains in the units that a drive is set in: A per N of force error, its integral and its rate."""
-        scale = self.current_per_force_A_per_N
-        names = {"k_p": "k_p_A_per_N", "k_i": "k_i_A_per_Ns", "k_d": "k_d_As_per_N", "k_ff": "k_ff_A_per_N"}
-        return {names[name]: scale * value for name, value in self.gains.items() if name in names}
+    def engineering(self) -> dict[str, tuple[float, str]]:
+        """The gains as a drive is set, values and units: the command per force error, its integral and its rate."""
+        unit, effort = self.command.unit, self.command.effort_unit
+        ratio = self.command.per_effort_unit
+        units = {"k_p": ratio, "k_i": f"{unit}/({effort} s)", "k_d": ratio.replace("/", " s/"), "k_ff": ratio}
+        scale = self.command.per_effort
+        return {name: (scale * value, units[name]) for name, value in self.gains.items() if name in units}
 
     def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
-        """Return a plant as this controller sees it: from motor force, through its own current per force."""
+        """Return a plant as this controller sees it: from effort, through its own command per effort."""
         return sample(
             plant,
             params,
             self.spec.measured,
-            self.current_per_force_A_per_N,
+            self.command.per_effort,
             self.sample_time_s,
             self.delay_samples,
         )
@@ -153,10 +156,10 @@ class Controller:
         loop = self.close(*self.design)
         f = np.array([float(frequency_hz)])
         force = np.abs(loop.reference.response(f, self.sample_time_s) * loop.sensitivity(f))[0]
-        return float(self.spec.current_limit_A / self.current_per_force_A_per_N / force)
+        return float(self.spec.current_limit_A / self.command.per_effort / force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of controller.json (schema seaopt/controller/1)."""
+        """Return the content of controller.json (schema seaopt/controller/2)."""
         achieved = {field.name: getattr(self.achieved, field.name) for field in fields(LoopFigures)}
         return {
             "schema": SCHEMA,
@@ -166,12 +169,12 @@ class Controller:
             "delay_samples": self.delay_samples,
             "reference": {"num": self.reference.num, "den": self.reference.den},
             "measurement": {"num": self.measurement.num, "den": self.measurement.den},
-            "current_per_force_A_per_N": self.current_per_force_A_per_N,
+            "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
             "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
             "achieved": {name: value for name, value in achieved.items() if name not in _NOT_ACHIEVED},
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
-            "engineering": self.engineering,
+            "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
             "observer": self._observer_dict(),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
@@ -205,7 +208,7 @@ class Controller:
         """
         given = stored(content)
         law = {name: given[name] for name in ("reference", "measurement")}
-        ts, gain = given["sample_time_s"], given["current_per_force_A_per_N"]
+        ts, gain = given["sample_time_s"], given["command"].per_effort
         sampled = sample(plant, params, given["spec"].measured, gain, ts, given["delay_samples"])
         return cls(**given, achieved=Loop(plant=sampled, **law).figures(), design=(plant, params))
 
@@ -237,7 +240,7 @@ class Controller:
         lines = [
             "  " + ", ".join(f"{name} = {value:.5g} {GAIN_UNITS[name]}" for name, value in law.items()),
             "  as current: " + ", ".join(
-                f"{name.split('_A')[0]} = {value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
+                f"{name} = {value:.5g} {unit}" for name, (value, unit) in self.engineering.items()
             ),
         ]  # fmt: skip
         if self.observer is not None:
@@ -257,9 +260,7 @@ class Controller:
 
     def _repr_html_(self) -> str:
         head, *_ = repr(self).splitlines()
-        current = {
-            name.split("_A")[0]: f"{value:.5g} {CURRENT_UNITS[name]}" for name, value in self.engineering.items()
-        }
+        current = {name: f"{value:.5g} {unit}" for name, (value, unit) in self.engineering.items()}
         gains = [
             (name, f"{value:.5g} {GAIN_UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
             for name, value in self.gains.items()

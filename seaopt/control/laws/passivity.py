@@ -46,7 +46,7 @@ from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.loop import GROWING, Loop
-from seaopt.control.loops.port import Frequencies, Port, Response, held, port_of, sight
+from seaopt.control.loops.port import Frequencies, PortModel, Response, held, port_of, sight
 from seaopt.control.loops.sampled_plant import DigitalPlant, hold
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -177,7 +177,7 @@ def passivity(
         raise ControlError(
             f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
         )
-    port = port_of(plant, params, controller.spec.measured, controller.current_per_force_A_per_N)
+    port = port_of(plant, params, controller.spec.measured, controller.command.per_effort)
     law = controller.measurement
     impedance, angle = _curves(port, law, ts, controller.delay_samples)
     f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
@@ -199,7 +199,7 @@ def passivity(
 
 
 def measure_port(
-    port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
+    port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
 ) -> PortFigures:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, where it is, and whether the held loop is stable."""
     _, angle = _curves(port, law, sample_time_s, delay_samples)
@@ -214,7 +214,7 @@ def passivity_rows(
     plant: Plant,
     params: ParameterSet,
     spec: ControllerSpec,
-    current_per_force_A_per_N: float,
+    per_effort: float,
     basis: Complex[np.ndarray, "m n"],
     f: Frequencies,
 ) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]:
@@ -224,7 +224,7 @@ def passivity_rows(
     ----------
     plant, params, spec
         The actuator, and what is measured, how fast, and how late.
-    current_per_force_A_per_N : float
+    per_effort : float
         Of the controller.
     basis : array, shape (m, n)
         Responses of 1, the integrator, the filtered difference, ... at f, as the controller computes them: delay and
@@ -244,12 +244,12 @@ def passivity_rows(
         is quadratic in the gains.
 
     """
-    port = port_of(plant, params, spec.measured, current_per_force_A_per_N)
+    port = port_of(plant, params, spec.measured, per_effort)
     loop, unit = sight(port, spec.sample_time_s, spec.delay_samples, f)
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 
-def held_stable(port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int) -> bool:
+def held_stable(port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
     a, b, c, d = port.link_held()
     late = np.array([port.delay_s])
@@ -262,7 +262,7 @@ def held_stable(port: Port, law: TransferFunction, sample_time_s: float, delay_s
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 
 
-def _curves(port: Port, law: TransferFunction, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
+def _curves(port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
     def impedance(f: Frequencies) -> Response:
@@ -275,7 +275,7 @@ def _curves(port: Port, law: TransferFunction, sample_time_s: float, delay_sampl
     return impedance, angle
 
 
-def _grid(port: Port, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
+def _grid(port: PortModel, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
     """Return frequencies that resolve the modes of plant and law."""
     roots = np.roots(np.trim_zeros(law.den, "b"))
     poles = np.log(roots.astype(complex)) / sample_time_s
@@ -304,7 +304,7 @@ def _bands(
     return tuple(bands), float(edges[bad[0]]) if bad.size else None
 
 
-def _limit(port: Port, f: Frequencies) -> float | None:
+def _limit(port: PortModel, f: Frequencies) -> float | None:
     def alike(x: Frequencies) -> Frequencies:
         response = port.response(x)
         return np.real(response.motor_to_port * np.conj(response.motor_to_feedback))

@@ -81,8 +81,8 @@ class RunnableLaw:
         T_t; None where nothing integrates.
     sample_time_s : float
         Seconds.
-    current_per_force_A_per_N : float
-        The command is this times F.
+    per_effort : float
+        The command is this times F: A/N or A/(N m).
     current_limit_A : float
         The command's largest magnitude; infinite where there is no limit.
 
@@ -98,13 +98,13 @@ class RunnableLaw:
     integrators: int
     tracking_time_s: float | None
     sample_time_s: float
-    current_per_force_A_per_N: float
+    per_effort: float
     current_limit_A: float
 
     @property
     def force_limit_N(self) -> float:
         """The motor force at the current limit."""
-        return self.current_limit_A / self.current_per_force_A_per_N
+        return self.current_limit_A / self.per_effort
 
     def __repr__(self) -> str:
         tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
@@ -149,7 +149,7 @@ class RunnableLaw:
         x = per_reference * reference - per_measurement * measurement
         if self.integrators:
             force = float(self.c @ x) + self.d_reference * reference - self.d_measurement * measurement
-            x[0] = current_A / self.current_per_force_A_per_N - force
+            x[0] = current_A / self.per_effort - force
         return LawState(x=x, current_A=current_A)
 
     def step(self, state: LawState, reference: float, measurement: float) -> tuple[float, LawState]:
@@ -165,7 +165,7 @@ class RunnableLaw:
             x += self.anti_windup * (applied - force)
         if not (math.isfinite(force) and np.all(np.isfinite(x))):
             return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1)
-        current = applied * self.current_per_force_A_per_N
+        current = applied * self.per_effort
         current = min(max(current, -self.current_limit_A), self.current_limit_A)  # a limit to the last bit
         return current, LawState(x=x, current_A=current)
 
@@ -217,7 +217,7 @@ def runnable(
         controller.reference,
         controller.measurement,
         sample_time_s=controller.sample_time_s,
-        current_per_force_A_per_N=controller.current_per_force_A_per_N,
+        per_effort=controller.command.per_effort,
         current_limit_A=limit,
         tracking_time_s=tracking_time_s,
     )
@@ -228,7 +228,7 @@ def realise(
     measurement: TransferFunction,
     *,
     sample_time_s: float,
-    current_per_force_A_per_N: float = 1.0,
+    per_effort: float = 1.0,
     current_limit_A: float | None = None,
     tracking_time_s: float | None = None,
 ) -> RunnableLaw:
@@ -240,8 +240,8 @@ def realise(
         C_r and C_y, of any order.
     sample_time_s : float
         Seconds.
-    current_per_force_A_per_N : float
-        A/N.
+    per_effort : float
+        The command for one unit of effort: A/N or A/(N m).
     current_limit_A : float, optional
         None: no limit.
     tracking_time_s : float, optional
@@ -256,7 +256,7 @@ def realise(
     """
     for name, value in (
         ("sample_time_s", sample_time_s),
-        ("current_per_force_A_per_N", current_per_force_A_per_N),
+        ("per_effort", per_effort),
         ("current_limit_A", current_limit_A),
         ("tracking_time_s", tracking_time_s),
     ):
@@ -283,7 +283,7 @@ def realise(
         integrators=m,
         tracking_time_s=tracking if m else None,
         sample_time_s=sample_time_s,
-        current_per_force_A_per_N=current_per_force_A_per_N,
+        per_effort=per_effort,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
     )
     _check(law, reference, measurement)

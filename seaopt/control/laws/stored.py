@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal, Notch
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -39,14 +40,11 @@ def stored(content: Mapping[str, Any]) -> dict[str, Any]:
         raise _wrong("sample_time_s", f"is {ts:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}")
     if not isinstance(feasible, bool):
         raise _wrong("feasible", f"is {feasible!r}, neither true nor false")
-    per_force = _number(content, "current_per_force_A_per_N")
-    if not per_force > 0.0:
-        raise _wrong("current_per_force_A_per_N", f"is {per_force:g}, not positive")
     _agree(gains, observer, spec, law)
     largest = None if content.get("largest_bandwidth_hz") is None else _number(content, "largest_bandwidth_hz")
     return {
         "structure": spec.structure, "gains": gains, "sample_time_s": ts, "delay_samples": spec.delay_samples, **law,
-        "current_per_force_A_per_N": per_force, "spec": spec, "feasible": feasible, "robust_to": robust_to,
+        "command": _command(content), "spec": spec, "feasible": feasible, "robust_to": robust_to,
         "active_constraints": _names(content, "active_constraints"), "observer": observer,
         "blocked_by": _names(content, "blocked_by") if "blocked_by" in content else (),
         "largest_bandwidth_hz": largest,
@@ -96,6 +94,18 @@ def _spec(content: Any) -> tuple[ControllerSpec, tuple[str, ...]]:
         return ControllerSpec(**given), robust_to
     except (ControlError, TypeError) as error:
         raise FileError(f"controller.json: spec: {error}; tune again") from error
+
+
+def _command(content: Mapping[str, Any]) -> Command:
+    table = _item(content, "command")
+    texts = {name: _item(table, name, "command.") for name in ("input", "unit", "effort_unit")}
+    for name, value in texts.items():
+        if not isinstance(value, str):
+            raise _wrong(f"command.{name}", f"is {_short(value)}, not text")
+    per_effort = _number(table, "per_effort", "command.")
+    if not per_effort > 0.0:
+        raise _wrong("command.per_effort", f"is {per_effort:g}, not positive")
+    return Command(per_effort=per_effort, **texts)
 
 
 def _gains(content: Any) -> dict[str, float]:

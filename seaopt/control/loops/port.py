@@ -1,4 +1,4 @@
-"""The port at link 2 of an actuator whose link 1 is held, as responses (`seaopt.control.laws.passivity`)."""
+"""The port of an actuator whose other links are held, as responses (`seaopt.control.laws.passivity`)."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ class PortResponse:
 
 
 @record(eq=False)
-class Port:
-    """A linearised plant whose link 2 is moved and whose link 1 is held.
+class PortModel:
+    """A linearised plant whose port is moved, its other links held.
 
     Parameters
     ----------
     a, motor, force
-        x' = a x + motor F_m + force Fe2, shapes (n, n), (n,), (n,).
+        x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,).
     feedback : array, shape (n + 2,)
-        The fed-back force of x, F_m and Fe2.
+        The fed-back force of x, F_m and F_e.
     speed : int
-        Which state is v_2.
+        Which state is the port's speed.
     mass : float
-        m_2, kg, which is taken off again.
+        The inertia on the port (kg or kg m^2), which is taken off again.
     delay_s : float
         Of the motor, besides the controller's.
 
@@ -64,7 +64,7 @@ class Port:
     delay_s: float = 0.0
 
     def response(self, f: Frequencies) -> PortResponse:
-        """Return the responses to motor force and to motion, Fe2 being what that motion takes.
+        """Return the responses to motor force and to motion, F_e being what that motion takes.
 
         They are infinite at an undamped pole, though Z under feedback is not: there they are those just beside it.
         """
@@ -95,7 +95,7 @@ class Port:
     def link_held(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"], float]:
         """Return (a, b, c, d) from motor force to the fed-back one with link 2 at rest, what cannot move left out."""
         n, at = self.motor.size, self.force[self.speed]
-        taken, pulled = -self.a[self.speed] / at, -self.motor[self.speed] / at  # Fe2 of x and of F_m
+        taken, pulled = -self.a[self.speed] / at, -self.motor[self.speed] / at  # F_e of x and of F_m
         a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pulled
         c, d = self.feedback[:n] + self.feedback[n + 1] * taken, self.feedback[n] + self.feedback[n + 1] * pulled
         moving = np.arange(n) != self.speed
@@ -116,8 +116,25 @@ class Port:
         return out
 
 
-def port_of(plant: Plant, params: ParameterSet, measured: str, current_per_force_A_per_N: float) -> Port:
-    """Return a plant's port at link 2, driven by the current for a motor force.
+def probe_of(plant: Plant) -> Plant:
+    """Return the plant that shows what the port is to the world: a bare inertia on it, the other links held.
+
+    Raises
+    ------
+    ControlError
+        The plant states no port, or its port states no probe.
+
+    """
+    if plant.port is None or plant.port.probe is None:
+        raise ControlError(
+            f"plant {plant.name} has no port at link 2; use high_impedance, moving_output or two_link, or give "
+            "ports = (Port(..., probe=...),)"
+        )
+    return plant.port.probe()
+
+
+def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float) -> PortModel:
+    """Return a plant's port, driven by the command for an effort.
 
     Raises
     ------
@@ -125,25 +142,51 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, current_per_force
         The plant has no such port or output.
 
     """
-    if plant.port is None:
-        raise ControlError(f"plant {plant.name} has no port at link 2; use high_impedance, moving_output or two_link")
-    port: Plant = plant.port()
-    if measured not in port.outputs:
+    probe = probe_of(plant)
+    if measured not in probe.outputs:
         raise ControlError(
-            f'measured = "{measured}" is not an output of {port.name}; {suggestion(measured, port.outputs)}'
+            f'measured = "{measured}" is not an output of {probe.name}; {suggestion(measured, probe.outputs)}'
         )
-    a, b, c, d = state_space(port, params)
-    motor, external = (list(port.inputs).index(name) for name in ("I", "Fe2"))
-    row = list(port.outputs).index(measured)
-    return Port(
+    a, b, c, d = state_space(probe, params)
+    port = bare_port(probe)
+    external, row = list(probe.inputs).index(port.effort), list(probe.outputs).index(measured)
+    return PortModel(
         a=a,
-        motor=current_per_force_A_per_N * b[:, motor],
+        motor=per_effort * b[:, 0],
         force=b[:, external].copy(),
-        feedback=np.concatenate([c[row], [current_per_force_A_per_N * d[row, motor], d[row, external]]]),
-        speed=list(port.states).index("v_2"),
-        mass=port.complete(params)["m_2"].value,
+        feedback=np.concatenate([c[row], [per_effort * d[row, 0], d[row, external]]]),
+        speed=list(probe.states).index(port.rate),
+        mass=probe.complete(params)[port.inertia].value,
         delay_s=conditions_of(plant, params).get(DELAY, 0.0),
     )
+
+
+@record
+class BarePort:
+    """The names of a probe's port: the world's effort, the link's coordinate and rate, and its inertia."""
+
+    effort: str
+    coordinate: str
+    rate: str
+    inertia: str
+
+
+def bare_port(probe: Plant) -> BarePort:
+    """Return the names of a probe's port.
+
+    Raises
+    ------
+    ControlError
+        The probe does not state them.
+
+    """
+    port = probe.port
+    if port is None or not (port.effort and port.coordinate and port.rate) or len(port.payload) != 1:
+        raise ControlError(
+            f"the probe {probe.name} does not say what its port is; give it ports = (Port(effort, coordinate, rate, "
+            "motion, payload),), the payload being one inertia"
+        )
+    return BarePort(effort=port.effort, coordinate=port.coordinate, rate=port.rate, inertia=port.payload[0])
 
 
 def held(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:
@@ -151,7 +194,7 @@ def held(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:
     return np.sinc(f * sample_time_s) * np.exp(-2j * np.pi * f * sample_time_s * (0.5 + delay_samples))
 
 
-def sight(port: Port, sample_time_s: float, delay_samples: int, f: Frequencies) -> tuple[Response, Response]:
+def sight(port: PortModel, sample_time_s: float, delay_samples: int, f: Frequencies) -> tuple[Response, Response]:
     """Return G_11 with delay and hold, and G_22/abs(G_22), with which passivity is affine in the gains.
 
     Raises

@@ -105,7 +105,7 @@ def sample(
     Parameters
     ----------
     plant, params
-        The plant; its first input is the motor current. `params` may hold conditions too.
+        The plant; its first input is what the controller commands. `params` may hold conditions too.
     measured : str
         The output that is fed back.
     gain : float
@@ -129,6 +129,21 @@ def sample(
         a=held[0][0], b=held[1][0], c=held[2][0], d=float(held[3][0]), sample_time_s=sample_time_s,
         delay_samples=delay_samples, static_gain=_static(a[0], b[0], c[0], float(d[0])),
     )  # fmt: skip
+
+
+def static_gain(plant: Plant, params: ParameterSet, output: str) -> float:
+    """Return an output of a constant unit of the first input, linearised at rest; infinite where it integrates.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output, or cannot rest where it is to be linearised.
+
+    """
+    values = np.array(plant.parameter_values(params))[:, None]
+    at = {name: np.array([value]) for name, value in conditions_of(plant, params).items()}
+    a, b, c, d = linearised(plant, values, at, output, 1.0)
+    return _static(a[0], b[0], c[0], float(d[0]))
 
 
 def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.plant import deflection_row
 
 
 def disturbances_of(plant: Plant, noise: NoiseModel, sample_time_s: float) -> list[tuple[int, float, float]]:
@@ -44,10 +45,8 @@ def list_estimates(
     for i, (name, unit) in enumerate(plant.states.items()):
         if name not in rows:
             rows[name], units[name] = (np.eye(nx)[i], np.zeros(nu)), unit
-    weights = _deflection(plant, params)
-    if weights:
-        row = np.sum([weight * rows[name][0] for name, weight in weights.items()], axis=0)
-        unit = "m" if "q" in weights else "rad"
+    if plant.spring is not None:
+        row, unit = deflection_row(plant, params), plant.spring.unit
         rows |= {"spring_deflection": (row, np.zeros(nu)), "spring_rate": (row @ a, row @ b)}
         units |= {"spring_deflection": unit, "spring_rate": f"{unit}/s"}
     count = len(disturbances)
@@ -59,13 +58,3 @@ def list_estimates(
             units[f"{name}_drift"] = plant.inputs[name]
     G, H = (np.array([pair[k] for pair in wide.values()]) for k in (0, 1))
     return tuple(wide), tuple(units[name] for name in wide), G, H
-
-
-def _deflection(plant: Plant, params: ParameterSet) -> dict[str, float]:
-    """Return the compression of the spring as weights of outputs and states; empty for a plant not of ours."""
-    if "q" in plant.outputs and "k" in plant.parameters:  # q [+ s] + x_2 - x_1 with either end of the spring
-        signs = {"q": 1.0, "s": 1.0, "x_2": 1.0, "x_1": -1.0}
-        return {name: sign for name, sign in signs.items() if name in plant.outputs or name in plant.states}
-    if {"theta_m", "theta_l"} <= set(plant.outputs) and "N" in plant.parameters:
-        return {"theta_m": 1.0 / plant.complete(params)["N"].value, "theta_l": -1.0}
-    return {}

@@ -31,6 +31,7 @@ from seaopt.formatting import format_count, format_table, html_text
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
+from seaopt.plants.plant import dry_friction_effort
 from seaopt.records import record
 from seaopt.simulation.discretisation import expm_with_derivatives
 from seaopt.simulation.simulate import input_samples
@@ -262,7 +263,7 @@ def estimator(
     Parameters
     ----------
     plant : Plant
-        Linearised at rest at zero; friction f_c must be zero, for dry friction has no linearisation there.
+        Linearised at rest at zero; its dry friction must be zero, for dry friction has no linearisation there.
     params : ParameterSet or Fit
         Its parameters.
     noise : NoiseModel
@@ -328,11 +329,11 @@ def _check(
         raise ControlError(f"sample_time_s = {sample_time_s!r} is not a time; give seconds above zero")
     if isinstance(delay, bool) or not isinstance(delay, int) or delay < 0:
         raise ControlError(f"delay_samples = {delay!r} is not a whole number of samples; give 0, 1, ...")
-    complete = plant.complete(params)
-    if "f_c" in complete and complete["f_c"].value != 0.0:
+    friction = dry_friction_effort(plant, params)
+    if friction != 0.0:
         raise ControlError(
-            f"f_c = {complete['f_c'].value:g}: dry friction at rest has no linear model; set f_c = 0 and let "
-            "input_noise or input_drift stand for it"
+            f"friction of {friction:g}: dry friction at rest has no linear model; set it to zero and let input_noise "
+            "or input_drift stand for it"
         )
     if not isinstance(noise, NoiseModel):
         raise ControlError(f"noise is a {type(noise).__name__}; give a NoiseModel")

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.command import command_of
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -31,7 +32,6 @@ from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
 from seaopt.control.mpc.quadratic_program import make_solver, solve_program
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.control.tuning.tuner import current_per_force
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, html_text
@@ -269,7 +269,7 @@ class ForceMPC:
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
         """Return the loop around a plant while no limit is active; its figures are in newtons of motor force."""
-        scale = current_per_force(*self.design)
+        scale = command_of(*self.design, self.spec.measured).per_effort
         reference, measurement = (TransferFunction(num=law.num / scale, den=law.den) for law in self.unlimited())
         digital = sample(
             plant, params, self.spec.measured, scale, self.spec.sample_time_s, self.spec.delay_samples

@@ -99,7 +99,7 @@ def _law_at_rest(law: RunnableLaw, force: float, current_A: float) -> tuple[Floa
     """Return the law's state and the reference at which it commands a current, unlimited, under a constant force."""
     n = law.c.size
     left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
-    right = np.append(-law.b_measurement * force, current_A / law.current_per_force_A_per_N + law.d_measurement * force)
+    right = np.append(-law.b_measurement * force, current_A / law.per_effort + law.d_measurement * force)
     try:
         rest = np.linalg.solve(left, right)
     except np.linalg.LinAlgError:

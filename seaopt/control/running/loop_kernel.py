@@ -102,7 +102,7 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     law, sensors, name = loop.law, loop.sensors, loop.measured
     limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.current_limit_A) else (0.0, 0.0)
     numbers = [
-        law.d_reference, law.d_measurement, limit, law.current_per_force_A_per_N, sensors.offset.get(name, 0.0),
+        law.d_reference, law.d_measurement, limit, law.per_effort, sensors.offset.get(name, 0.0),
         sensors.saturation.get(name, 0.0), sensors.quantisation.get(name, 0.0), loop.current_step_A,
         most,
     ]  # fmt: skip

@@ -96,7 +96,7 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
     )
 
 
-def check_current(spec: ControllerSpec, k_ff: float, current_per_force: float, friction_N: float) -> None:
+def check_current(spec: ControllerSpec, k_ff: float, per_effort: float, friction: float) -> None:
     """Refuse a current limit that does not hold the step, or does not overcome dry friction.
 
     Raises
@@ -108,12 +108,12 @@ def check_current(spec: ControllerSpec, k_ff: float, current_per_force: float, f
     limit = spec.current_limit_A
     if limit is None:
         return
-    if limit <= current_per_force * friction_N:
+    if limit <= per_effort * friction:
         raise ControlError(
-            f"current_limit_A = {limit:g} makes {limit / current_per_force:.4g} N, no more than the friction f_c = "
-            f"{friction_N:g} N: nothing moves; raise it"
+            f"current_limit_A = {limit:g} makes {limit / per_effort:.4g} N, no more than the friction of "
+            f"{friction:g} N: nothing moves; raise it"
         )
-    held = limit / (current_per_force * abs(k_ff))
+    held = limit / (per_effort * abs(k_ff))
     if spec.step_N is not None and spec.step_N > held:
         raise ControlError(
             f"step_N = {spec.step_N:g} takes {limit * spec.step_N / held:.4g} A at rest, more than current_limit_A = "

@@ -28,7 +28,7 @@ from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.port import Port, sight
+from seaopt.control.loops.port import PortModel, sight
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
 
@@ -95,7 +95,7 @@ class Task:
     names: tuple[str, ...]
     k_ff: float
     nominal: Nominal | None
-    port: Port | None = None
+    port: PortModel | None = None
 
     @property
     def least_rate(self) -> float:

@@ -23,6 +23,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex
 
+from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
@@ -39,6 +40,7 @@ from seaopt.control.tuning.starts import find_starts
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.plant import dry_friction_effort
 
 STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
 STARTS_REFINED = 2  # one more with an observer, all with a notch
@@ -46,27 +48,6 @@ RECHECKS = 3
 BANDWIDTH_RESOLUTION = 0.01  # to which the largest bandwidth is found
 HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more is not looked for elsewhere
 BANDWIDTHS_PROBED = 5  # when the lowest cannot be met
-
-
-def current_per_force(plant: Plant, params: ParameterSet) -> float:
-    """Return r/(eta K_tau) of (2) and (3), A/N; one over the torque constant where the plant has no screw.
-
-    Raises
-    ------
-    ControlError
-        The plant's parameters do not say what force a current makes.
-
-    """
-    complete = plant.complete(params)
-    if all(name in complete for name in ("l", "N_p", "K_tau", "eta")):
-        lead, ratio, torque, eta = complete.values_of(("l", "N_p", "K_tau", "eta"))
-        if torque * eta <= 0.0 or ratio <= 0.0:
-            raise ControlError(f"K_tau = {torque:g}, eta = {eta:g}, N_p = {ratio:g}: all must be positive")
-        return lead / (2 * np.pi * ratio) / (eta * torque)
-    raise ControlError(
-        f"plant {plant.name} has no l, N_p, K_tau, eta that say what force a current makes; "
-        "use a plant with the actuator's parameters"
-    )
 
 
 def tune(
@@ -114,9 +95,8 @@ def tune(
     """
     task = make_task(plant, params, spec, robust_to or {}, draws)
     check_delay(spec, task.plants[0])
-    values = plant.complete(params)
-    friction = values["f_c"].value if "f_c" in values else 0.0
-    check_current(spec, task.k_ff, current_per_force(plant, params), friction)
+    command = command_of(plant, params, spec.measured)
+    check_current(spec, task.k_ff, command.per_effort, dry_friction_effort(plant, params))
     x, loops = solve(task)
     largest = None
     if list_broken(judge_all(spec, loops)):
@@ -139,7 +119,7 @@ def make_task(
         As `tune`.
 
     """
-    gain = current_per_force(plant, params)
+    gain = command_of(plant, params, spec.measured).per_effort
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
     models = {"design plant": (plant, params)}
@@ -301,7 +281,7 @@ def make_controller(
         delay_samples=spec.delay_samples,
         reference=reference,
         measurement=measurement,
-        current_per_force_A_per_N=current_per_force(*design),
+        command=command_of(*design, spec.measured),
         spec=spec,
         achieved=loops[0].figures,
         feasible=not broken,

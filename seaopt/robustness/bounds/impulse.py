@@ -76,7 +76,7 @@ def enclose_plant(
     a, b, c, d = (
         assemble_matrix(block, rows, count, over) for block, rows in zip(blocks, (n, n, outputs, outputs), strict=True)
     )
-    gain = controller.current_per_force_A_per_N
+    gain = controller.command.per_effort
     return _sample(
         a, b[:, :, :1] * gain, c[:, row : row + 1], d[:, row : row + 1, :1] * gain, controller.sample_time_s, delay
     )

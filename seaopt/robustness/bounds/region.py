@@ -14,7 +14,7 @@ from seaopt.control.loops.sampled_plant import DELAY, conditions, conditions_of
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_linear
-from seaopt.robustness.uncertainty.draws import SCREW_MASS, SCREW_MODE, Uncertainty, confidence_radius
+from seaopt.robustness.uncertainty.draws import Uncertainty, confidence_radius
 
 SMALLEST_AXIS = 1e-12  # half axis, as a fraction of the largest relative one, below which nothing is uncertain
 
@@ -136,7 +136,7 @@ class Region:
 def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     """Return the set of what is uncertain of one plant."""
     extra = conditions((plant,))
-    taken = {SCREW_MASS} if SCREW_MODE in unknown.ranges else set[str]()
+    taken = {mode.parameter for mode in unknown.modes.values()}
     gaussian = [k for k, name in enumerate(unknown.names) if name in plant.parameters and name not in taken]
     names = [unknown.names[k] for k in gaussian]
     rows = unknown.factor()[gaussian] * confidence_radius(len(unknown.names))
@@ -144,10 +144,7 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     left, axes, _ = np.linalg.svd(rows / np.where(size > 0.0, size, 1.0), full_matrices=False)
     uncertain = axes > SMALLEST_AXIS
     half_axes = (left * axes)[:, uncertain] * size
-    ends = {
-        (SCREW_MASS if name == SCREW_MODE else name): _convert_range(unknown, name, pair)
-        for name, pair in unknown.ranges.items()
-    }
+    ends = dict(_convert_range(unknown, name, pair) for name, pair in unknown.ranges.items())
     ends = {name: pair for name, pair in ends.items() if name in plant.parameters or name in extra}
     pinned = {name: pair[0] for name, pair in ends.items() if pair[0] == pair[1]}
     wide = {name: pair for name, pair in ends.items() if name not in pinned}
@@ -165,9 +162,10 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     )  # fmt: skip
 
 
-def _convert_range(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[float, float]:
-    """Return a range of numbers; for the screw's mode, the range of masses that put it there."""
-    if name != SCREW_MODE:
-        return float(pair[0]), float(pair[1])
-    ends = np.interp(np.array(pair), unknown.screw[0], unknown.screw[1])
-    return float(np.min(ends)), float(np.max(ends))
+def _convert_range(unknown: Uncertainty, name: str, pair: tuple[float, float]) -> tuple[str, tuple[float, float]]:
+    """Return a parameter and its range; for a mode's frequency, the parameter that sets it, and its range."""
+    mode = unknown.modes.get(name)
+    if mode is None:
+        return name, (float(pair[0]), float(pair[1]))
+    ends = mode.values_at(np.array(pair))
+    return mode.parameter, (float(np.min(ends)), float(np.max(ends)))

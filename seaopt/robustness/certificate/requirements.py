@@ -24,7 +24,7 @@ def design_requirements(controller: Controller, achieved: LoopFigures, values: P
     spec, band = controller.spec, controller.spec.passive_band_hz
     port = None
     if band is not None and controller.design is not None:
-        held = port_of(controller.design[0], values, spec.measured, controller.current_per_force_A_per_N)
+        held = port_of(controller.design[0], values, spec.measured, controller.command.per_effort)
         port = measure_port(held, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
     verdicts = judge(spec, MeasuredLoop(name="design", figures=achieved, port=port), "design plant")
     return [_make_requirement(verdict, _place_passive(verdict, port, band)) for verdict in verdicts]

@@ -83,7 +83,7 @@ def batch_figures(
             none = np.zeros(block.stop - block.start)
             delays = at.get(DELAY, none) if chain else none
             continuous = linearised(
-                plant, values[:, block], at, controller.spec.measured, controller.current_per_force_A_per_N
+                plant, values[:, block], at, controller.spec.measured, controller.command.per_effort
             )
             pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, none.size, CURVE_BLOCK)]
             parts += pool.map(

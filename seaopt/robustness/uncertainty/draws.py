@@ -1,8 +1,9 @@
 """What is uncertain of the parameters, and draws of it: the fit's joint distribution and the declared ranges.
 
 A range may name a parameter of a plant, a condition (`seaopt.control.loops.sampled_plant`: an angle such as phi,
-delay_s), or ``screw_mode_hz``: the frequency of the screw's mode, which its effective mass m_n sets, all else being
-nominal, on the first plant that has the part; the other plants get that mass.
+delay_s), or the frequency of a mode that a plant declares, such as ``screw_mode_hz``: one parameter sets it, the
+screw's effective mass m_n, all else being nominal, on the first plant that has the mode; the other plants get that
+value.
 """
 
 from __future__ import annotations
@@ -18,13 +19,12 @@ from seaopt.control.loops.sampled_plant import conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant, state_space
+from seaopt.plants import PARTS, Mode, Plant, state_space
 from seaopt.records import record
 from seaopt.units import factor
 
 MAX_REJECTION = 200
 LEVEL = 0.999  # probability of the part of the fit's distribution in which the worst case is searched
-SCREW_MODE, SCREW_MASS = "screw_mode_hz", "m_n"
 
 
 @record
@@ -35,7 +35,7 @@ class Varied:
     ----------
     name, unit : str
     value : float or None
-        Nominal; None where there is none (`screw_mode_hz`).
+        Nominal; None where there is none (a mode's frequency).
     std : float or None
         Of a Gaussian, correlated as in the fit and cut at `low` and `high`; None for a uniform range.
     low, high : float
@@ -62,6 +62,31 @@ class Varied:
 
 
 @record(eq=False)
+class ModeTable:
+    """Which values of a parameter put a mode where, ascending in frequency.
+
+    Parameters
+    ----------
+    parameter : str
+    frequency_hz, value : arrays, shape (m,)
+
+    """
+
+    parameter: str
+    frequency_hz: Float[np.ndarray, " m"]
+    value: Float[np.ndarray, " m"]
+
+    def values_at(self, frequency_hz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the parameter's values that put the mode at frequencies."""
+        return np.interp(frequency_hz, self.frequency_hz, self.value)
+
+    def slopes_at(self, frequency_hz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the derivatives of `values_at`."""
+        steps = np.diff(self.value) / np.diff(self.frequency_hz)
+        return steps[np.clip(np.searchsorted(self.frequency_hz, frequency_hz) - 1, 0, steps.size - 1)]
+
+
+@record(eq=False)
 class Uncertainty:
     """What is uncertain of the parameters.
 
@@ -73,8 +98,8 @@ class Uncertainty:
         The uncertain parameters of the Gaussian part, with `covariance`, shape (n, n).
     ranges : mapping of name to (low, high)
         Uniform, independent of the rest.
-    screw : (frequencies, masses)
-        Effective masses m_n that put the screw's mode at the frequencies, which ascend; for a range of screw_mode_hz.
+    modes : mapping of name to ModeTable
+        For every range of a mode's frequency, which values of its parameter put it where.
     absent : mapping of name to Parameter
         What a range may name and `nominal` has no value of: the plants' defaults, and conditions.
 
@@ -84,7 +109,7 @@ class Uncertainty:
     names: tuple[str, ...]
     covariance: Float[np.ndarray, "n n"]
     ranges: Mapping[str, tuple[float, float]]
-    screw: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]] = (np.empty(0), np.empty(0))
+    modes: Mapping[str, ModeTable] = field(default_factory=dict[str, ModeTable])
     absent: Mapping[str, Parameter] = field(default_factory=dict[str, Parameter])
 
     @property
@@ -142,10 +167,8 @@ class Uncertainty:
         out = dict(zip(self.names, self._gaussian_values(coordinates).T, strict=True))
         for (name, (low, high)), t in zip(self.ranges.items(), coordinates[:, len(self.names) :].T, strict=True):
             value = 0.5 * (low + high) + 0.5 * (high - low) * t
-            if name == SCREW_MODE:
-                out[SCREW_MASS] = np.interp(value, self.screw[0], self.screw[1])
-            else:
-                out[name] = value
+            mode = self.modes.get(name)
+            out[name if mode is None else mode.parameter] = value if mode is None else mode.values_at(value)
         return out
 
     def slopes(self, coordinates: Float[np.ndarray, "n k"]) -> dict[str, Float[np.ndarray, "n k"]]:
@@ -157,11 +180,10 @@ class Uncertainty:
             out[name][:, : row.size] = row
         for i, (name, (low, high)) in enumerate(self.ranges.items(), start=len(self.names)):
             slope = np.full(count, 0.5 * (high - low))
-            if name == SCREW_MODE:
-                steps = np.diff(self.screw[1]) / np.diff(self.screw[0])
-                value = 0.5 * (low + high) + slope * coordinates[:, i]
-                slope *= steps[np.clip(np.searchsorted(self.screw[0], value) - 1, 0, steps.size - 1)]
-            varied = SCREW_MASS if name == SCREW_MODE else name
+            mode = self.modes.get(name)
+            if mode is not None:
+                slope *= mode.slopes_at(0.5 * (low + high) + slope * coordinates[:, i])
+            varied = name if mode is None else mode.parameter
             out[varied] = np.zeros((count, width))
             out[varied][:, i] = slope
         return out
@@ -245,10 +267,11 @@ def combine_uncertainty(
     factors = np.array([scale.get(name, 1.0) for name in uncertain])
     whole *= factors[:, None] * factors
     _check_inside(ranges, nominal)
-    screw = _screw_masses(plants, nominal, ranges[SCREW_MODE]) if SCREW_MODE in ranges else (np.empty(0), np.empty(0))
+    ranged = {name: plant for name, plant in find_modes(plants).items() if name in ranges}
+    modes = {name: _tabulate_mode(plant, nominal, ranges[name]) for name, plant in ranged.items()}
     return Uncertainty(
         nominal=nominal, names=tuple(uncertain[i] for i in used), covariance=whole[np.ix_(used, used)],
-        ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, screw=screw,
+        ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, modes=modes,
         absent={name: default for plant in plants.values() for name, default in plant.defaults.items()}
         | conditions(tuple(plants.values())),
     )  # fmt: skip
@@ -289,12 +312,14 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
     """
     extra = conditions(tuple(plants.values()))
     parameters = {name: plant.defaults.get(name) for plant in plants.values() for name in plant.parameters}
-    known = [*parameters, *extra, *([SCREW_MODE] if SCREW_MASS in parameters else [])]
+    modes = {name: _mode(plant).parameter for name, plant in find_modes(plants).items()}
+    known = [*parameters, *extra, *modes]
     if not isinstance(ranges, Mapping):
         raise ControlError(f"ranges is a {type(ranges).__name__}; give a mapping of name to (low, high)")
     for name, ends in ranges.items():
         if name not in known:
-            remedy = 'add parts = ["screw_mode"] to one' if name == SCREW_MODE else suggestion(str(name), known)
+            part = str(name).removesuffix("_hz")
+            remedy = f'add parts = ["{part}"] to one' if part in PARTS else suggestion(str(name), known)
             raise ControlError(f'range of "{name}": no plant has it; {remedy}')
         low, high = _read_ends(name, ends)
         if not (np.isfinite(low) and np.isfinite(high)):
@@ -312,8 +337,9 @@ def check_ranges(ranges: Mapping[str, tuple[float, float]], plants: Mapping[str,
                 f"range of {name} = [{low:g}, {high:g}] leaves the bounds [{parameter.min:g}, {parameter.max:g}]; "
                 "keep inside them"
             )
-    if SCREW_MODE in ranges and SCREW_MASS in ranges:
-        raise ControlError(f"ranges of {SCREW_MODE} and {SCREW_MASS} both set the screw's mode; keep one")
+    for name, parameter in modes.items():
+        if name in ranges and parameter in ranges:
+            raise ControlError(f"ranges of {name} and {parameter} both set the mode; keep one")
 
 
 def _read_ends(name: str, value: Any) -> tuple[float, float]:
@@ -332,40 +358,52 @@ def place_value(
     Raises
     ------
     ControlError
-        The screw's mode cannot be there.
+        A mode cannot be there.
 
     """
     values, extra = plant.complete(params), conditions((plant,))
-    if name == SCREW_MODE and SCREW_MASS in values:
-        frequencies, masses = _screw_masses(plants, params, (value, value))
-        return values.update(**{SCREW_MASS: float(np.interp(value, frequencies, masses))})
+    modes = find_modes(plants)
+    if name in modes and _mode(modes[name]).parameter in values:
+        table = _tabulate_mode(modes[name], params, (value, value))
+        return values.update(**{table.parameter: float(table.values_at(np.array([value]))[0])})
     if name in values:
         return values.update(**{name: value})
     return values.with_parameters(replace(extra[name], value=value)) if name in extra else None
 
 
-def _screw_masses(
-    plants: Mapping[str, Plant], nominal: ParameterSet, wanted: tuple[float, float]
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return frequencies of the screw's mode, ascending, and the masses that give them."""
-    plant = next(plant for plant in plants.values() if SCREW_MASS in plant.parameters)
-    complete = plant.complete(nominal)
-    masses = complete[SCREW_MASS].value * np.geomspace(20.0, 0.05, 400)
-    place = list(plant.states).index("s")
-    frequencies = np.empty(masses.size)
-    for k, mass in enumerate(masses):
-        values, vectors = np.linalg.eig(state_space(plant, complete.update(**{SCREW_MASS: float(mass)}))[0])
-        part = np.abs(vectors[place] * np.linalg.inv(vectors)[:, place]) * (np.imag(values) > 0.0)
-        frequencies[k] = np.abs(values[np.argmax(part)]) / (2 * np.pi)
+def find_modes(plants: Mapping[str, Plant]) -> dict[str, Plant]:
+    """Return the modes that a range may name, each with the first plant that has it."""
+    modes: dict[str, Plant] = {}
+    for plant in plants.values():
+        if plant.mode is not None:
+            modes.setdefault(plant.mode.name, plant)
+    return modes
+
+
+def _mode(plant: Plant) -> Mode:
+    assert plant.mode is not None  # of `find_modes`
+    return plant.mode
+
+
+def _tabulate_mode(plant: Plant, nominal: ParameterSet, wanted: tuple[float, float]) -> ModeTable:
+    """Tabulate where the values of one parameter put a plant's mode."""
+    mode, complete = _mode(plant), plant.complete(nominal)
+    values = complete[mode.parameter].value * np.geomspace(20.0, 0.05, 400)
+    place = list(plant.states).index(mode.state)
+    frequencies = np.empty(values.size)
+    for k, value in enumerate(values):
+        poles, vectors = np.linalg.eig(state_space(plant, complete.update(**{mode.parameter: float(value)}))[0])
+        part = np.abs(vectors[place] * np.linalg.inv(vectors)[:, place]) * (np.imag(poles) > 0.0)
+        frequencies[k] = np.abs(poles[np.argmax(part)]) / (2 * np.pi)
     turns = np.flatnonzero(np.diff(frequencies) <= 0.0)
     start = int(turns[-1]) + 1 if turns.size else 0
-    frequencies, masses = frequencies[start:], masses[start:]
+    frequencies, values = frequencies[start:], values[start:]
     if wanted[0] < frequencies[0] or wanted[1] > frequencies[-1]:
         raise ControlError(
-            f"range of {SCREW_MODE} = [{wanted[0]:g}, {wanted[1]:g}] is beyond what {SCREW_MASS} alone can do, "
-            f"{frequencies[0]:.3g} to {frequencies[-1]:.3g} Hz; keep inside, or give ranges of k_b and {SCREW_MASS}"
+            f"range of {mode.name} = [{wanted[0]:g}, {wanted[1]:g}] is beyond what {mode.parameter} alone can do, "
+            f"{frequencies[0]:.3g} to {frequencies[-1]:.3g} Hz; keep inside, or give ranges of the parameters"
         )
-    return frequencies, masses
+    return ModeTable(parameter=mode.parameter, frequency_hz=frequencies, value=values)
 
 
 def confidence_radius(dimensions: int) -> float:

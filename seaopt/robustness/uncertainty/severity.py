@@ -107,7 +107,7 @@ def _sample_plants(
     dp = np.stack([slopes.get(name, np.zeros(points.shape)).ravel() for name in plant.parameters])
     dat = {name: slopes.get(name, np.zeros(points.shape)).ravel() for name in at}
     spec, none = controller.spec, np.zeros(count * width)
-    matrices, derivatives = linearised_along(plant, p, at, dp, dat, spec.measured, controller.current_per_force_A_per_N)
+    matrices, derivatives = linearised_along(plant, p, at, dp, dat, spec.measured, controller.command.per_effort)
     a, b, c, d = (value + 1j * COMPLEX_STEP * slope for value, slope in zip(matrices, derivatives, strict=True))
     late = at.get(DELAY, none) + 1j * COMPLEX_STEP * dat.get(DELAY, none)
     stepped = hold(a, b, c, d, controller.sample_time_s, late)

@@ -1,4 +1,4 @@
-r"""The loop held against something: mass, spring and damper on link 2, with link 1 held.
+r"""The loop held against something: mass, spring and damper on the plant's port, its other links held.
 
 .. math:: F_{e2} = -k_e x_2 - d_e \dot x_2, \qquad m_2 \ddot x_2 = -F_2 + F_{e2}
 
@@ -12,6 +12,7 @@ sampling are left out); this map does not, so that the two can part near the Nyq
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,7 @@ from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import GROWING
+from seaopt.control.loops.port import bare_port, probe_of
 from seaopt.errors import ControlError
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
@@ -129,7 +131,7 @@ class StabilityMap:
 
 
 def against_environment(plant: Plant) -> Plant:
-    """Return the actuator of a plant with link 1 held and an environment on link 2: parameters m_2, k_e and d_e.
+    """Return a plant's probe with an environment on its inertia: parameters k_e and d_e besides its own.
 
     Raises
     ------
@@ -137,25 +139,24 @@ def against_environment(plant: Plant) -> Plant:
         The plant says nothing of a port.
 
     """
-    if plant.port is None:
-        raise ControlError(
-            f"plant {plant.name} has no port at link 2 that an environment could be attached to; use two_link, "
-            "high_impedance or moving_output"
-        )
-    port = plant.port()
+    probe = probe_of(plant)
+    port = bare_port(probe)
+    command, unit = next(iter(probe.inputs.items()))
 
     def pulled(x: Any, u: Any, p: Any) -> Any:
-        inputs = dict.fromkeys(port.inputs, 0.0) | {"I": u.I, "Fe2": -p.k_e * x.x_2 - p.d_e * x.v_2}
-        return SimpleNamespace(**inputs)
+        force = -p.k_e * getattr(x, port.coordinate) - p.d_e * getattr(x, port.rate)
+        return SimpleNamespace(**(dict.fromkeys(probe.inputs, 0.0) | vars(u) | {port.effort: force}))
 
     return Plant(
         name=f"{plant.name} against an environment",
-        states=port.states,
-        inputs={"I": port.inputs["I"]},
-        outputs=port.outputs,
-        parameters={**port.parameters, "k_e": SPRING, "d_e": DAMPER},
-        f=lambda t, x, u, p: port.f(t, x, pulled(x, u, p), p),
-        h=lambda t, x, u, p: port.h(t, x, pulled(x, u, p), p),
+        states=probe.states,
+        inputs={command: unit},
+        outputs=probe.outputs,
+        parameters={**probe.parameters, "k_e": SPRING, "d_e": DAMPER},
+        f=lambda t, x, u, p: probe.f(t, x, pulled(x, u, p), p),
+        h=lambda t, x, u, p: probe.h(t, x, pulled(x, u, p), p),
+        friction=probe.friction,
+        ports=(replace(probe.ports[0], effort=None),),
     )
 
 
@@ -225,7 +226,7 @@ def environment(
     controller: Controller, coupled: Plant, parameters: ParameterSet, m_2: float, k_e: float, d_e: float
 ) -> Environment:
     """Return what the loop does against one environment, `coupled` being a plant of `against_environment`."""
-    values = coupled.complete(parameters).update(m_2=m_2, k_e=k_e, d_e=d_e)
+    values = coupled.complete(parameters).update(**{_inertia(coupled): m_2, "k_e": k_e, "d_e": d_e})
     poles = controller.close(coupled, values).eigenvalues()
     largest = poles[int(np.argmax(np.abs(poles)))]
     radius, period = float(abs(largest)), controller.sample_time_s
@@ -248,18 +249,23 @@ def _check(
         raise ControlError(f"points = {points} is no grid; give 2 or more")
 
 
+def _inertia(coupled: Plant) -> str:
+    """Return the name of the parameter that is the inertia on the port."""
+    return coupled.ports[0].payload[0]
+
+
 def _radii(
     controller: Controller, coupled: Plant, parameters: ParameterSet, m: Float[np.ndarray, " n"],
     k: Float[np.ndarray, " n"], d: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:  # fmt: skip
     """Return the spectral radii against n environments."""
-    draws = {"m_2": m, "k_e": k, "d_e": d}
+    draws = {_inertia(coupled): m, "k_e": k, "d_e": d}
     return batch_figures(controller, coupled, coupled.complete(parameters), draws, peaks=False).spectral_radius
 
 
 def _fixed(controller: Controller, coupled: Plant, parameters: ParameterSet) -> bool:
     """Tell whether the loop is stable with the link fixed: what a mass of 1e9 kg on the ground is to it."""
-    values = coupled.complete(parameters).update(m_2=1e9, k_e=1e12, d_e=1e9)
+    values = coupled.complete(parameters).update(**{_inertia(coupled): 1e9, "k_e": 1e12, "d_e": 1e9})
     return bool(np.max(np.abs(controller.close(coupled, values).eigenvalues())) <= GROWING)
 
 

@@ -38,7 +38,7 @@ from seaopt.records import record
 from seaopt.robustness.verification.linear import LinearView, linear_view
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Stage, Trace
-from seaopt.robustness.verification.scenarios import Scenario, moves
+from seaopt.robustness.verification.scenarios import Scenario
 
 SETTLE = 0.2  # of the last phase, before it is judged
 GROWTH, GROWTH_FLOOR = 1.05, 1e-3
@@ -222,7 +222,7 @@ def _ringing(
     spec, period = stage.controller.spec, stage.controller.sample_time_s
     if not scenario.quiet:
         return
-    free = moves(stage.plant) and not scenario.phases[-1].held
+    free = stage.plant.moves and not scenario.phases[-1].held
     for window in _windows(stage, trace):
         lasting = period * (window.stop - window.start)
         lowest = max(spec.bandwidth_hz / SLOWER, PERIODS / lasting) if free else STILL_PERIODS / lasting
@@ -254,7 +254,7 @@ def _windows(stage: Stage, trace: Trace) -> tuple[slice, slice]:
 def _floor(stage: Stage, trace: Trace, run: int) -> float:
     """Return the amplitude (N) that noise, quantisation and rounding make by themselves."""
     name, sensors = stage.controller.spec.measured, stage.sensors
-    rounding = 0.5 * stage.current_step_A / stage.controller.current_per_force_A_per_N
+    rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
     noise = 2.0 * sensors.noise_std.get(name, 0.0) + 1.5 * sensors.quantisation.get(name, 0.0)
     return max(noise + rounding, 1e-3 * float(trace.peaks[name][run]))
 

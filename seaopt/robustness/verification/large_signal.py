@@ -170,7 +170,7 @@ def _onset(
     assert limit is not None
     loop = controller.close(plant, parameters)
     motor = np.abs(loop.reference.response(f, controller.sample_time_s) * loop.sensitivity(f))
-    return limit / controller.current_per_force_A_per_N / motor
+    return limit / controller.command.per_effort / motor
 
 
 def _bandwidth(f: Float[np.ndarray, " f"], gain: Float[np.ndarray, " f"], static: float) -> float | None:

@@ -93,7 +93,7 @@ def linear_view(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> Linear
     return LinearView(
         loop=controller.close(plant, params),
         noise_N=_spread(stage.sensors.noise_std.get(name, 0.0), stage.sensors.quantisation.get(name, 0.0)),
-        step_N=_spread(0.0, stage.current_step_A / controller.current_per_force_A_per_N),
+        step_N=_spread(0.0, stage.current_step_A / controller.command.per_effort),
     )
 
 

@@ -16,11 +16,11 @@ from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, Sample
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant
-from seaopt.plants.impacts import caught, position, released, struck
+from seaopt.plants import Plant, Port
+from seaopt.plants.impacts import catch, offset, release, strike
 from seaopt.plants.plant import fill_vector
 from seaopt.records import record
-from seaopt.robustness.verification.scenarios import LINK, Phase, Scenario
+from seaopt.robustness.verification.scenarios import Phase, Scenario
 
 Rows = Float[np.ndarray, "runs n"]
 
@@ -34,7 +34,7 @@ class Stage:
     controller : Controller
         Its law runs as exported.
     plant : Plant
-        With link 2 as it is.
+        With the link at its port as it is.
     partner : Plant or None
         The same actuator with that link fixed, for phases in which it is held.
     sensors, current_step_A
@@ -185,7 +185,8 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         elif grip is not None and not phase.held:
             now, grip = _let_go(stage, values, grip, now), None
         if phase.impulse_Ns:
-            blows = [struck(stage.plant, p, x, LINK, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
+            link = _port(stage.plant).motion or ""
+            blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
         loop = stage.loop(phase.held, longest)
         reference = offset + _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
@@ -199,11 +200,15 @@ def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], lon
     """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
     plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
     start = at_rest(loop, len(values), fill_vector("state", plant.states, scenario.initial_state))
-    if "q" in plant.states and LINK in plant.outputs:
-        place = list(plant.states).index("q")
+    if plant.port is not None:
         for row, p in zip(start.x, values, strict=True):
-            row[place] -= position(plant, p, row, LINK)
+            row -= offset(plant, p, row, plant.port)
     return start
+
+
+def _port(plant: Plant) -> Port:
+    assert plant.port is not None  # else the scenario has an obstacle
+    return plant.port
 
 
 def loaded(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
@@ -227,13 +232,12 @@ def _catch(
     stage: Stage, values: Sequence[ParameterSet], now: LoopState, time_s: float
 ) -> tuple[LoopState, list[dict[str, float]], Contact]:
     """Return the states after the link is caught, where its coordinate stands in each run, and the contact."""
-    plant, held = stage.plant, stage.partner
-    assert held is not None
-    found = [caught(plant, p, row, held) for p, row in zip(values, now.x, strict=True)]
-    (name,) = [n for n, unit in plant.states.items() if n not in held.states and not unit.endswith("/s")]
+    plant, port = stage.plant, _port(stage.plant)
+    catches = [catch(plant, p, row, port) for p, row in zip(values, now.x, strict=True)]
+    name = port.coordinate or ""
     place = list(plant.states).index(name)
-    after = LoopState(x=np.stack([state for state, _, _ in found]), z=now.z)
-    impulse, loss = (np.array([item[k] for item in found]) for k in (1, 2))
+    after = LoopState(x=np.stack([state for state, _, _ in catches]), z=now.z)
+    impulse, loss = (np.array([each[k] for each in catches]) for k in (1, 2))
     contact = Contact(time_s=time_s, impulse=impulse, loss_J=loss)
     return after, [{name: float(row[place])} for row in now.x], contact
 
@@ -241,9 +245,8 @@ def _catch(
 def _let_go(
     stage: Stage, values: Sequence[ParameterSet], grip: Sequence[Mapping[str, float]], now: LoopState
 ) -> LoopState:
-    held = stage.partner
-    assert held is not None
-    rows = [released(held, row, stage.plant, p, link) for row, p, link in zip(now.x, values, grip, strict=True)]
+    plant, port = stage.plant, _port(stage.plant)
+    rows = [release(plant, p, port, row, link) for row, p, link in zip(now.x, values, grip, strict=True)]
     return LoopState(x=np.stack(rows), z=now.z)
 
 

@@ -15,11 +15,9 @@ from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.impacts import struck
+from seaopt.plants.impacts import strike
 from seaopt.records import record
 
-LINK = "x_2"
-PAYLOADS = (("I_p", "m"), ("I_p2", "m2"), ("m_2",), ("J_l",))
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # blows that are tried
 NOMINAL_FORCE_N = 100.0
@@ -42,12 +40,12 @@ class Phase:
     excitation : tuple of Chirp, Noise, Multisine
         Added to it (amplitudes in N).
     impulse_Ns : float
-        A blow on link 2 (along x_2) at the start.
+        A blow on the link at the plant's port, along its motion, at the start.
     scale : mapping of parameter name to float
         Factors on the plant's parameters, from here to the end of the scenario; states go on unchanged, so that a
         payload arrives with the link's speed.
     held : bool
-        Link 2 is held where it is: the plant's partner without that link takes over.
+        The link is held where it is: the plant's partner without it takes over.
 
     """
 
@@ -77,8 +75,8 @@ class Scenario:
     name : str
     phases : tuple of Phase
     initial_state : mapping of state name to float
-        Where every run starts, zero where left out; q is then moved so that the spring is relaxed. Without it a run
-        starts at rest where its parameters say (phi), zero if they do not.
+        Where every run starts, zero where left out; the drive is then moved so that the spring is relaxed. Without it a
+        run starts at rest where its parameters say (phi), zero if they do not.
     about_rest : bool
         Forces are counted from the one that keeps a run where it starts; False: from zero.
     quiet : bool
@@ -90,7 +88,7 @@ class Scenario:
     passes : mapping of output name to float
         Values that an output must cross: shows that the scenario did what it says.
     on : {"any", "held", "free"}
-        Plants that it is for: every one, those without a link that moves (x_1, x_2, an angle), or those with one.
+        Plants that it is for: every one, those without a link that moves at a port, or those with one.
 
     """
 
@@ -132,7 +130,7 @@ class Scenario:
 
     def obstacle(self, plant: Plant, partner: Plant | None) -> str | None:
         """Return why the scenario cannot be played on a plant, or None."""
-        free = moves(plant)
+        free = plant.moves
         if (self.on == "held" and free) or (self.on == "free" and not free):
             return f"it is for plants whose link is {self.on}"
         if any(phase.held for phase in self.phases) and partner is None:
@@ -140,17 +138,17 @@ class Scenario:
         for name in (name for phase in self.phases for name in phase.scale):
             if name not in plant.parameters:
                 return f"the plant has no parameter {name}"
-        if any(phase.impulse_Ns for phase in self.phases) and (LINK not in plant.outputs or plant.energy is None):
-            return f"the plant has no {LINK}, or no energy that tells what a blow does"
+        if any(phase.impulse_Ns for phase in self.phases) and (_struck(plant) is None or plant.energy is None):
+            return "the plant has no link that moves, or no energy that tells what a blow does"
         for name in (*self.initial_state, *self.passes):
             if name not in plant.states and name not in plant.outputs:
                 return f"the plant has no {name}"
         return None
 
 
-def moves(plant: Plant) -> bool:
-    """Tell whether a plant has a link that moves: an output x_1, x_2 or an angle."""
-    return any(name in ("x_1", LINK) or unit == "rad" for name, unit in plant.outputs.items())
+def _struck(plant: Plant) -> str | None:
+    """Return the output along which the link at the port is struck; None where it does not move."""
+    return plant.port.motion if plant.port is not None else None
 
 
 def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]:
@@ -189,12 +187,13 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     if step is not None and rest is not None:
         found += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
     found.append(_chirp(controller, small, tail))
-    if LINK in plant.outputs and plant.energy is not None:
+    if _struck(plant) is not None and plant.energy is not None:
         found.append(_impact(_blow(controller, plant, 2.0 * small), tail))
-    payload = next((names for names in PAYLOADS if all(name in plant.parameters for name in names)), ())
-    if payload and moves(plant):
-        found.append(_payload(payload, small, lasting, tail))
-    found += [_fall(angle, 2.0 * tail) for angle in ("phi", "phi2") if angle in plant.states]
+    if plant.port is not None and plant.port.payload:
+        found.append(_payload(plant.port.payload, small, lasting, tail))
+    angle = _lever(plant)
+    if angle is not None:
+        found.append(_fall(angle, 2.0 * tail))
     found.append(_contact(small, lasting, tail))
     return tuple(item for item in found if item.obstacle(plant, plant) is None)
 
@@ -243,14 +242,16 @@ def _samples(controller: Controller, duration_s: float) -> int:
 
 
 def _blow(controller: Controller, plant: Plant, force: float) -> float:
-    """Return the blow (N s) on link 2 whose peak of the measured force is about `force`; play makes that nonlinear."""
+    """Return the blow (N s) on the link after which the measured force peaks at about `force`; play is nonlinear."""
+    link = _struck(plant)
+    assert link is not None
     params = plant.complete(_design(controller)[1])
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )
 
     def peak(blow: float) -> float:
-        state = struck(plant, params, np.zeros(len(plant.states)), LINK, blow)
+        state = strike(plant, params, np.zeros(len(plant.states)), link, blow)
         run = run_loop(loop, [params], np.zeros(_samples(controller, 0.1)), start=at_rest(loop, 1, state))
         return float(run.peaks[controller.spec.measured][0])
 
@@ -261,6 +262,15 @@ def _blow(controller: Controller, plant: Plant, force: float) -> float:
         if found >= force:
             return blow * 2.0 ** (-math.log(found / force) / math.log(found / before))
     return blow
+
+
+def _lever(plant: Plant) -> str | None:
+    """Return the angle of a link that pulls on the actuator by a lever arm, which turns its sign; None without one."""
+    port = plant.port
+    if port is None or port.motion is None or port.coordinate is None:
+        return None
+    angle = plant.states[port.coordinate] == "rad" and plant.outputs[port.motion] != "rad"
+    return port.coordinate if angle else None
 
 
 def _tail(controller: Controller, plant: Plant) -> float:
@@ -274,7 +284,7 @@ def _tail(controller: Controller, plant: Plant) -> float:
 
 
 def _small_step(force: float, lasting: float, tail: float, plant: Plant) -> Scenario:
-    if moves(plant):
+    if plant.moves:
         return Scenario(
             name="small step",
             phases=(Phase(duration_s=lasting, force_N=force), Phase(duration_s=tail)),

@@ -13,7 +13,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.impacts import is_pair
+from seaopt.plants.impacts import check_held
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judged
 from seaopt.robustness.verification.playback import Stage, Trace, play
@@ -164,8 +164,7 @@ def verify(
     current_step_A : float
         What the current is rounded to; 0 for not at all.
     partners : mapping of plant name to Plant, optional
-        The same actuator with link 2 fixed, for scenarios of contact; found among `plants` and the controller's design
-        plant where left out.
+        The same actuator with its link fixed, for scenarios of contact; what the plant's port makes where left out.
     seed : int
         Of noise and random excitations.
 
@@ -195,7 +194,7 @@ def verify(
     check_plants(plants, draws or {}, partners or {})
     stages = {
         name: Stage(
-            controller=controller, plant=plant, partner=_partner(name, plant, plants, controller, partners or {}),
+            controller=controller, plant=plant, partner=_partner(plant, (partners or {}).get(name)),
             sensors=sensors or Sensors(), current_step_A=current_step_A,
         )
         for name, plant in plants.items()
@@ -243,13 +242,12 @@ def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners
                 raise ControlError(f'{what} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
 
 
-def _partner(
-    name: str, plant: Plant, plants: Mapping[str, Plant], controller: Controller, given: Mapping[str, Plant]
-) -> Plant | None:
-    if name in given:
-        return given[name]
-    known = [*([controller.design[0]] if controller.design is not None else []), *plants.values()]
-    return next((item for item in known if is_pair(plant, item)), None)
+def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
+    """Return the plant with the port held: as given, else as the port makes it; None where it makes none."""
+    if partner is not None:
+        check_held(plant, partner)
+        return partner
+    return plant.port.held() if plant.port is not None and plant.port.held is not None else None
 
 
 def _plain(value: Any) -> Any:

@@ -217,7 +217,7 @@ def test_the_matlab_script_has_the_law(tuned, tmp_path):
     given = dict(re.findall(r"^([\w.]+) = ([^%\n]*);", text, flags=re.MULTILINE))
     for name, value in tuned.gains.items():
         assert numbers(given[f"gains.{name}"]) == [value]
-    assert numbers(given["current_per_force"]) == [tuned.current_per_force_A_per_N]
+    assert numbers(given["command_per_effort"]) == [tuned.command.per_effort]
     for name, tf in (("reference", tuned.reference), ("measurement", tuned.measurement)):
         assert numbers(given[f"{name}_num"]) == tf.num.tolist()
         assert numbers(given[f"{name}_den"]) == tf.den.tolist()
@@ -310,7 +310,7 @@ EDITS = [
     (("feasible",), "yes", "feasible is 'yes'"),
     (("spec", "structure"), "foo", 'structure = "foo" is not known'),
     (("spec", "bandwidth_range_hz"), ["a", 2.0], r"spec.bandwidth_range_hz\[0\] is 'a', not a number"),
-    (("current_per_force_A_per_N",), "1", "current_per_force_A_per_N is '1', not a number"),
+    (("command", "per_effort"), "1", "command.per_effort is '1', not a number"),
     (("measurement", "den"), [], "measurement.den is .., not a list of numbers"),
     (("active_constraints",), "ms", "active_constraints is 'ms', not a list of names"),
     (("observer",), {"T_q": 1.0}, "observer.inverse is missing"),
@@ -360,7 +360,7 @@ def test_a_pid_whose_integral_is_slow_is_coarse_in_float(compiler, tuned, tmp_pa
         folder = tmp_path / precision
         folder.mkdir()
         compiled = Compiled(compiler, folder, with_law(tuned, *slow), precision, current_limit_A=90.0)
-        compiled.reset(1000.0, 1000.0, 2000.0 * tuned.current_per_force_A_per_N)
+        compiled.reset(1000.0, 1000.0, 2000.0 * tuned.command.per_effort)
         before = compiled.law.x[0]
         for _ in range(1000):
             compiled.step(1000.0, 999.99)

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import Gains, TransferFunction, current_per_force
+from seaopt.control import Gains, TransferFunction, command_of
 from seaopt.control.laws.passivity import passivity, passivity_rows
 from seaopt.control.loops.port import held, port_of
 from seaopt.errors import ControlError
@@ -57,7 +57,7 @@ def test_the_impedance_is_that_of_the_equations(drive, spring, kind, thor):
     make = {"stand": high_impedance, "swing": moving_output, "two masses": lambda **o: two_link("mass", "mass", **o)}
     plant = make[kind](drive=drive, spring=spring)
     c = 3.2 + 1.3 / S + 0.03 * S
-    found = port_of(plant, thor, "F1", current_per_force(plant, thor)).response(F).impedance(c)
+    found = port_of(plant, thor, "F1", command_of(plant, thor, "F1").per_effort).response(F).impedance(c)
     np.testing.assert_allclose(found, IMPEDANCES[drive, spring](*figures(thor), c, S), rtol=1e-9)
 
 
@@ -73,7 +73,7 @@ def test_the_loop_is_the_sampled_one_at_low_frequency(thor, stand):
     """G_11 with hold and delay is the zero-order-hold plant but for its images: to 1 % at 30 Hz."""
     controller = controller_of(delay_samples=2)
     f = np.geomspace(0.1, 30, 20)
-    g = port_of(stand, thor, "F1", controller.current_per_force_A_per_N).response(f).motor_to_feedback
+    g = port_of(stand, thor, "F1", controller.command.per_effort).response(f).motor_to_feedback
     np.testing.assert_allclose(g * held(f, TS, 2), controller.plant(stand, thor).response(f), rtol=0.01)
 
 
@@ -112,7 +112,7 @@ def test_the_real_part_is_the_power_that_a_sampled_loop_takes(f_hz, tolerance, t
     controller = controller_of(k_i=20.0)
     f = np.array([f_hz])
     law = controller.measurement.response(f, TS) * held(f, TS, 1)
-    z = port_of(stand, thor, "F1", controller.current_per_force_A_per_N).response(f).impedance(law)[0]
+    z = port_of(stand, thor, "F1", controller.command.per_effort).response(f).impedance(law)[0]
     taken = power(controller, thor, f_hz, periods=2 * f_hz)
     assert taken == pytest.approx(z.real, abs=tolerance * abs(z))
     assert (taken < 0) == (f_hz == 100.0)
@@ -135,7 +135,7 @@ def test_an_undelayed_pid_is_passive_up_to_the_rule(k_p, thor, stand):
 def test_the_rule_has_m_k_where_there_is_no_sprung_mass(thor, stand):
     """Continuous PID, m_l = 0: Re Z changes sign at k_i = b_m (1 + k_p)/m_k to rounding."""
     params = thor.update(m_l=0.0)
-    port = port_of(stand, params, "F1", current_per_force(stand, params))
+    port = port_of(stand, params, "F1", command_of(stand, params, "F1").per_effort)
     m_k, b, _, _ = figures(params)
     rule, f = b * 4.0 / m_k, np.array([1e-3, 1e-2])
     for k_i, sign in ((rule * (1 - 1e-6), 1), (rule * (1 + 1e-6), -1)):
@@ -183,7 +183,7 @@ def test_a_loop_that_breaks_the_rule_is_unstable_with_the_right_spring(thor, sta
     assert found.violated_hz == found.low_hz
     f = np.array([found.least_hz])
     law = controller.measurement.response(f, TS) * held(f, TS, 1)
-    z = port_of(stand, thor, "F1", controller.current_per_force_A_per_N).response(f).impedance(law)[0]
+    z = port_of(stand, thor, "F1", controller.command.per_effort).response(f).impedance(law)[0]
     w = 2 * np.pi * found.least_hz
     mass, stiffness = (-z.imag / w, 0.0) if z.imag < 0 else (1e-3, z.imag * w)
     assert attached(controller, thor, mass, stiffness) > 1 + 1e-6
@@ -227,7 +227,7 @@ def test_rows_are_the_condition_for_any_gains(thor, stand):
     spec = so.ControllerSpec(delay_samples=2)
     q = np.exp(-S * TS)
     basis = np.column_stack([np.ones(F.size), TS / 2 * (1 + q) / (1 - q), (1 - q) / (2 * TS - TS * q)])
-    rows, least = passivity_rows(stand, thor, spec, current_per_force(stand, thor), basis, F)
+    rows, least = passivity_rows(stand, thor, spec, command_of(stand, thor, "F1").per_effort, basis, F)
     m, b, k, m_l = figures(thor)
     for theta in np.random.default_rng(1).normal(size=(20, 3)) * [5.0, 200.0, 0.1]:
         c = basis @ theta * q**2 * (1 - q) / (S * TS)
@@ -240,7 +240,7 @@ def test_the_port_wears_the_plants_parts(thor):
     """A load cell and a current loop are lags in the loop, and leave the port's own force alone."""
     plant = high_impedance(parts=("current_loop", "load_cell"))
     c = np.full(F.size, 3.0 + 0j)
-    found = port_of(plant, thor, "F1", current_per_force(plant, thor)).response(F).impedance(c)
+    found = port_of(plant, thor, "F1", command_of(plant, thor, "F1").per_effort).response(F).impedance(c)
     lag = 1 / (1 + 1j * F / 500.0)
     np.testing.assert_allclose(found, IMPEDANCES["unlumped", "link1"](*figures(thor), c * lag**2, S), rtol=1e-9)
 
@@ -302,7 +302,7 @@ def test_an_undamped_pole_is_no_hole(thor, stand):
     m, _, k, m_l = figures(params)
     f = np.sqrt(k / (m + m_l)) / (2 * np.pi) * np.array([1.0, 1.0 + 1e-15, 1.0 - 1e-12, 1.0 + 1e-9, 1.0 + 1e-6, 1.1])
     s = 2j * np.pi * f
-    port = port_of(stand, params, "F1", current_per_force(stand, params))
+    port = port_of(stand, params, "F1", command_of(stand, params, "F1").per_effort)
     c = 3.0 + 0.02 * s
     found = port.response(f).impedance(c)
     np.testing.assert_allclose(found, IMPEDANCES["unlumped", "link1"](m, 0.0, k, m_l, c, s), rtol=1e-6)

@@ -227,7 +227,7 @@ def closed(law, controller, references):
         force = float(c[0] @ x)
         current, state = law.step(state, float(reference), force)
         x = a @ x + b[:, 0] * held
-        held = current / controller.current_per_force_A_per_N
+        held = current / controller.command.per_effort
         forces.append(force)
     return np.array(forces)
 

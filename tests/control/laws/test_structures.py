@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import bilinear, lfilter
 
 import seaopt as so
-from seaopt.control import Controller, DisturbanceObserver, Gains, Notch, corners, current_per_force, draw, sample
+from seaopt.control import Controller, DisturbanceObserver, Gains, Notch, command_of, corners, draw, sample
 from seaopt.control.laws.structures import Nominal
 from seaopt.control.tuning.feasibility import sensitivity_possible
 from seaopt.errors import ControlError
@@ -21,7 +21,7 @@ TS = 1e-3
 
 
 def digital(plant, params, delay=1):
-    return sample(plant, params, "F1", current_per_force(plant, params), TS, delay)
+    return sample(plant, params, "F1", command_of(plant, params, "F1").per_effort, TS, delay)
 
 
 def test_the_observer_is_the_written_one(stand, thor):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, current_per_force, sample
+from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, command_of, sample
 from seaopt.control.loops.response import find_zeros
 
 
@@ -18,13 +18,13 @@ def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains)
     plant, params = plant or so.plants.high_impedance(), params or so.plants.thor()
     law = Gains(**{"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_ff": 1.0, **gains})
     reference, measurement = law.transfer_functions(structure, ts)
-    digital = sample(plant, params, "F1", current_per_force(plant, params), ts, delay)
+    digital = sample(plant, params, "F1", command_of(plant, params, "F1").per_effort, ts, delay)
     return Loop(plant=digital, reference=reference, measurement=measurement)
 
 
 def test_the_sampled_plant_is_scipys_zero_order_hold(swing, thor):
     model = swing.linearize(thor)
-    gain = current_per_force(swing, thor)
+    gain = command_of(swing, thor, "F1").per_effort
     found = sample(swing, thor, "F1", gain, 1e-3, 1)
     a, b, c, d, _ = cont2discrete((model.A, model.B * gain, model.C[:1], model.D[:1] * gain), 1e-3, "zoh")
     np.testing.assert_allclose(found.a, a, rtol=1e-10, atol=1e-14)

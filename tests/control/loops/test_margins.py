@@ -300,15 +300,15 @@ def test_a_nu_gap_across_the_winding_is_one():
 
 def test_a_delay_in_the_plant_is_pythons_exact_one(stand, thor):
     """A fraction of a sample: simulate the continuous plant at 100 times the rate with the late command."""
-    from seaopt.control import current_per_force, sample
+    from seaopt.control import command_of, sample
     from seaopt.control.loops.sampled_plant import conditions
 
     delay = conditions((stand,))["delay_s"]
     late = sample(
         stand, thor.with_parameters(type(delay)(name="delay_s", value=1.37e-3, unit="s")), "F1",
-        current_per_force(stand, thor), 1e-3, 0,
+        command_of(stand, thor, "F1").per_effort, 1e-3, 0,
     )  # fmt: skip
-    fine = sample(stand, thor, "F1", current_per_force(stand, thor), 1e-5, 0)
+    fine = sample(stand, thor, "F1", command_of(stand, thor, "F1").per_effort, 1e-5, 0)
     u = np.random.default_rng(0).normal(size=40)
     x, y = np.zeros(2), []
     for k in range(40 * 100):

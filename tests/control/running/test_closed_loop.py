@@ -24,7 +24,7 @@ GAIN = 1 / 240.3318
 
 
 def law(limit=9.0, **changes):
-    options = {"sample_time_s": TS, "current_per_force_A_per_N": GAIN, "current_limit_A": limit, **changes}
+    options = {"sample_time_s": TS, "per_effort": GAIN, "current_limit_A": limit, **changes}
     return realise(LAW["reference"], LAW["measurement"], **options)
 
 
@@ -208,7 +208,7 @@ def test_peaks_between_samples_are_seen(thor):
     plant = so.plants.two_link("fixed", "mass")
     silent = realise(
         *(TransferFunction(num=np.zeros(1), den=np.ones(1)) for _ in range(2)), sample_time_s=3.1e-3,
-        current_per_force_A_per_N=GAIN,
+        per_effort=GAIN,
     )  # fmt: skip
     params = plant.defaults.update(m_2=1e6, b_r=0.0, J=1e-3)
     loop = SampledLoop(plant=plant, law=silent, measured="F1", delay_samples=1)
@@ -246,7 +246,7 @@ def test_a_loop_that_runs_away_is_left_where_it_does(stand, thor):
     """An unstable loop without limit: the largest eigenvalue says when the largest float is passed, or its 1e-7th."""
     wild = realise(
         *(TransferFunction(num=100.0 * tf.num, den=tf.den) for tf in LAW.values()), sample_time_s=TS,
-        current_per_force_A_per_N=GAIN,
+        per_effort=GAIN,
     )  # fmt: skip
     loop = SampledLoop(plant=stand, law=wild, measured="F1", delay_samples=1)
     run = run_loop(loop, [thor, thor.update(J=3.4e-6)], np.full(2000, 50.0))

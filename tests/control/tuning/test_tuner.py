@@ -135,7 +135,7 @@ def test_json_round_trip(stand, swing, thor, tmp_path):
 
     controller = tuned(stand, swing, thor, bandwidth_hz=30)
     path = write_json(tmp_path / "controller.json", controller.to_dict())
-    again = Controller.from_dict(read_json(path, "seaopt/controller/1"), stand, thor)
+    again = Controller.from_dict(read_json(path, "seaopt/controller/2"), stand, thor)
     assert repr(again) == repr(controller)
     broken = controller.to_dict()
     broken["measurement"] = {"num": [1.0], "den": [2.0]}
@@ -190,7 +190,7 @@ def test_the_force_limit_is_the_plants(stand, thor):
     loop = controller.close(stand, thor)
     p = loop.plant.response(np.array([30.0]))[0]
     t = loop.tracking(np.array([30.0]))[0]
-    saturation = 9.0 / controller.current_per_force_A_per_N
+    saturation = 9.0 / controller.command.per_effort
     assert controller.force_limit(30.0) == pytest.approx(saturation * abs(p) / abs(t), rel=1e-9)
     assert controller.force_limit(0.01) == pytest.approx(saturation, rel=1e-3)
     assert controller.force_limit(30) == controller.force_limit(30.0)

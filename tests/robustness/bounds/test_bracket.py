@@ -103,7 +103,8 @@ def first_order(controller, params):
     )  # fmt: skip
     law = TransferFunction(num=np.array([3.0]), den=np.array([1.0]))
     return plant, replace(
-        controller, reference=law, measurement=law, delay_samples=0, current_per_force_A_per_N=1.0,
+        controller, reference=law, measurement=law, delay_samples=0,
+        command=replace(controller.command, per_effort=1.0),
         spec=so.ControllerSpec(bandwidth_hz=30),
     )  # fmt: skip
 

@@ -139,7 +139,7 @@ def test_the_sampled_plant_holds_exponentials(parts, ranges, robust_controller, 
     within = build_region(plant, unknown)
     boxes = Boxes(centre=np.full((1, 2), 0.2), radius=np.full((1, 2), 0.5))
     enclosed = enclose_plant(controller, plant, unknown.nominal, within, boxes)
-    period, gain = controller.sample_time_s, controller.current_per_force_A_per_N
+    period, gain = controller.sample_time_s, controller.command.per_effort
     for e in np.random.default_rng(5).uniform(-1.0, 1.0, (30, 2)):
         values = {name: float(column[0]) for name, column in within.evaluate(0.2 + 0.5 * e[None]).items()}
         drawn = thor.update(**{k: v for k, v in values.items() if k in thor})

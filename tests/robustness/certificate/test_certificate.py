@@ -55,7 +55,7 @@ def test_every_requirement_carries_its_numbers(certificate):
 def test_the_swing_plants_loop_is_python_controls(controller, swing, thor, certificate):
     """Hold, delay and loop in python-control: eigenvalues of the feedback connection and the peak of S."""
     ts = controller.sample_time_s
-    model = swing.linearize(thor)[0, 0] * controller.current_per_force_A_per_N
+    model = swing.linearize(thor)[0, 0] * controller.command.per_effort
     plant = control.sample_system(model, ts, method="zoh")
     c_y = control.tf(controller.measurement.num, controller.measurement.den, ts)
     loop = control.ss(plant) * control.ss(c_y) * control.ss(control.tf([1], [1, 0], ts))

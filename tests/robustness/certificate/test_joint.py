@@ -68,7 +68,7 @@ def test_the_final_certificate_holds_in_numpy_alone(done, thor):
         a[:2, 2:] = np.eye(2)
         a[2:, :2], a[2:, 2:] = np.linalg.solve(mass, -stiff), np.linalg.solve(mass, -np.diag([p["b_r"] / r**2, p["d"]]))
         b = np.zeros(4)
-        b[2:] = np.linalg.solve(mass, [eta * p["K_tau"] / r * done.controller.current_per_force_A_per_N, 0.0])
+        b[2:] = np.linalg.solve(mass, [eta * p["K_tau"] / r * done.controller.command.per_effort, 0.0])
         c = np.array([p["k"], p["k"] * arm, 0.0, 0.0])
         phi, old, new = _held(a, b, delay)
         x = np.linalg.solve(z[:, None, None] * np.eye(4) - phi, (old / z[:, None] + new)[..., None])[..., 0]

@@ -105,7 +105,7 @@ def test_what_cannot_be_had_is_said(stand, thor):
     found = run_simulations(unlimited, {"stand": stand}, thor)
     assert found.large_signal == ()
     assert "current_limit_A" in found.left_out["large signals"]
-    closed = replace(unlimited, design=(replace(stand, port=None), thor))
+    closed = replace(unlimited, design=(replace(stand, ports=()), thor))
     found = run_simulations(closed, {"stand": stand}, thor)
     assert found.passivity_dict() is None
     assert "no port at link 2" in found.left_out["passivity"]

@@ -29,7 +29,7 @@ def test_a_controller_shows_gains_and_what_is_asked(certificate):
     controller = certificate.controller
     found = {row[0]: row[1:] for row in rows(controller._repr_html_())}
     assert found["k_p"][0] == f"{controller.gains['k_p']:.5g} N/N"
-    assert found["k_p"][1] == f"{controller.gains['k_p'] * controller.current_per_force_A_per_N:.5g} A/N"
+    assert found["k_p"][1] == f"{controller.gains['k_p'] * controller.command.per_effort:.5g} A/N"
     assert found["Ms"] == [f"{controller.achieved.ms:.4g}", "at most 1.6"]
     assert found["Mt"][1] == ""
     assert found["bandwidth"] == ["30 Hz", "30 Hz"]

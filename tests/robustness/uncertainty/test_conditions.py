@@ -59,7 +59,7 @@ class Difference:
         tfs = controller.reference, controller.measurement
         self.num, self.den = [tf.num for tf in tfs], [tf.den for tf in tfs]
         assert np.allclose(*self.den)
-        self.gain = controller.current_per_force_A_per_N
+        self.gain = controller.command.per_effort
         self.r, self.y = ([value] * 12 for value in (reference, measurement))
         self.u = [current / self.gain] * 12
 
@@ -94,7 +94,7 @@ def test_a_draw_is_played_where_it_rests_and_as_late_as_it_is(request, swing, th
     drawn = thor.update(I_p=0.25, d=0.05, f_c=20.0)
     x, force, current = resting_by_hand(drawn, phi)
     sums = [tf.num.sum() for tf in (one.reference, one.measurement)]
-    start = force if law == "controller" else (current / one.current_per_force_A_per_N * one.measurement.den.sum()
+    start = force if law == "controller" else (current / one.command.per_effort * one.measurement.den.sum()
                                                + sums[1] * force) / sums[0]  # fmt: skip
     trace = play(Stage(controller=one, plant=swing), STEP, [thor, at(drawn, phi=phi, delay_s=delay_s)])
     references = start + np.where(np.arange(400) < 120, 30.0, 0.0)
@@ -151,7 +151,7 @@ def test_small_steps_there_are_the_linear_loops(controller, swing, thor):
     law, x, forces = Difference(controller, 0.0, 0.0, 0.0), np.zeros(b.size), []
     for _ in range(300):
         forces.append(float(c @ x))
-        x = a @ x + b * law(0.05, forces[-1]) / controller.current_per_force_A_per_N
+        x = a @ x + b * law(0.05, forces[-1]) / controller.command.per_effort
     assert d == 0.0
     np.testing.assert_allclose(trace.outputs["F1"][0] - trace.rest.force[0], forces, atol=3e-5)
 
@@ -270,9 +270,7 @@ def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(contro
     gain = loop.open_loop(f)
     k = np.flatnonzero((gain.imag[:-1] * gain.imag[1:] < 0) & (gain.real[:-1] < -1))[0]
     needed, s = -1 / gain.real[k], np.linspace(1e-4, 1, 100_001)
-    motor = (
-        9.0 / wild.current_per_force_A_per_N / np.interp(needed, 2 / np.pi * (np.arcsin(s) + s * np.sqrt(1 - s**2)), s)
-    )
+    motor = 9.0 / wild.command.per_effort / np.interp(needed, 2 / np.pi * (np.arcsin(s) + s * np.sqrt(1 - s**2)), s)
     force = np.abs(loop.plant.response(f[k : k + 1]))[0] * needed * motor
     kick = Scenario(name="kick", phases=(Phase(duration_s=0.1, force_N=200.0), Phase(duration_s=3.0)))
     row = verify(wild, {"swing": swing}, thor, scenarios=[kick], draws={"swing": [drawn]}).rows[1]

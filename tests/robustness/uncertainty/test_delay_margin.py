@@ -68,7 +68,12 @@ def closed(base, plant, gain):
     law = TransferFunction(num=np.array([float(gain)]), den=np.array([1.0]))
     spec = so.ControllerSpec(bandwidth_hz=30, measured="F1")
     return replace(
-        base, reference=law, measurement=law, current_per_force_A_per_N=1.0, spec=spec, design=(plant, plant.defaults)
+        base,
+        reference=law,
+        measurement=law,
+        command=replace(base.command, per_effort=1.0),
+        spec=spec,
+        design=(plant, plant.defaults),
     )
 
 

@@ -34,7 +34,7 @@ def by_hand(controller, thor, m_2, k_e, d_e):
     stiffness = np.array([[p["k"], p["k"]], [p["k"], p["k"] + k_e]])
     h = np.linalg.inv(inertia)
     a = np.block([[np.zeros((2, 2)), np.eye(2)], [-h @ stiffness, -h @ np.diag([b, d_e])]])
-    drive = np.concatenate([[0, 0], h[:, 0] * p["K_tau"] / r * controller.current_per_force_A_per_N])
+    drive = np.concatenate([[0, 0], h[:, 0] * p["K_tau"] / r * controller.command.per_effort])
     read = np.array([[p["k"], p["k"], 0.0, 0.0]])
     phi, gamma, *_ = cont2discrete((a, drive[:, None], read, np.zeros((1, 1))), 1e-3, "zoh")
     num, den = controller.measurement.num, controller.measurement.den

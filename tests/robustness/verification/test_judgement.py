@@ -119,7 +119,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
     f = np.arange(0.5, 500.0)
     rounding = np.abs([y @ np.linalg.solve(np.exp(2j * np.pi * x * 1e-3) * np.eye(b.size) - a, b) for x in f])
     rounding = rounding * np.abs(controller.close(stand, thor).sensitivity(f))
-    step = 0.1 / controller.current_per_force_A_per_N / np.sqrt(12.0)
+    step = 0.1 / controller.command.per_effort / np.sqrt(12.0)
     assert view.force_std() ** 2 == pytest.approx(expected + step**2 * np.mean(rounding**2), rel=5e-3)
 
 

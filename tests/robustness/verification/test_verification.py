@@ -92,7 +92,7 @@ def test_the_step_limit_is_where_the_current_saturates(controller, stand, thor):
     x, memory, largest = np.zeros(len(b)), law.reset(), 0.0
     for _ in range(200):
         current, memory = law.step(memory, 1.0, float(c @ x))
-        x = a @ x + b * current / controller.current_per_force_A_per_N
+        x = a @ x + b * current / controller.command.per_effort
         largest = max(largest, abs(current))
     assert step_limit(controller) == pytest.approx(9.0 / largest, rel=1e-4)
 
@@ -109,7 +109,7 @@ def test_a_limit_cycle_is_found_where_the_describing_function_says(controller, s
     needed = -1 / gain.real[at]
     s = np.linspace(1e-4, 1, 100_001)
     shape = 2 / np.pi * (np.arcsin(s) + s * np.sqrt(1 - s**2))
-    motor = 9.0 / wild.current_per_force_A_per_N / np.interp(needed, shape, s)
+    motor = 9.0 / wild.command.per_effort / np.interp(needed, shape, s)
     force = np.abs(loop.plant.response(f[at : at + 1]))[0] * needed * motor
 
     kick = Scenario(name="kick", phases=(Phase(duration_s=0.1, force_N=200.0), Phase(duration_s=3.0)))
@@ -164,7 +164,7 @@ def test_a_payload_arrives(controller, swing, thor):
 
 def test_what_cannot_be_played_is_said(controller, stand, swing, thor):
     contact = Scenario(name="contact", phases=(Phase(duration_s=0.1, held=True), Phase(duration_s=0.5)))
-    verification = verify(replace(controller, design=None), {"swing": swing}, thor, scenarios=[contact])
+    verification = verify(controller, {"swing": replace(swing, ports=())}, thor, scenarios=[contact])
     assert not verification.passed
     assert verification.skipped == (
         ("contact", "swing", "there is no plant with the same actuator and its link fixed"),
@@ -257,7 +257,7 @@ def test_far_above_the_limit_the_current_is_a_square_wave(controller, stand, tho
     sweep = large_signal(controller, stand, thor, amplitudes_N=(2e4,), frequencies_hz=(40.0,))
     f = sweep.frequency_hz
     plant = np.abs(controller.plant(stand, thor).response(f))[0]
-    expected = 4 / np.pi * 9.0 / controller.current_per_force_A_per_N * plant
+    expected = 4 / np.pi * 9.0 / controller.command.per_effort * plant
     assert np.abs(sweep.gain[0, 0]) * 2e4 == pytest.approx(expected, rel=0.02)
 
 

@@ -1,0 +1,168 @@
+"""What the parts of a plant are for: what a controller commands, what is measured, where the world touches it.
+
+A plant states its roles when it is made, so that tuning, certificates and simulation never guess them from names.
+Expressions of a role are functions of the plant's namespaces, as `f` and `h` are; names are those of its own states,
+inputs, outputs and parameters, whose units the plant knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from seaopt.records import record
+
+Expression = Callable[[Any], Any]  # of the parameters p
+StateExpression = Callable[[Any, Any], Any]  # of the states x and the parameters p
+PlantMaker = Callable[[], Any]  # makes another plant; untyped, for the plant's module imports this one
+
+
+def _one(p: Any) -> float:
+    return 1.0
+
+
+@record(eq=False)
+class Actuation:
+    """What a controller commands.
+
+    Parameters
+    ----------
+    input : str
+        The commanded input, the first of the plant's.
+    effort : callable ``p -> expression``
+        The effort at the spring that one unit of the input makes.
+    unit : str
+        Of the effort: N or N m.
+    efficiency : str or None
+        The parameter that scales the effort and says what the transmission loses.
+
+    """
+
+    input: str
+    effort: Expression
+    unit: str = "N"
+    efficiency: str | None = None
+
+
+@record
+class Sensing:
+    """What is regulated, and what a sensor may feed back: names of outputs, or of states.
+
+    Parameters
+    ----------
+    regulated : tuple of str
+        Forces or torques at the spring or behind it, the first the one that is regulated as a rule; load cells read
+        them.
+    motor_position, motor_speed, link_position : str or None
+        What encoders on either side of the spring read.
+
+    """
+
+    regulated: tuple[str, ...]
+    motor_position: str | None = None
+    motor_speed: str | None = None
+    link_position: str | None = None
+
+
+@record(eq=False)
+class SeriesSpring:
+    """The elastic element.
+
+    Parameters
+    ----------
+    deflection : callable ``(x, p) -> expression``
+        How far it is compressed or twisted.
+    unit : str
+        Of the deflection: m or rad.
+    stiffness : str or None
+        The parameter that is its stiffness, where one is.
+    mass, damping : str or None
+        The derived figures that (16) of Orekhov et al. 2015 reads from a second-order response with k known.
+
+    """
+
+    deflection: StateExpression
+    unit: str
+    stiffness: str | None = None
+    mass: str | None = None
+    damping: str | None = None
+
+
+@record(eq=False)
+class Friction:
+    """A dissipative force of one velocity, opposite to it; what grows in proportion to the velocity may stay in `f`.
+
+    In `f` and `h` the force stands among the inputs under the friction's name, ``u.NAME``.
+
+    Parameters
+    ----------
+    velocity : callable ``(x, p) -> expression``
+    force : callable ``(velocity, p) -> expression``
+        The curve, positive where the velocity is.
+    unit : str
+        Of the force.
+    effort : callable ``p -> expression``
+        The effort at the spring that one unit of the force takes; 1 if left out.
+
+    """
+
+    velocity: StateExpression
+    force: Callable[[Any, Any], Any]
+    unit: str = "N"
+    effort: Expression = _one
+
+
+@record(eq=False)
+class Port:
+    r"""Where the world touches an actuator: at one of its links, which moves or is held.
+
+    Parameters
+    ----------
+    motion : str or None
+        The output that says where the port is; None where the plant has it held.
+    coordinate, rate : str or None
+        The states of the link alone, which are gone in the plant with the port held.
+    effort : str or None
+        The input that is the world's force or torque along the motion, where the plant has one.
+    payload : tuple of str
+        The parameters that grow when the link carries more.
+    held : callable ``() -> Plant``, optional
+        Makes the same actuator with this port held.
+    drive : str or None
+        The state of the drive that the spring adds to the motion, and `ratio` (``p -> expression``, 1 if left out) by
+        how much: with the port held at y, the held plant counts that state from -ratio y.
+    probe : callable ``() -> Plant``, optional
+        Makes the same actuator with its other links held and a bare inertia on this one, for the impedance at the
+        port. That plant's first port has motion and coordinate in one, the effort, and the inertia as its payload.
+
+    """
+
+    motion: str | None = None
+    coordinate: str | None = None
+    rate: str | None = None
+    effort: str | None = None
+    payload: tuple[str, ...] = ()
+    held: PlantMaker | None = None
+    drive: str | None = None
+    ratio: Expression = _one
+    probe: PlantMaker | None = None
+
+
+@record
+class Mode:
+    """A mode whose frequency one parameter sets, so that an uncertainty may be given as a range of that frequency.
+
+    Parameters
+    ----------
+    name : str
+        Of the frequency in ranges, ending in ``_hz``.
+    parameter : str
+        That sets it; more of it lowers the frequency.
+    state : str
+        That takes most part in it.
+
+    """
+
+    name: str
+    parameter: str
+    state: str
