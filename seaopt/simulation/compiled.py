@@ -80,7 +80,7 @@ def _text(name: str) -> str:
 
 
 def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
-    """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives a row."""
+    """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives per row."""
     a, b = pattern
     lines = [
         f"static inline void seaopt_{name}_chain(const double *a, const double *b,",

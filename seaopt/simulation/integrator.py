@@ -6,8 +6,8 @@ compiled code needs to do the same faster: differentiating the four stages gives
 
 .. math:: \dot S = f_x S + f_p,
 
-so that one evaluation of :math:`f, f_x, f_p` a stage serves every derivative, and the sensitivities are again those of
-the numbers that the step computes.
+so that one evaluation of :math:`f, f_x, f_p` per stage serves every derivative, and the sensitivities are again those
+of the numbers that the step computes.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Rates:
     Parameters
     ----------
     prepare : Function
-        p -> c, once a pass.
+        p -> c, once per pass.
     rate, output : Function
         (t, x, u, c) -> f or h, and the nonzeros of its derivatives by x and by theta.
     rate_pattern, output_pattern : tuple of lists of (row, column)

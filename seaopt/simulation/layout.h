@@ -1,5 +1,5 @@
 /* Sizes of the arrays of a pass. Built with these constants in front (see seaopt/simulation/compiled.py):
-     NX states, NU inputs, NY outputs, ND drift terms an output,
+     NX states, NU inputs, NY outputs, ND drift terms per output,
      NP derivatives that are shared: parameters (NQ), then a free delay, then what only the correction gain depends on;
      NI linear only: forcing terms (inputs in force, and the constant); LINEAR, CORRECT, DELAYED 0 or 1. */
 #include <math.h>

@@ -55,7 +55,7 @@ class Weights:
 
 @record(eq=False)
 class Segment:
-    """A gap-free stretch of a log: one array a channel, in the order of a model's inputs and outputs.
+    """A gap-free stretch of a log: one array per channel, in the order of a model's inputs and outputs.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Segment:
     y : tuple of arrays, shape (n,)
         Measured outputs, NaN where missing. Empty: simulate only.
     keep : tuple of arrays, shape (n,)
-        One an output, 0 where a sample gets no weight. Empty: all are kept.
+        One per output, 0 where a sample gets no weight. Empty: all are kept.
     lead : int
         How many of the input samples go before the first sample: what a delay reaches back to.
     start_s : float
@@ -112,7 +112,7 @@ class Point:
     clock : Clock
         Period, hold and delay.
     substeps : int
-        Runge-Kutta steps a period (a linear model needs none).
+        Runge-Kutta steps per period (a linear model needs none).
     correction : array, shape (1 + ns, nx, ny), or None
         Gain by which the prediction error corrects the next state, and its derivatives with respect to theta, a free
         delay, and what else it depends on (ns in all). None: the plant is simulated.
@@ -129,7 +129,7 @@ class Point:
 
     @property
     def drift_terms(self) -> int:
-        """Drift coefficients an output."""
+        """Drift coefficients per output."""
         return self.drift.shape[1]
 
 

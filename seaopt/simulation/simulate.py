@@ -156,7 +156,7 @@ def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx
             break
         if substeps >= MAX_SIMULATION_SUBSTEPS:
             raise SimulationError(
-                f"plant {model.plant.name}: {substeps} steps a sample leave an error of {error:.1e} of the signal "
+                f"plant {model.plant.name}: {substeps} steps per sample leave an error of {error:.1e} of the signal "
                 f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
             )
     return result

@@ -1,4 +1,4 @@
-r"""The loop as it will run: a continuous nonlinear plant and a law that acts once a sample.
+r"""The loop as it will run: a continuous nonlinear plant and a law that acts once per sample.
 
 At sample k the load cell reads :math:`m_k = Q(y_k + n_k)`, noise :math:`n_k` and quantisation Q as `Sensors` says; the
 law `RunnableLaw` makes of it and of the reference a motor force, limited, with its anti-windup; the current
@@ -69,7 +69,7 @@ class LoopRun:
     error : float
         Estimated integration error of the worst sample, over the state's largest value.
     substeps : int
-        Integration steps a sample.
+        Integration steps per sample.
     wall_s : float
         Time the simulation took, with steps that were too long, but not compilation.
 
@@ -122,7 +122,7 @@ def run_loop(
     loop : SampledLoop
         Plant, law and devices.
     params : sequence of ParameterSet
-        One a run; `delay_s` among them is delay besides the controller's, exact between samples too.
+        One per run; `delay_s` among them is delay besides the controller's, exact between samples too.
     reference : array, shape (n,) or (runs, n)
         F_ref at each sample, N.
     start : LoopState, optional
@@ -159,7 +159,7 @@ def run_loop(
 
     """
     if not params:
-        raise SimulationError("run_loop got no parameters; give one ParameterSet a run")
+        raise SimulationError("run_loop got no parameters; give one ParameterSet per run")
     runs = len(params)
     wanted = np.atleast_2d(reference).astype(float)
     if wanted.ndim != 2 or wanted.shape[0] not in (1, runs) or not wanted.shape[1]:
@@ -175,7 +175,7 @@ def run_loop(
         start_s=start_s,
     )
     if job.start.x.shape != (runs, len(loop.plant.states)):
-        raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state a run")
+        raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state per run")
     substeps, before, wall_s = _first_guess(loop, params, rtol), None, 0.0
     execute = make_kernel(loop)
     while True:
@@ -189,10 +189,10 @@ def run_loop(
             return _result(loop, job, arrays, error, substeps, wall_s)
         if 2 * substeps > MAX_LOOP_SUBSTEPS:
             raise SimulationError(
-                f"plant {loop.plant.name}: {2 * substeps} steps a sample leave an error of {error:.1e} of a state "
+                f"plant {loop.plant.name}: {2 * substeps} steps per sample leave an error of {error:.1e} of a state "
                 f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
                 if decided
-                else f"plant {loop.plant.name}: {2 * substeps} steps a sample do not decide whether the loop runs "
+                else f"plant {loop.plant.name}: {2 * substeps} steps per sample do not decide whether the loop runs "
                 "away or the steps are too long; check the parameters"
             )
         substeps, before = 2 * substeps, arrays
@@ -256,7 +256,7 @@ def _external(plant: Plant, signals: Mapping[str, Float[np.ndarray, " n"]], n: i
                 f'external has "{name}", which is not another input of {plant.name}; {suggestion(name, names)}'
             )
         if values.shape != (n,):
-            raise SimulationError(f"external {name} has the shape {values.shape}; give ({n},), one value a sample")
+            raise SimulationError(f"external {name} has the shape {values.shape}; give ({n},), one value per sample")
     columns = [signals.get(name, np.zeros(n)) for name in names]
     return np.ascontiguousarray(np.column_stack(columns) if columns else np.zeros((n, 0)), dtype=float)
 

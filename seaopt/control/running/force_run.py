@@ -1,7 +1,7 @@
 """A digital law that is a Python function, such as a predictive one, on a plant as it is, nonlinear and continuous.
 
 A law that is a `RunnableLaw` runs in `seaopt.control.running.closed_loop`, compiled and over many draws at once. Here
-is what that cannot do: any callable, called once a sample. The plant between the samples is the same, with the same
+is what that cannot do: any callable, called once per sample. The plant between the samples is the same, with the same
 steps and the same error: each sample is integrated with n and with 2n of them, and n doubled until they agree to
 `rtol`.
 """
@@ -29,7 +29,7 @@ from seaopt.plants.plant import output_function
 from seaopt.records import record
 
 State = TypeVar("State")
-FIRST_SUBSTEPS = 2  # coarse steps a sample to begin with
+FIRST_SUBSTEPS = 2  # coarse steps per sample to begin with
 
 
 @record(eq=False)
@@ -46,7 +46,7 @@ class ForceRun:
     error : float
         Estimated integration error of the worst sample, over the state's largest value until then.
     substeps : int
-        Integration steps a sample, at the end.
+        Integration steps per sample, at the end.
 
     """
 
@@ -112,7 +112,7 @@ def close_loop(
     plant, params
         As it is, not only as the law was designed for; `delay_s` among the parameters is delay besides `delay_samples`.
     reference : array, shape (n,)
-        N, one value a sample.
+        N, one value per sample.
     measured : str
         The output that the law sees.
     sample_time_s : float
@@ -215,9 +215,9 @@ class _Integrator:
         if not np.all(np.isfinite(fine)):
             raise ControlError(f"the loop on {self.plant.name} runs away at t = {t:g} s; tune it again")
         raise SimulationError(
-            f"plant {self.plant.name}: {2 * self.substeps} steps a sample leave an error of {error:.1e} of a state at "
-            f"t = {t:g} s (rtol = {self.rtol:g}); check the parameters and that the loop does not run away, smooth the "
-            "friction (v_s), or raise rtol"
+            f"plant {self.plant.name}: {2 * self.substeps} steps per sample leave an error of {error:.1e} of a state "
+            f"at t = {t:g} s (rtol = {self.rtol:g}); check the parameters and that the loop does not run away, smooth "
+            "the friction (v_s), or raise rtol"
         )
 
 

@@ -23,7 +23,7 @@ from seaopt.records import record
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 
 CHAINED_SAMPLES = 250  # samples that the virtual machine chains in one call
-MAX_EXPANDED_STEPS = 8  # coarse steps a sample up to which its operations are one flat list there
+MAX_EXPANDED_STEPS = 8  # coarse steps per sample up to which its operations are one flat list there
 Rows = Float[np.ndarray, "runs n"]
 
 

@@ -69,7 +69,7 @@ class Bench:
     offset, initial : bool
         Whether those are estimated too.
     substeps : int
-        Integration steps a sample.
+        Integration steps per sample.
 
     """
 
