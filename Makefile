@@ -13,7 +13,7 @@ PYTEST := $(BIN)/python -m pytest
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
 METHODS     := tests/estimation/solver/test_methods.py
-INTERPRETED := tests/simulation tests/estimation/result/test_fit.py tests/estimation/result/test_nist.py tests/test_whole_path.py \
+INTERPRETED := tests/simulation tests/estimation/result/test_fit.py tests/estimation/result/test_nist.py \
                $(METHODS)::test_prediction_error_sees_noise_inside_the_plant \
                $(METHODS)::test_slow_drift_is_taken_out $(METHODS)::test_shots_start_where_the_plant_is
 
