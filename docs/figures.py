@@ -24,7 +24,7 @@ from seaopt.control import (
     sweep,
 )
 from seaopt.control.laws.realisation import realise, runnable
-from seaopt.control.loops.port import held, port_of
+from seaopt.control.loops.port import hold_response, port_of
 from seaopt.estimation import Limits, design_experiment
 from seaopt.reporting.verification import large_signal_figure, stability_figure
 from seaopt.robustness.verification.environments import coupled_stability
@@ -201,8 +201,8 @@ def passivity() -> None:
     without = np.zeros(f.size, dtype=complex)
     laws = {
         "no control": without,
-        "pid, held, one sample late": c_y.response(f, 1e-3) * held(f, 1e-3, 1),
-        "the same, two samples late": c_y.response(f, 1e-3) * held(f, 1e-3, 2),
+        "pid, held, one sample late": c_y.response(f, 1e-3) * hold_response(f, 1e-3, 1),
+        "the same, two samples late": c_y.response(f, 1e-3) * hold_response(f, 1e-3, 2),
     }
     for (label, law), colour in zip(laws.items(), ("#777777", "#0072b2", "#d55e00"), strict=True):
         z = port.response(f).impedance(law)

@@ -233,11 +233,11 @@ def wrapped(
             if not signals:
                 listed = f"none of the outputs {', '.join(outputs)}" if outputs else "no regulated output"
                 raise PlantError(f"plant {plant.name} has {listed} that {part} reads; name others")
-        plant = _filtered(plant, part, signals)
+        plant = _add_filter(plant, part, signals)
     return plant
 
 
-def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
+def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
     """Return a plant with one filter on each of the named inputs or outputs."""
     law, parameter, where, order = _FILTERS[part]
     if parameter in plant.parameters:
@@ -265,14 +265,14 @@ def _filtered(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
             rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
         return inner_u, dict(out), rates
 
-    def filtered_as_well(make: Callable[[], Plant]) -> Plant:
+    def make_filtered(make: Callable[[], Plant]) -> Plant:
         inner = make()
         known = inner.inputs if where == "input" else inner.outputs
-        return _filtered(inner, part, [signal for signal in signals if signal in known])
+        return _add_filter(inner, part, [signal for signal in signals if signal in known])
 
     def port_behind(port: Port) -> Port:
         makers = {"held": port.held, "probe": port.probe}
-        behind = {name: partial(filtered_as_well, make) for name, make in makers.items() if make is not None}
+        behind = {name: partial(make_filtered, make) for name, make in makers.items() if make is not None}
         return replace(port, **behind)
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:

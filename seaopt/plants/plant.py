@@ -126,8 +126,8 @@ class Plant:
         put(self, "t", time)
         for key, named in symbols.items():
             put(self, key, ca.vertcat(*named.values()) if named else ca.SX(0, 1))
-        put(self, "dynamics", _stack(self, "f", _called(self, "f", self.f, time, *spaces), self.states))
-        put(self, "output", _stack(self, "h", _called(self, "h", self.h, time, *spaces), self.outputs))
+        put(self, "dynamics", _stack(self, "f", _evaluate_equations(self, "f", self.f, time, *spaces), self.states))
+        put(self, "output", _stack(self, "h", _evaluate_equations(self, "h", self.h, time, *spaces), self.outputs))
         _check_structure(self)
         _check_roles(self)
 
@@ -350,7 +350,7 @@ def _in_unit(item: Parameter, unit: str, plant: str) -> Parameter:
     return replace(item, value=item.value * scale, unit=unit, min=low, max=high, prior_std=prior, std=std)
 
 
-def _called(plant: Plant, what: str, equations: Equations, *arguments: Any) -> Mapping[str, Any]:
+def _evaluate_equations(plant: Plant, what: str, equations: Equations, *arguments: Any) -> Mapping[str, Any]:
     """Return what f or h gives; a name that it uses and that is not there is a PlantError."""
     try:
         return equations(*arguments)

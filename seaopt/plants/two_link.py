@@ -202,12 +202,12 @@ def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
     )  # fmt: skip
 
 
-def _listed(parts: Sequence[Part]) -> tuple[Part, ...]:
+def _as_tuple(parts: Sequence[Part]) -> tuple[Part, ...]:
     part_laws.check_parts(parts)
     return tuple(parts)
 
 
-def _checked(build: _Build) -> _Build:
+def _check_build(build: _Build) -> _Build:
     for what, given, known in (
         ("drive", build.drive, ("unlumped", "lumped")),
         ("spring", build.spring, ("link1", "link2")),
@@ -222,7 +222,7 @@ def _checked(build: _Build) -> _Build:
 
 def _actuator(name: str, build: _Build, external: bool) -> Plant:
     """Return the plant of a build: its own states and parameters, then the parts that wrap any plant."""
-    _checked(build)
+    _check_build(build)
     states = {"q": "m", "qd": "m/s"} | ({"s": "m", "sd": "m/s"} if "screw_mode" in build.parts else {})
     outputs = {"F1": "N", "F2": "N", "q": "m"}
     parameters = [*ACTUATOR, *part_laws.parameters(build.parts)]
@@ -374,7 +374,7 @@ def two_link(
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
 
     """
-    build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=_listed(parts))
+    build = _Build(links=(link1, link2), suffixes=("1", "2"), drive=drive, spring=spring, parts=_as_tuple(parts))
     return _actuator(f"two_link({link1}, {link2}, {drive})", build, external=True)
 
 
@@ -409,7 +409,7 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
     True
 
     """
-    build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=_listed(parts))
+    build = _Build(links=("fixed", "fixed"), suffixes=("1", "2"), drive=drive, spring=spring, parts=_as_tuple(parts))
     return _actuator(f"high_impedance({drive})", build, external=False)
 
 
@@ -437,5 +437,5 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Se
     ['F1', 'F2', 'q', 'phi', 'x_2']
 
     """
-    build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=_listed(parts))
+    build = _Build(links=("fixed", "pendulum"), suffixes=("1", ""), drive=drive, spring=spring, parts=_as_tuple(parts))
     return _actuator(f"moving_output({drive})", build, external=False)

@@ -46,7 +46,7 @@ from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.loop import GROWING, Loop
-from seaopt.control.loops.port import Frequencies, PortModel, Response, held, port_of, sight
+from seaopt.control.loops.port import Frequencies, PortModel, Response, hold_response, port_of, sight
 from seaopt.control.loops.sampled_plant import DigitalPlant, hold
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -266,7 +266,9 @@ def _curves(port: PortModel, law: TransferFunction, sample_time_s: float, delay_
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
     def impedance(f: Frequencies) -> Response:
-        return port.response(f).impedance(law.response(f, sample_time_s) * held(f, sample_time_s, delay_samples))
+        return port.response(f).impedance(
+            law.response(f, sample_time_s) * hold_response(f, sample_time_s, delay_samples)
+        )
 
     def angle(f: Frequencies) -> Frequencies:
         z = impedance(f)

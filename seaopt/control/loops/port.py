@@ -189,7 +189,7 @@ def bare_port(probe: Plant) -> BarePort:
     return BarePort(effort=port.effort, coordinate=port.coordinate, rate=port.rate, inertia=port.payload[0])
 
 
-def held(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:
+def hold_response(f: Frequencies, sample_time_s: float, delay_samples: int) -> Response:
     """Return the response of a delay and a zero-order hold."""
     return np.sinc(f * sample_time_s) * np.exp(-2j * np.pi * f * sample_time_s * (0.5 + delay_samples))
 
@@ -211,4 +211,4 @@ def sight(port: PortModel, sample_time_s: float, delay_samples: int, f: Frequenc
             "the force at the port does not follow from the measured one alone (an elastic screw between them), so "
             "that passivity is not affine in the gains; leave the constraint out and read the band that is reported"
         )
-    return g11 * held(f, sample_time_s, delay_samples), g22 / np.abs(g22)
+    return g11 * hold_response(f, sample_time_s, delay_samples), g22 / np.abs(g22)

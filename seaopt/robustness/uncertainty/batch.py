@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.response import LARGEST_ENTRY, law_state_space
-from seaopt.control.loops.sampled_plant import DELAY, Linear, conditions, conditions_of, hold, linearised
+from seaopt.control.loops.sampled_plant import DELAY, LinearPlants, conditions, conditions_of, hold, linearised
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -149,7 +149,7 @@ class Products:
 
 
 def _close_piece(
-    controller: Controller, continuous: Linear, delay: Float[np.ndarray, " k"], peaks: bool
+    controller: Controller, continuous: LinearPlants, delay: Float[np.ndarray, " k"], peaks: bool
 ) -> tuple[Float[np.ndarray, " k"], ...]:
     """Return spectral radius, Ms and Mt of some draws."""
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import Gains, TransferFunction, command_of
 from seaopt.control.laws.passivity import passivity, passivity_rows
-from seaopt.control.loops.port import held, port_of
+from seaopt.control.loops.port import hold_response, port_of
 from seaopt.errors import ControlError
 from seaopt.plants import high_impedance, moving_output, two_link
 
@@ -74,7 +74,7 @@ def test_the_loop_is_the_sampled_one_at_low_frequency(thor, stand):
     controller = controller_of(delay_samples=2)
     f = np.geomspace(0.1, 30, 20)
     g = port_of(stand, thor, "F1", controller.command.per_effort).response(f).motor_to_feedback
-    np.testing.assert_allclose(g * held(f, TS, 2), controller.plant(stand, thor).response(f), rtol=0.01)
+    np.testing.assert_allclose(g * hold_response(f, TS, 2), controller.plant(stand, thor).response(f), rtol=0.01)
 
 
 def power(controller, params, f_hz, periods, steps=20):
@@ -111,7 +111,7 @@ def test_the_real_part_is_the_power_that_a_sampled_loop_takes(f_hz, tolerance, t
     """Simulated with its sampler, hold and delay; at 100 Hz the loop gives power away. Tolerances are of abs(Z)."""
     controller = controller_of(k_i=20.0)
     f = np.array([f_hz])
-    law = controller.measurement.response(f, TS) * held(f, TS, 1)
+    law = controller.measurement.response(f, TS) * hold_response(f, TS, 1)
     z = port_of(stand, thor, "F1", controller.command.per_effort).response(f).impedance(law)[0]
     taken = power(controller, thor, f_hz, periods=2 * f_hz)
     assert taken == pytest.approx(z.real, abs=tolerance * abs(z))
@@ -182,7 +182,7 @@ def test_a_loop_that_breaks_the_rule_is_unstable_with_the_right_spring(thor, sta
     assert controller.close(stand, thor).figures().stable
     assert found.violated_hz == found.low_hz
     f = np.array([found.least_hz])
-    law = controller.measurement.response(f, TS) * held(f, TS, 1)
+    law = controller.measurement.response(f, TS) * hold_response(f, TS, 1)
     z = port_of(stand, thor, "F1", controller.command.per_effort).response(f).impedance(law)[0]
     w = 2 * np.pi * found.least_hz
     mass, stiffness = (-z.imag / w, 0.0) if z.imag < 0 else (1e-3, z.imag * w)

@@ -226,6 +226,7 @@ def test_what_cannot_be_enclosed_is_left_out(controller, stand, thor):
     plant = so.Plant(
         name="odd", states=stand.states, inputs=stand.inputs, outputs=stand.outputs, parameters=stand.parameters,
         f=lambda t, x, u, p: stand.f(t, x, u, p) | {"q": x.qd * (1.0 + ca.erf(p.eta - 1.0))}, h=stand.h,
+        friction=stand.friction,
     )  # fmt: skip
     bounds = bracket(controller, plant, of(plant, thor, {"eta": (0.9, 1.0)}))
     assert "erf" in bounds.left_out
