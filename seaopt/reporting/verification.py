@@ -11,9 +11,9 @@ from seaopt.reporting.figures import MEASURED, MODEL, PLANT_COLOURS, panels
 from seaopt.reporting.templates import render_template
 from seaopt.robustness.certificate.simulated import Simulated
 from seaopt.robustness.verification.environments import StabilityMap
-from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judged_window
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome, find_judged_window
 from seaopt.robustness.verification.large_signal import LargeSignal
-from seaopt.robustness.verification.playback import Trace
+from seaopt.robustness.verification.playback import Playback
 from seaopt.robustness.verification.verification import Verification
 
 if TYPE_CHECKING:
@@ -60,16 +60,16 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
     return figure
 
 
-def _visible_until(trace: Trace) -> float:
+def _visible_until(trace: Playback) -> float:
     """Return how much of a trace is drawn: all of one phase, else the last one's beginning."""
     if len(trace.edges) == 2:
         return float(trace.time[-1])
     return float(trace.time[trace.edges[-2]]) + max(LAST_PHASE_S, float(trace.time[trace.edges[-2]]))
 
 
-def _phases(axes: tuple[Axes, Axes], trace: Trace, until: float, verification: Verification, row: Outcome) -> None:
+def _phases(axes: tuple[Axes, Axes], trace: Playback, until: float, verification: Verification, row: Outcome) -> None:
     if not row.passed:
-        window = judged_window(trace)
+        window = find_judged_window(trace)
         for axis in axes:
             axis.axvspan(
                 float(trace.time[window.start]), float(trace.time[window.stop - 1]), color=JUDGED_COLOUR, zorder=0

@@ -23,7 +23,7 @@ from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.worst import Worst, measure_worst
-from seaopt.robustness.verification.verification import witness
+from seaopt.robustness.verification.verification import describe_witness
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
@@ -371,7 +371,8 @@ def _require_simulations(simulations: Simulated) -> list[Requirement]:
         rows += [
             Requirement(
                 name=SIMULATION_FAILURES, limit=0.0, value=1.0, met=False,
-                where=f"{plant}, {row.scenario}, draw {row.draw}, seed {verification.seed}: {row.reason}{witness(row)}",
+                where=f"{plant}, {row.scenario}, draw {row.draw}, seed {verification.seed}: {row.reason}"
+                + describe_witness(row),
             )
             for row in failed
         ]  # fmt: skip

@@ -79,7 +79,7 @@ class Simulated:
         if self.verification is not None:
             failed, count = len(self.verification.failures), len(self.verification.rows)
             out.append(f"simulation: {f'{failed} of {count} runs FAILED' if failed else f'{count} runs passed'}")
-            out += self.verification.following()
+            out += self.verification.describe_tracking()
         out += [f"large signals on {sweep.plant}: {_format_large(sweep)}" for sweep in self.large_signal]
         if self.passivity is not None:
             out.append(f"port at link 2: passive {_format_bands(self.passivity)}")

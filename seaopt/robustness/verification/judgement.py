@@ -1,24 +1,23 @@
-"""Whether what a run showed is allowed.
+"""The judgement of each simulated run, for verification: its figures, and whether they are allowed.
 
-What every run is judged by:
+A run passes if:
 
-- it stays finite, and the current within the limit: the last whole step of the amplifier within it;
+- it stays finite, and the current stays within the limit, rounded down to a whole step of the amplifier;
 - the linear loop of the last phase is stable (`linear`). An unstable one may still settle by luck, on a step of the
-  sensor or because the scenario does not move what grows;
-- nothing grows without noise: the run is played again on a sensor and an amplifier that only have a range. In its last
-  phase, where the reference is constant, the largest energy of the second half (after a fifth of settling) is no more
-  than that of the first, with 5 % and a thousandth of the whole run's to spare. With the force held, the loop works on
-  the link like a constant force, which is conservative: over a swing the energy of link and actuator comes back to
-  where it was, unless the loop feeds it. Where a plant declares no energy, the square of the force's error stands for
-  it. What counts is the energy above or below that of the rest where the run started. This sees growth within seconds;
-  a mode that takes minutes is seen by the eigenvalues. Noise itself moves energy up and down, more than 5 %, which is
-  no growth;
-- noise does not set off what would not grow without: in the second half the force is off by no more than twice what it
-  was before, with or without noise, and six standard deviations of what noise makes in the linear loop;
-- no oscillation sustains itself in the last phase (`oscillation`), above what noise and quantisation make. Where a link
-  moves, slower ones than a tenth of the bandwidth are not looked at: an undamped link that swings is its own business;
-- the limits of the scenario: the final error, a mean, with four of its standard deviations of noise to spare, and
-  without noise with none.
+  sensor or because the scenario does not excite the growing mode;
+- nothing grows without noise: the run is simulated again on a sensor and an amplifier that only have a range. In its
+  last phase, where the reference is constant, the largest energy of the second half (after a fifth for settling) does
+  not exceed that of the first by more than 5 % and a thousandth of the whole run's. Under a constant reference the loop
+  acts on the link like a constant force, which is conservative: over a swing the energy of link and actuator returns
+  to its value, unless the loop feeds it. Where a plant declares no energy, the square of the force error replaces it.
+  Energy is counted from that of the rest where the run started. This finds growth within seconds; the eigenvalues find
+  a mode that takes minutes. Noise moves the energy by more than 5 %, which is not growth;
+- noise does not set off an oscillation: in the second half the force error is at most twice what it was before, with or
+  without noise, plus six standard deviations of the force that noise makes in the linear loop;
+- no oscillation sustains itself in the last phase (`oscillation`), above the level of noise and quantisation. Where a
+  link moves, oscillations slower than a tenth of the bandwidth are excluded: an undamped link may swing;
+- the scenario's limits are met: the final error, a mean, with an allowance of four standard deviations of its noise,
+  and of none in the run without noise.
 """
 
 from __future__ import annotations
@@ -35,20 +34,21 @@ from seaopt.control.running.closed_loop import ENERGY
 from seaopt.control.running.sampled_loop import largest_current
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
-from seaopt.robustness.verification.linear import LinearView, linear_view
+from seaopt.robustness.verification.linear import LinearView, linearise_last_phase
 from seaopt.robustness.verification.oscillation import find_oscillation
-from seaopt.robustness.verification.playback import Stage, Trace
+from seaopt.robustness.verification.playback import Playback, Stage
 from seaopt.robustness.verification.scenarios import Scenario
 
-SETTLE = 0.2  # of the last phase, before it is judged
+SETTLE = 0.2  # of the last phase, which is not judged
 GROWTH, GROWTH_FLOOR = 1.05, 1e-3
 OUTBREAK, OUTLIER = 2.0, 6.0
-LINE = 4.0  # standard deviations of noise that a line in the spectrum stays below: its amplitude is Rayleigh's
-MEAN = 4.0  # standard deviations of a mean
-WINDOW_S = 3.0
-SLOWER, PERIODS = 10.0, 8.0  # how far below the bandwidth oscillations are looked for, and how many periods of them
-SHORTER = 4.0
-STILL_PERIODS = 4.0  # where no link moves: the slowest that a window tells from a drift
+LINE_SIGMAS = 4.0  # standard deviations of noise that a line in its spectrum stays below: the amplitude is Rayleigh's
+MEAN_SIGMAS = 4.0  # standard deviations that a mean of noise stays below
+LEAST_WINDOW_S = 3.0
+SLOWEST = 10.0  # times slower than the bandwidth: the slowest oscillation that is looked for
+LINE_PERIODS = 8.0  # of the slowest oscillation, in the window
+SHORTER = 4.0  # times shorter: the second window
+STILL_PERIODS = 4.0  # where no link moves: of the slowest oscillation that is distinct from a drift
 NOMINAL = "nominal"
 
 
@@ -66,13 +66,13 @@ class Outcome:
     parameters : mapping of name to float
         Where the draw differs from nominal: with scenario, plant and seed, the witness.
     peak_force_N, peak_current_A : float
-        Of the measured output (in its unit), between samples too, and of the command.
+        Peaks of the measured output (in its unit), between samples too, and of the command.
     saturated : float
         Share of the samples at the current limit.
     peak_angle_rad : float or None
-        Of the plant's angles.
+        Peak of the plant's angles.
     peak_energy_J, energy_growth : float or None
-        Largest energy; largest of the last phase's second half over that of its first.
+        Largest energy; ratio of the largest in the last phase's second half to that in its first.
     final_error_N : float or None
         Mean of reference minus force over the last fifth of the last phase.
     limit_cycle_N, limit_cycle_hz : float or None
@@ -103,52 +103,51 @@ class Outcome:
 
 @record
 class _Findings:
-    """What one run showed, as figures of an `Outcome`, and sentences on what is not allowed."""
+    """Figures of one run, as fields of an `Outcome`, and sentences on what is not allowed."""
 
     figures: dict[str, Any] = field(default_factory=dict[str, Any])
     faults: list[str] = field(default_factory=list[str])
 
 
-def judged(
-    stage: Stage, name: str, scenario: Scenario, trace: Trace, run: int, sets: Sequence[ParameterSet],
-    ideal: Trace | None = None,
+def judge_run(
+    stage: Stage, name: str, scenario: Scenario, trace: Playback, run: int, sets: Sequence[ParameterSet],
+    ideal: Playback | None = None,
 ) -> Outcome:  # fmt: skip
     """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first.
 
     `ideal` is the same scenario on `stage.ideal`; the trace itself where the stage is ideal.
     """
-    found, twin = _Findings(), trace if ideal is None else ideal
-    view = linear_view(stage, scenario, sets[run])
+    findings, twin = _Findings(), trace if ideal is None else ideal
+    view = linearise_last_phase(stage, scenario, sets[run])
     if view.instability:
-        found.faults.append(view.instability)
+        findings.faults.append(view.instability)
     measured = stage.controller.spec.measured
     force, current = trace.outputs[measured][run], trace.current[run]
-    _extremes(stage, scenario, trace, run, found)
-    _resting(stage, trace, run, sets[run], found)
-    if all(np.all(np.isfinite(item)) for item in (force, current, twin.outputs[measured][run])):
-        _growth(stage, scenario, twin, run, found)
+    _judge_extremes(stage, scenario, trace, run, findings)
+    _judge_rest(stage, trace, run, sets[run], findings)
+    if all(np.all(np.isfinite(signal)) for signal in (force, current, twin.outputs[measured][run])):
+        _judge_growth(stage, scenario, twin, run, findings)
         if not view.instability:
-            _outbreak(stage, scenario, trace, twin, run, view, found)
-        _ringing(stage, scenario, trace, run, view, found)
-        _ending(stage, scenario, trace, twin, run, found)
+            _judge_outbreak(stage, scenario, trace, twin, run, view, findings)
+        _judge_oscillation(stage, scenario, trace, run, view, findings)
+        _judge_final_error(stage, scenario, trace, twin, run, findings)
     else:
-        found.faults.insert(0, "it leaves what numbers can hold")
+        findings.faults.insert(0, "its numbers overflow")
     return Outcome(
-        scenario=scenario.name, plant=name, draw=NOMINAL if run == 0 else str(run), passed=not found.faults,
-        reason="; ".join(found.faults), parameters=_difference(sets[0], sets[run]),
-        **found.figures,
+        scenario=scenario.name, plant=name, draw=NOMINAL if run == 0 else str(run), passed=not findings.faults,
+        reason="; ".join(findings.faults), parameters=_find_differences(sets[0], sets[run]),
+        **findings.figures,
     )  # fmt: skip
 
 
-def _extremes(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Findings) -> None:
+def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
     controller, plant = stage.controller, stage.plant
     force = float(trace.peaks[controller.spec.measured][run])
     angles = [float(trace.peaks[name][run]) for name, unit in plant.outputs.items() if unit == "rad"]
     current, limit = np.abs(trace.current[run]), controller.spec.current_limit_A
     most = largest_current(math.inf if limit is None else limit, stage.current_step_A)
-    hits = trace.contacts
-    hardest = max(hits, key=lambda item: abs(item.impulse[run]), default=None)
-    found.figures.update(
+    hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[run]), default=None)
+    findings.figures.update(
         peak_force_N=force,
         peak_current_A=float(np.max(current)),
         peak_angle_rad=max(angles) if angles else None,
@@ -158,31 +157,31 @@ def _extremes(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _
         contact_loss_J=None if hardest is None else float(hardest.loss_J[run]),
     )
     if np.max(current) > most * (1 + 1e-9):
-        found.faults.append(f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
+        findings.faults.append(f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
     for what, value, allowed, unit in (
         (controller.spec.measured, force, scenario.max_force_N, "N"),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
         if allowed is not None and not value <= allowed:
-            found.faults.append(f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
+            findings.faults.append(f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
     for name, value in scenario.passes.items():
         reached = trace.outputs[name][run]
         if not np.nanmin(reached) <= value <= np.nanmax(reached):
-            found.faults.append(f"{name} never passes {value:g}, so that the scenario shows nothing")
+            findings.faults.append(f"{name} never passes {value:g}, so that the scenario does not happen")
 
 
-def _resting(stage: Stage, trace: Trace, run: int, drawn: ParameterSet, found: _Findings) -> None:
-    """Find whether the motor can hold the plant where the draw wants it to rest."""
+def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, findings: _Findings) -> None:
+    """Check that the motor can hold the plant where the draw puts it at rest."""
     limit = stage.controller.spec.current_limit_A
     if trace.rest is None or limit is None or abs(trace.rest.current_A[run]) <= limit * (1 + 1e-9):
         return
     where = ", ".join(f"{name} = {drawn[name].value:.4g}" for name in stage.plant.states if name in drawn)
-    found.faults.append(
+    findings.faults.append(
         f"to rest at {where} takes {trace.rest.current_A[run]:.4g} A, above the limit of {limit:g} A; narrow its range"
     )
 
 
-def _growth(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Findings) -> None:
+def _judge_growth(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
     if ENERGY in trace.outputs:
         base = 0.0 if trace.rest is None or not scenario.about_rest else trace.rest.energy_J[run]
         level, what = trace.outputs[ENERGY][run] - base, "the energy"
@@ -195,92 +194,94 @@ def _growth(stage: Stage, scenario: Scenario, trace: Trace, run: int, found: _Fi
     last = level[-(trace.edges[-1] - trace.edges[-2]) :]
     last = last[int(SETTLE * last.size) :]
     first, second = (float(np.max(half)) for half in np.array_split(last, 2))
-    found.figures["energy_growth"] = second / max(first, 1e-300)
+    findings.figures["energy_growth"] = second / max(first, 1e-300)
     if second > GROWTH * first + GROWTH_FLOOR * float(np.max(level)):
-        found.faults.append(f"{what} grows {second / max(first, 1e-300):.3g} times while the reference is constant")
+        findings.faults.append(f"{what} grows {second / max(first, 1e-300):.3g} times while the reference is constant")
 
 
-def _outbreak(
-    stage: Stage, scenario: Scenario, trace: Trace, twin: Trace, run: int, view: LinearView, found: _Findings
+def _judge_outbreak(
+    stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, view: LinearView, findings: _Findings
 ) -> None:
-    """Find a force that runs away under noise alone."""
+    """Check that noise does not set off a growing force error."""
     if twin is trace:
         return
     name = stage.controller.spec.measured
-    off, alone = (np.abs(_error(scenario, item, run, item.outputs[name][run])) for item in (trace, twin))
+    off, alone = (np.abs(_error(scenario, one, run, one.outputs[name][run])) for one in (trace, twin))
     half = trace.last.stop - (trace.last.stop - trace.last.start) // 2
     before, after = max(float(np.max(off[:half])), float(np.max(alone))), float(np.max(off[half:]))
     allowed = OUTBREAK * before + OUTLIER * view.force_std()
     if not after <= allowed:
-        found.faults.append(f"{name} is off by up to {after:.4g} N in the end, without noise by {np.max(alone):.4g} N")
+        end = f"{after:.4g} N in the end, without noise by {np.max(alone):.4g} N"
+        findings.faults.append(f"{name} is off by up to {end}")
 
 
-def _ringing(
-    stage: Stage, scenario: Scenario, trace: Trace, run: int, view: LinearView, found: _Findings
+def _judge_oscillation(
+    stage: Stage, scenario: Scenario, trace: Playback, run: int, view: LinearView, findings: _Findings
 ) -> None:  # fmt: skip
-    """Find an oscillation that lasts: a slow one in a long window, one whose phase noise moves in a short one."""
+    """Check that no oscillation lasts: a slow one in a long window, one whose phase noise moves in a short one."""
     spec, period = stage.controller.spec, stage.controller.sample_time_s
     if not scenario.quiet:
         return
     free = stage.plant.moves and not scenario.phases[-1].held
-    for window in _windows(stage, trace):
+    for window in _find_windows(stage, trace):
         lasting = period * (window.stop - window.start)
-        lowest = max(spec.bandwidth_hz / SLOWER, PERIODS / lasting) if free else STILL_PERIODS / lasting
-        floor = _floor(stage, trace, run)
+        lowest = max(spec.bandwidth_hz / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
+        floor = _noise_floor(stage, trace, run)
         if not view.instability:
-            floor = max(floor, LINE * view.force_std(lowest))
-        seen = find_oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
-        if seen is not None and (seen.sustained or seen.growing):
-            found.figures.update(limit_cycle_N=seen.amplitude, limit_cycle_hz=seen.frequency_hz)
-            what = "sustains itself" if seen.sustained else f"grows {seen.growth:.3g} times"
-            found.faults.append(f"an oscillation of {seen.amplitude:.3g} N at {seen.frequency_hz:.4g} Hz {what}")
+            floor = max(floor, LINE_SIGMAS * view.force_std(lowest))
+        line = find_oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
+        if line is not None and (line.sustained or line.growing):
+            findings.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
+            what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
+            findings.faults.append(f"an oscillation of {line.amplitude:.3g} N at {line.frequency_hz:.4g} Hz {what}")
             return
 
 
-def judged_window(trace: Trace) -> slice:
-    """Return the samples of the last phase that growth and oscillations are looked for in."""
+def find_judged_window(trace: Playback) -> slice:
+    """Return the samples of the last phase that are searched for growth and oscillations."""
     last = trace.last
     return slice(last.start + int(SETTLE * (last.stop - last.start)), last.stop)
 
 
-def _windows(stage: Stage, trace: Trace) -> tuple[slice, slice]:
-    last, controller = judged_window(trace), stage.controller
-    slow = max(WINDOW_S, PERIODS * SLOWER / controller.spec.bandwidth_hz)
-    found = (max(last.start, last.stop - math.ceil(item / controller.sample_time_s)) for item in (slow, slow / SHORTER))
-    long, short = (slice(start, last.stop) for start in found)
+def _find_windows(stage: Stage, trace: Playback) -> tuple[slice, slice]:
+    """Return a window long enough for the slowest oscillation, and a short one, where noise moves fast phases less."""
+    last, controller = find_judged_window(trace), stage.controller
+    slow = max(LEAST_WINDOW_S, LINE_PERIODS * SLOWEST / controller.spec.bandwidth_hz)
+    lengths = (math.ceil(duration / controller.sample_time_s) for duration in (slow, slow / SHORTER))
+    long, short = (slice(max(last.start, last.stop - length), last.stop) for length in lengths)
     return long, short
 
 
-def _floor(stage: Stage, trace: Trace, run: int) -> float:
-    """Return the amplitude (N) that noise, quantisation and rounding make by themselves."""
+def _noise_floor(stage: Stage, trace: Playback, run: int) -> float:
+    """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation."""
     name, sensors = stage.controller.spec.measured, stage.sensors
     rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
     noise = 2.0 * sensors.noise_std.get(name, 0.0) + 1.5 * sensors.quantisation.get(name, 0.0)
     return max(noise + rounding, 1e-3 * float(trace.peaks[name][run]))
 
 
-def _ending(stage: Stage, scenario: Scenario, trace: Trace, twin: Trace, run: int, found: _Findings) -> None:
+def _judge_final_error(
+    stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, findings: _Findings
+) -> None:
     last, name = trace.last, stage.controller.spec.measured
     end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
-    error, alone = (float(np.mean(_error(scenario, item, run, item.outputs[name][run])[end])) for item in (trace, twin))
-    found.figures["final_error_N"] = error
-    spare = MEAN * stage.sensors.noise_std.get(name, 0.0) / math.sqrt(end.stop - end.start)
+    error, alone = (float(np.mean(_error(scenario, one, run, one.outputs[name][run])[end])) for one in (trace, twin))
+    findings.figures["final_error_N"] = error
+    spare = MEAN_SIGMAS * stage.sensors.noise_std.get(name, 0.0) / math.sqrt(end.stop - end.start)
     for value, more, what in ((error, spare, ""), (alone, 0.0, " without noise")):
         if scenario.final_error is not None and not abs(value) <= scenario.final_error + more:
             allowed = scenario.final_error + more
-            found.faults.append(f"the force ends {value:.4g} N off{what}, {allowed:.4g} N are allowed")
+            findings.faults.append(f"the force ends {value:.4g} N off{what}, {allowed:.4g} N are allowed")
             return
 
 
-def _error(scenario: Scenario, trace: Trace, run: int, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return reference minus force, each counted from rest: a law without integrator rests at another reference."""
+def _error(scenario: Scenario, trace: Playback, run: int, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return reference minus force, each relative to rest: a law without integrator rests at another reference."""
     at_rest = (
         0.0 if trace.rest is None or not scenario.about_rest else trace.rest.reference[run] - trace.rest.force[run]
     )
     return trace.reference[run] - force - at_rest
 
 
-def _difference(nominal: ParameterSet, drawn: ParameterSet) -> dict[str, float]:
-    return {
-        name: item.value for name, item in drawn.items() if name not in nominal or item.value != nominal[name].value
-    }
+def _find_differences(nominal: ParameterSet, drawn: ParameterSet) -> dict[str, float]:
+    return {name: p.value for name, p in drawn.items() if name not in nominal or p.value != nominal[name].value}

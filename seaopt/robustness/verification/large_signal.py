@@ -1,13 +1,13 @@
-r"""The bandwidth that is left at large amplitudes, where the current saturates: a chirp in steps.
+r"""The bandwidth that remains at large amplitudes, where the current saturates, by a stepped sine.
 
-A sine :math:`F_\mathrm{ref} = A \sin 2\pi f t` is held until the loop has settled; the first harmonic of the force over
-whole periods is the describing-function gain at (f, A). As long as nothing saturates it is the linear response. It
-stops being so at
+A sine :math:`F_\mathrm{ref} = A \sin 2\pi f t` is kept until the loop has settled; the first harmonic of the force over
+whole periods is the describing-function gain at (f, A). As long as nothing saturates it is the linear response, up
+to the amplitude
 
 .. math:: A_\mathrm{max}(f) = \frac{F_\mathrm{sat}}{|C_r S|} = F_\mathrm{sat} \frac{|P|}{|T_r|},
 
-the saturation map: what the motor has to give for a force that is to follow is the plant's property, T/P, whatever
-the controller.
+the saturation map: the motor force that a tracked reference takes, T/P, is a property of the plant, whatever the
+controller.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Complex, Float
 
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
+from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError
 from seaopt.formatting import html_text
@@ -27,12 +28,11 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 
-PERIODS, SETTLING = 6, 12
-LEAST_S = 0.6  # that a loop is given to settle
+MEASURED_PERIODS, SETTLING_PERIODS = 6, 12
+LEAST_SETTLING_S = 0.6
 AMPLITUDES = (0.1, 0.5, 1.0, 2.0, 4.0)  # of the force that the limit allows at the bandwidth
-POINTS = 14
+SWEEP_POINTS = 14
 STATIC_HZ = 1e-3  # stands for 0 Hz
-HALF_POWER = 1.0 / math.sqrt(2.0)
 
 
 @record(eq=False)
@@ -42,7 +42,7 @@ class LargeSignal:
     Parameters
     ----------
     plant : str
-        Its name.
+        The plant's name.
     frequency_hz : array, shape (f,)
     amplitude_N : array, shape (a,)
         Of F_ref.
@@ -52,7 +52,7 @@ class LargeSignal:
         Whether the current reached its limit after settling.
     onset_N : array, shape (f,)
         A_max of the linear loop.
-    bandwidth_hz : tuple of float or None, one an amplitude
+    bandwidth_hz : tuple of float or None, one per amplitude
         Highest frequency at which the gain is not yet 3 dB below the linear loop's at 0 Hz; None: not within the sweep.
 
     """
@@ -77,9 +77,9 @@ class LargeSignal:
     def __repr__(self) -> str:
         lines = [f"Large-signal bandwidth on {self.plant}"]
         for amplitude, band, hit in zip(self.amplitude_N, self.bandwidth_hz, self.saturated, strict=True):
-            shown = "not within the sweep" if band is None else f"{band:.4g} Hz"
+            bandwidth = "not within the sweep" if band is None else f"{band:.4g} Hz"
             from_hz = f", saturates from {self.frequency_hz[np.argmax(hit)]:.4g} Hz" if np.any(hit) else ""
-            lines.append(f"  {amplitude:.4g} N: {shown}{from_hz}")
+            lines.append(f"  {amplitude:.4g} N: {bandwidth}{from_hz}")
         return "\n".join(lines)
 
     _repr_html_ = html_text
@@ -100,7 +100,7 @@ def large_signal(
     controller : Controller
         With a current limit.
     plant, parameters
-        What it runs on.
+        The plant that it runs on.
     amplitudes_N : tuple of float, optional
         Multiples of what the limit allows at the bandwidth if left out.
     frequencies_hz : tuple of float, optional
@@ -122,8 +122,8 @@ def large_signal(
     >>> import seaopt as so
     >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
     >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
-    >>> found = large_signal(so.tune(stand, thor, spec), stand, thor, amplitudes_N=(20.0, 800.0))
-    >>> round(found.bandwidth_hz[0]), found.bandwidth_hz[1] < 25
+    >>> sweep = large_signal(so.tune(stand, thor, spec), stand, thor, amplitudes_N=(20.0, 800.0))
+    >>> round(sweep.bandwidth_hz[0]), sweep.bandwidth_hz[1] < 25
     (30, True)
 
     """
@@ -135,23 +135,26 @@ def large_signal(
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )
-    wanted = np.geomspace(band / 5, 2 * band, POINTS) if frequencies_hz is None else np.array(frequencies_hz, float)
+    if frequencies_hz is None:
+        wanted = np.geomspace(band / 5, 2 * band, SWEEP_POINTS)
+    else:
+        wanted = np.array(frequencies_hz, float)
     if not (np.all(wanted > 0.0) and np.all(np.diff(wanted) > 0.0) and np.all(wanted < 0.25 / period)):
         raise ControlError(
             f"frequencies_hz = {frequencies_hz} do not rise from above 0 to {0.25 / period:g}; sort them"
         )
-    lengths = np.round(PERIODS / (wanted * period)).astype(int)
-    f = PERIODS / (lengths * period)
-    onset = _onset(controller, plant, parameters, f)
+    lengths = np.round(MEASURED_PERIODS / (wanted * period)).astype(int)
+    f = MEASURED_PERIODS / (lengths * period)
+    onset = _compute_onset(controller, plant, parameters, f)
     static = float(np.abs(controller.close(plant, parameters).tracking(np.array([STATIC_HZ])))[0])
-    at_band = float(_onset(controller, plant, parameters, np.array([float(band)]))[0])
+    at_band = float(_compute_onset(controller, plant, parameters, np.array([float(band)]))[0])
     amplitude = np.array(amplitudes_N, float) if amplitudes_N is not None else np.array(AMPLITUDES) * at_band
     if not (amplitude.size and np.all(amplitude > 0.0)):
         raise ControlError(f"amplitudes_N = {amplitudes_N} are not positive; give some")
     gain = np.zeros((amplitude.size, f.size), dtype=complex)
     saturated = np.zeros(gain.shape, dtype=bool)
     for column, (frequency, length) in enumerate(zip(f, lengths, strict=True)):
-        n = length + math.ceil(max(SETTLING / frequency, LEAST_S) / period)
+        n = length + math.ceil(max(SETTLING_PERIODS / frequency, LEAST_SETTLING_S) / period)
         phase = 2 * np.pi * frequency * period * np.arange(n)
         run = run_loop(loop, [parameters] * amplitude.size, amplitude[:, None] * np.sin(phase))
         force, current = run.outputs[loop.measured][:, -length:], run.current[:, -length:]
@@ -159,11 +162,11 @@ def large_signal(
         saturated[:, column] = np.max(np.abs(current), axis=1) >= limit * (1 - 1e-9)
     return LargeSignal(
         plant=plant.name, frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
-        bandwidth_hz=tuple(_bandwidth(f, np.abs(row), static) for row in gain),
+        bandwidth_hz=tuple(_find_bandwidth(f, np.abs(row), static) for row in gain),
     )  # fmt: skip
 
 
-def _onset(
+def _compute_onset(
     controller: Controller, plant: Plant, parameters: ParameterSet, f: Float[np.ndarray, " f"]
 ) -> Float[np.ndarray, " f"]:
     limit = controller.spec.current_limit_A
@@ -173,7 +176,7 @@ def _onset(
     return limit / controller.command.per_effort / motor
 
 
-def _bandwidth(f: Float[np.ndarray, " f"], gain: Float[np.ndarray, " f"], static: float) -> float | None:
+def _find_bandwidth(f: Float[np.ndarray, " f"], gain: Float[np.ndarray, " f"], static: float) -> float | None:
     """Return where the gain last falls through 3 dB below the static one, on straight lines in logarithms."""
     level = np.log(np.maximum(gain, 1e-300)) - math.log(HALF_POWER * static)
     falls = np.flatnonzero((level[:-1] >= 0.0) & (level[1:] < 0.0))

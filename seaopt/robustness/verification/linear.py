@@ -1,4 +1,4 @@
-r"""What the linear loop says of a scenario's last phase: whether it is stable there, and what force noise makes.
+r"""The linear loop of a scenario's last phase, for its judgement: its stability, and the force that noise makes.
 
 White noise of variance :math:`s_n^2` on the reading and :math:`s_u^2` on the motor force leave
 
@@ -17,7 +17,7 @@ import numpy as np
 from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
-from seaopt.robustness.verification.playback import Stage, loaded
+from seaopt.robustness.verification.playback import Stage, apply_load
 from seaopt.robustness.verification.scenarios import Scenario
 
 
@@ -29,7 +29,7 @@ class LinearView:
     ----------
     loop : Loop
     noise_N, step_N : float
-        Standard deviations of the white noise that stands for the sensor, and for the rounded current.
+        Standard deviations of the white noises that represent the sensor and the rounded current.
 
     """
 
@@ -39,14 +39,14 @@ class LinearView:
 
     @property
     def instability(self) -> str:
-        """The eigenvalue that makes the loop unstable, in words; empty where it is stable."""
+        """The eigenvalue that makes the loop unstable, as text; empty where it is stable."""
         poles, period = self.loop.eigenvalues(), self.loop.plant.sample_time_s
         fastest = poles[np.argmax(np.abs(poles))] if poles.size else 0.0
         radius = abs(fastest)
         if radius < STABLE:
             return ""
         if not math.isfinite(radius):
-            return "unstable: the linear loop has an eigenvalue beyond all numbers"
+            return "unstable: the linear loop has an eigenvalue that is not finite"
         hz = abs(np.angle(fastest)) / (2 * np.pi * period)
         grows = f", doubling in {math.log(2) * period / math.log(radius):.3g} s" if radius > 1.0 + 1e-12 else ""
         return f"unstable: the linear loop's spectral radius is {radius:.6g}, at {hz:.4g} Hz{grows}"
@@ -60,7 +60,7 @@ class LinearView:
         return math.sqrt(float(np.trapezoid(power, f)) / self.loop.plant.nyquist_hz)
 
 
-def linear_view(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> LinearView:
+def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> LinearView:
     """Return the linear loop of a scenario's last phase, with the load and the link as they are then.
 
     Parameters
@@ -68,7 +68,7 @@ def linear_view(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> Linear
     stage : Stage
         Controller, plants and devices.
     scenario : Scenario
-        What is played.
+        The scenario that is simulated.
     drawn : ParameterSet
         Parameters and conditions of the run.
 
@@ -79,8 +79,8 @@ def linear_view(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> Linear
     >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
     >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     >>> stage = Stage(controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}))
-    >>> found = linear_view(stage, default_scenarios(controller, stand)[0], thor)
-    >>> found.instability, found.force_std() < 2.0
+    >>> view = linearise_last_phase(stage, default_scenarios(controller, stand)[0], thor)
+    >>> view.instability, view.force_std() < 2.0
     ('', True)
 
     """
@@ -88,14 +88,15 @@ def linear_view(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> Linear
     plant = stage.partner if last.held and stage.partner is not None else stage.plant
     params = drawn.with_parameters(*plant.complete(drawn).values())
     for phase in scenario.phases:
-        params = loaded(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
+        params = apply_load(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
     name = controller.spec.measured
     return LinearView(
         loop=controller.close(plant, params),
-        noise_N=_spread(stage.sensors.noise_std.get(name, 0.0), stage.sensors.quantisation.get(name, 0.0)),
-        step_N=_spread(0.0, stage.current_step_A / controller.command.per_effort),
+        noise_N=_combine_std(stage.sensors.noise_std.get(name, 0.0), stage.sensors.quantisation.get(name, 0.0)),
+        step_N=_combine_std(0.0, stage.current_step_A / controller.command.per_effort),
     )
 
 
-def _spread(std: float, step: float) -> float:
+def _combine_std(std: float, step: float) -> float:
+    """Return the standard deviation of noise and of rounding to a step."""
     return math.hypot(std, step / math.sqrt(12.0))

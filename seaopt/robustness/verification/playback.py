@@ -1,4 +1,4 @@
-"""Play a scenario: phase after phase on the sampled loop, several parameter sets at once."""
+"""Simulation of a scenario for verification: phase after phase on the sampled loop, several parameter sets at once."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from seaopt.plants.plant import fill_vector
 from seaopt.records import record
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 
-Rows = Float[np.ndarray, "runs n"]
+RunSamples = Float[np.ndarray, "runs n"]
 
 
 @record(eq=False)
 class Stage:
-    """What scenarios are played on.
+    """Controller, plant and devices that scenarios are simulated on.
 
     Parameters
     ----------
@@ -72,15 +72,15 @@ class Stage:
 
     @property
     def is_ideal(self) -> bool:
-        """Sensor and amplifier do nothing of their own."""
+        """Whether sensor and amplifier add nothing of their own."""
         sensors, name = self.sensors, self.controller.spec.measured
-        own = (getattr(sensors, what).get(name, 0.0) for what in ("noise_std", "offset", "quantisation"))
-        return not (self.current_step_A or any(own))
+        additions = (getattr(sensors, field).get(name, 0.0) for field in ("noise_std", "offset", "quantisation"))
+        return not (self.current_step_A or any(additions))
 
 
 @record(eq=False)
 class Contact:
-    """A link that is caught: when (s), the impulse that stops it and the energy (J) it loses, one a run."""
+    """A link that is caught: when (s), the impulse that stops it and the energy (J) it loses, one per run."""
 
     time_s: float
     impulse: Float[np.ndarray, " runs"]
@@ -88,8 +88,8 @@ class Contact:
 
 
 @record(eq=False)
-class Trace:
-    """A scenario as it was played.
+class Playback:
+    """The samples of a simulated scenario.
 
     Parameters
     ----------
@@ -98,27 +98,27 @@ class Trace:
     reference, current : array, shape (runs, n)
         N and A.
     outputs : mapping of name to array, shape (runs, n)
-        Of `plant`, and "energy" where it declares it; NaN while the link is held and there is no such output.
+        Outputs of `plant`, and "energy" where it declares that; NaN while the link is held and there is no such output.
     peaks : mapping of name to array, shape (runs,)
         Largest magnitudes, between samples too.
     rest : Equilibrium or None
-        Where runs started; None where the scenario says where.
+        The rest where runs started; None where the scenario has an initial state.
     edges : tuple of int
         First samples of the phases, and one past the last.
     contacts : tuple of Contact
     error : float
         Estimated integration error of the worst sample, relative.
     substeps : int
-        Integration steps a sample, the most of all phases.
+        Integration steps per sample, the largest number of all phases.
     wall_s : float
-        Time that the simulation took.
+        Time of computing.
 
     """
 
     time: Float[np.ndarray, " n"]
-    reference: Rows
-    current: Rows
-    outputs: Mapping[str, Rows]
+    reference: RunSamples
+    current: RunSamples
+    outputs: Mapping[str, RunSamples]
     peaks: Mapping[str, Float[np.ndarray, " runs"]]
     rest: Equilibrium | None
     edges: tuple[int, ...]
@@ -129,7 +129,7 @@ class Trace:
 
     def __repr__(self) -> str:
         contacts = f"{len(self.contacts)} contacts; "
-        return describe_runs("Trace", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
+        return describe_runs("Playback", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
 
     @property
     def last(self) -> slice:
@@ -137,8 +137,8 @@ class Trace:
         return slice(self.edges[-2], self.edges[-1])
 
 
-def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Trace:
-    """Play a scenario, once for each set of parameters.
+def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Playback:
+    """Simulate a scenario, once for each set of parameters.
 
     A run starts at rest: at zero, or where a condition among its parameters (an angle such as phi) puts the plant, with
     the law and the commands that wait at rest too, and the scenario's forces counted from the one that keeps it there.
@@ -149,9 +149,9 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     stage : Stage
         Controller, plant and devices.
     scenario : Scenario
-        What happens.
+        What is simulated.
     params : sequence of ParameterSet
-        One a run; conditions may be among them: where it rests, and `delay_s`, delay besides the controller's.
+        One per run; they may contain conditions: where the run rests, and `delay_s`, a delay besides the controller's.
     seed : int
         Of the sensor noise and of random excitations.
 
@@ -167,18 +167,18 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     if obstacle is not None:
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
     if not params:
-        raise ControlError("play got no parameters; give one ParameterSet a run")
-    delays = [[item[DELAY]] if DELAY in item else [] for item in params]
-    longest = max(conditions_of(stage.plant, item).get(DELAY, 0.0) for item in params)
-    values = [stage.plant.complete(item).with_parameters(*d) for item, d in zip(params, delays, strict=True)]
+        raise ControlError("params is empty; give one ParameterSet per run")
+    delays = [[drawn[DELAY]] if DELAY in drawn else [] for drawn in params]
+    longest = max(conditions_of(stage.plant, drawn).get(DELAY, 0.0) for drawn in params)
+    values = [stage.plant.complete(drawn).with_parameters(*d) for drawn, d in zip(params, delays, strict=True)]
     rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), params)
-    now, grip = _start(stage, scenario, values, longest) if rest is None else rest.state, None
+    now, grip = _start_state(stage, scenario, values, longest) if rest is None else rest.state, None
     offset = rest.reference[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
     runs: list[LoopRun] = []
     contacts: list[Contact] = []
     begin_s = 0.0
     for number, phase in enumerate(scenario.phases):
-        values = [loaded(item, phase.scale) for item in values]
+        values = [apply_load(unloaded, phase.scale) for unloaded in values]
         if phase.held and grip is None:
             now, grip, contact = _catch(stage, values, now, begin_s)
             contacts.append(contact)
@@ -189,14 +189,14 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
         loop = stage.loop(phase.held, longest)
-        reference = offset + _reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
+        reference = offset + _build_reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
         run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
         now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s
         runs.append(run)
-    return _joined(stage, runs, rest, tuple(contacts))
+    return _join_phases(stage, runs, rest, tuple(contacts))
 
 
-def _start(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
+def _start_state(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
     """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
     plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
     start = at_rest(loop, len(values), fill_vector("state", plant.states, scenario.initial_state))
@@ -211,8 +211,8 @@ def _port(plant: Plant) -> Port:
     return plant.port
 
 
-def loaded(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
-    """Return the parameters with a load on: their bounds say what is known of them, not what may be carried."""
+def apply_load(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
+    """Return the scaled parameters; their bounds, which limit what is known and not what is carried, are widened."""
     changed: list[Parameter] = []
     for name, factor in scale.items():
         value = factor * params[name].value
@@ -221,7 +221,7 @@ def loaded(params: ParameterSet, scale: Mapping[str, float]) -> ParameterSet:
     return params.with_parameters(*changed)
 
 
-def _reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
     n = max(1, round(phase.duration_s / sample_time_s))
     if not phase.excitation:
         return np.full(n, phase.force_N)
@@ -237,7 +237,7 @@ def _catch(
     name = port.coordinate or ""
     place = list(plant.states).index(name)
     after = LoopState(x=np.stack([state for state, _, _ in catches]), z=now.z)
-    impulse, loss = (np.array([each[k] for each in catches]) for k in (1, 2))
+    impulse, loss = (np.array([figures[k] for figures in catches]) for k in (1, 2))
     contact = Contact(time_s=time_s, impulse=impulse, loss_J=loss)
     return after, [{name: float(row[place])} for row in now.x], contact
 
@@ -250,14 +250,16 @@ def _let_go(
     return LoopState(x=np.stack(rows), z=now.z)
 
 
-def _joined(stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]) -> Trace:
+def _join_phases(
+    stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]
+) -> Playback:
     names = stage.loop(held=False).watched
     count = runs[0].current.shape[0]
 
-    def column(run: LoopRun, name: str) -> Rows:
+    def column(run: LoopRun, name: str) -> RunSamples:
         return run.outputs[name] if name in run.outputs else np.full((count, run.time.size), np.nan)
 
-    return Trace(
+    return Playback(
         time=np.concatenate([run.time for run in runs]),
         reference=np.hstack([run.reference for run in runs]),
         current=np.hstack([run.current for run in runs]),

@@ -1,4 +1,4 @@
-"""What a controller is put through: phases with a reference, a blow, another payload, a link held or let go."""
+"""Scenarios of verification: phases with a reference, a blow, another payload, a link held or let go."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from seaopt.plants.impacts import strike
 from seaopt.records import record
 
 FALL_DEG = 120.0
-LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # blows that are tried
+LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
 NOMINAL_FORCE_N = 100.0
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
@@ -29,7 +29,7 @@ LONGEST_SLOW_S = 200.0
 
 @record
 class Phase:
-    """A stretch of a scenario; what happens at its start happens in no time.
+    """A part of a scenario; blows, loads and catches at its start are instantaneous.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Phase:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.duration_s < math.inf:
-            raise ControlError(f"phase: duration_s = {self.duration_s:g} is no time; give a positive number")
+            raise ControlError(f"phase: duration_s = {self.duration_s:g} is not a duration; give a positive number")
         if self.held and self.impulse_Ns:
             raise ControlError("phase: a link that is held cannot be struck; strike it in a phase with held = False")
         for name, factor in self.scale.items():
@@ -68,7 +68,9 @@ class Phase:
 
 @record
 class Scenario:
-    """Phases one after the other, and what must hold. Always: finite, nothing that grows in the last phase.
+    """A sequence of phases, and its requirements besides those of every scenario.
+
+    Every run must stay finite, and nothing may grow in its last phase.
 
     Parameters
     ----------
@@ -78,17 +80,17 @@ class Scenario:
         Where every run starts, zero where left out; the drive is then moved so that the spring is relaxed. Without it a
         run starts at rest where its parameters say (phi), zero if they do not.
     about_rest : bool
-        Forces are counted from the one that keeps a run where it starts; False: from zero.
+        Forces are counted from the one that keeps a run at its start; False: from zero.
     quiet : bool
-        The last phase ends without an oscillation that sustains itself.
+        No oscillation may sustain itself in the last phase.
     final_error : float or None
-        Mean error over the last fifth of the last phase, N, at most.
+        Largest mean error over the last fifth of the last phase, N.
     max_force_N, max_angle_rad : float or None
-        Peaks allowed of the measured force and of every angle.
+        Largest peaks of the measured force and of every angle.
     passes : mapping of output name to float
-        Values that an output must cross: shows that the scenario did what it says.
+        Values that an output must cross, which shows that the scenario happened.
     on : {"any", "held", "free"}
-        Plants that it is for: every one, those without a link that moves at a port, or those with one.
+        Plants that it applies to: every one, those without a link that moves at a port, or those with one.
 
     """
 
@@ -111,7 +113,7 @@ class Scenario:
 
     @property
     def size(self) -> str:
-        """How large it is, in short: forces, blows, loads, and where it starts.
+        """Its magnitudes as text: forces, blows, loads and initial state.
 
         Examples
         --------
@@ -120,10 +122,10 @@ class Scenario:
 
         """
         forces = [abs(phase.force_N) for phase in self.phases if phase.force_N]
-        waves = [item.amplitude for phase in self.phases for item in phase.excitation if isinstance(item, Chirp)]
+        waves = [wave.amplitude for phase in self.phases for wave in phase.excitation if isinstance(wave, Chirp)]
         blows = [abs(phase.impulse_Ns) for phase in self.phases if phase.impulse_Ns]
         loads = {n: f for phase in reversed(self.phases) for n, f in phase.scale.items()}
-        parts = [f"{max(found):.4g} {unit}" for found, unit in ((forces + waves, "N"), (blows, "N s")) if found]
+        parts = [f"{max(sizes):.4g} {unit}" for sizes, unit in ((forces + waves, "N"), (blows, "N s")) if sizes]
         parts += [f"{factor:.3g} {name}" for name, factor in loads.items()]
         parts += [f"{name} = {value:.4g}" for name, value in self.initial_state.items()]
         return ", ".join(parts)
@@ -132,7 +134,7 @@ class Scenario:
         """Return why the scenario cannot be played on a plant, or None."""
         free = plant.moves
         if (self.on == "held" and free) or (self.on == "free" and not free):
-            return f"it is for plants whose link is {self.on}"
+            return f"it applies to plants whose link is {self.on}"
         if any(phase.held for phase in self.phases) and partner is None:
             return "there is no plant with the same actuator and its link fixed"
         for name in (name for phase in self.phases for name in phase.scale):
@@ -154,16 +156,16 @@ def _struck(plant: Plant) -> str | None:
 def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]:
     """Return the scenarios for a plant, sized by the controller's own limits.
 
-    Forces are multiples of two: the step that just reaches the current limit (at its first samples, where the law
-    differentiates), and the force that the limit holds at rest. Without `current_limit_A` nothing saturates: the
+    Forces are multiples of two: that of the step that just reaches the current limit (at its first samples, where the
+    law differentiates), and that which the limit can hold at rest. Without `current_limit_A` nothing saturates: the
     step is then 100 N, and the scenarios of saturation are left out.
 
     Parameters
     ----------
     controller : Controller
-        It knows its design plant.
+        A controller that knows its design plant.
     plant : Plant
-        What it is to be verified on.
+        The plant to verify it on.
 
     Raises
     ------
@@ -175,38 +177,38 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     >>> import seaopt as so
     >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
-    >>> [item.name for item in default_scenarios(controller, so.plants.high_impedance())]
+    >>> [scenario.name for scenario in default_scenarios(controller, so.plants.high_impedance())]
     ['small step', 'saturating doublet', 'saturating hold', 'chirp']
 
     """
-    step, rest = step_limit(controller), controller.force_limit(0.01)
+    step, rest = find_step_limit(controller), controller.force_limit(0.01)
     band = controller.spec.bandwidth_hz
     small = 0.5 * step if step is not None else NOMINAL_FORCE_N
-    tail, lasting = _tail(controller, plant), max(0.2, 6.0 / band)
-    found = [_small_step(small, lasting, tail, plant)]
+    tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
+    scenarios = [_small_step(small, lasting, tail, plant)]
     if step is not None and rest is not None:
-        found += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
-    found.append(_chirp(controller, small, tail))
+        scenarios += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
+    scenarios.append(_chirp(controller, small, tail))
     if _struck(plant) is not None and plant.energy is not None:
-        found.append(_impact(_blow(controller, plant, 2.0 * small), tail))
+        scenarios.append(_impact(_size_blow(controller, plant, 2.0 * small), tail))
     if plant.port is not None and plant.port.payload:
-        found.append(_payload(plant.port.payload, small, lasting, tail))
+        scenarios.append(_payload(plant.port.payload, small, lasting, tail))
     angle = _lever(plant)
     if angle is not None:
-        found.append(_fall(angle, 2.0 * tail))
-    found.append(_contact(small, lasting, tail))
-    return tuple(item for item in found if item.obstacle(plant, plant) is None)
+        scenarios.append(_fall(angle, 2.0 * tail))
+    scenarios.append(_contact(small, lasting, tail))
+    return tuple(scenario for scenario in scenarios if scenario.obstacle(plant, plant) is None)
 
 
-def left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
-    """Return the names of the default scenarios that need a current limit, where the controller has none."""
+def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
+    """Return the names of the default scenarios that are left out because the controller has no current limit."""
     if controller.spec.current_limit_A is not None:
         return ()
     saturating = _doublet(1.0, 1.0, 1.0), _hold(1.0, 1.0, 1.0)
-    return tuple(item.name for item in saturating if item.obstacle(plant, plant) is None)
+    return tuple(scenario.name for scenario in saturating if scenario.obstacle(plant, plant) is None)
 
 
-def step_limit(controller: Controller) -> float | None:
+def find_step_limit(controller: Controller) -> float | None:
     """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit.
 
     Raises
@@ -216,7 +218,7 @@ def step_limit(controller: Controller) -> float | None:
 
     """
     limit = controller.spec.current_limit_A
-    plant, params = _design(controller)
+    plant, params = _require_design(controller)
     if limit is None:
         return None
     loop = SampledLoop(
@@ -225,11 +227,11 @@ def step_limit(controller: Controller) -> float | None:
         measured=controller.spec.measured,
         delay_samples=controller.delay_samples,
     )
-    run = run_loop(loop, [params], np.full(_samples(controller, 0.2), NOMINAL_FORCE_N))
+    run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), NOMINAL_FORCE_N))
     return NOMINAL_FORCE_N * limit / float(np.max(np.abs(run.current)))
 
 
-def _design(controller: Controller) -> tuple[Plant, ParameterSet]:
+def _require_design(controller: Controller) -> tuple[Plant, ParameterSet]:
     if controller.design is None:
         raise ControlError(
             "the controller does not know its design plant; tune it, or read it with Controller.from_dict"
@@ -237,30 +239,30 @@ def _design(controller: Controller) -> tuple[Plant, ParameterSet]:
     return controller.design
 
 
-def _samples(controller: Controller, duration_s: float) -> int:
+def _count_samples(controller: Controller, duration_s: float) -> int:
     return max(2, round(duration_s / controller.sample_time_s))
 
 
-def _blow(controller: Controller, plant: Plant, force: float) -> float:
+def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     """Return the blow (N s) on the link after which the measured force peaks at about `force`; play is nonlinear."""
     link = _struck(plant)
     assert link is not None
-    params = plant.complete(_design(controller)[1])
+    params = plant.complete(_require_design(controller)[1])
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )
 
-    def peak(blow: float) -> float:
+    def measure_peak(blow: float) -> float:
         state = strike(plant, params, np.zeros(len(plant.states)), link, blow)
-        run = run_loop(loop, [params], np.zeros(_samples(controller, 0.1)), start=at_rest(loop, 1, state))
+        run = run_loop(loop, [params], np.zeros(_count_samples(controller, 0.1)), start=at_rest(loop, 1, state))
         return float(run.peaks[controller.spec.measured][0])
 
-    blow, found = LIGHTEST_NS, peak(LIGHTEST_NS)
-    while found < force and blow < HEAVIEST_NS:
-        blow, before = 2.0 * blow, found
-        found = peak(blow)
-        if found >= force:
-            return blow * 2.0 ** (-math.log(found / force) / math.log(found / before))
+    blow, reached = LIGHTEST_NS, measure_peak(LIGHTEST_NS)
+    while reached < force and blow < HEAVIEST_NS:
+        blow, before = 2.0 * blow, reached
+        reached = measure_peak(blow)
+        if reached >= force:
+            return blow * 2.0 ** (-math.log(reached / force) / math.log(reached / before))
     return blow
 
 
@@ -273,9 +275,9 @@ def _lever(plant: Plant) -> str | None:
     return port.coordinate if angle else None
 
 
-def _tail(controller: Controller, plant: Plant) -> float:
-    """Return how long a last phase lasts: long enough for the loop's slowest swing, and for slow limit cycles."""
-    loop = controller.close(plant, _design(controller)[1])
+def _size_last_phase(controller: Controller, plant: Plant) -> float:
+    """Return the duration of a last phase: long enough for the loop's slowest swing, and for slow limit cycles."""
+    loop = controller.close(plant, _require_design(controller)[1])
     poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
     swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0
@@ -308,7 +310,7 @@ def _doublet(force: float, half: float, tail: float) -> Scenario:
 def _hold(rest: float, lasting: float, tail: float) -> Scenario:
     """Ask for more than the limit holds, then for a quarter: an integrator that has wound up overshoots.
 
-    What the limit holds does not depend on where the plant rests.
+    The force that the limit can hold does not depend on where the plant rests.
     """
     phases = (Phase(duration_s=2 * lasting, force_N=1.2 * rest), Phase(duration_s=tail, force_N=0.25 * rest))
     return Scenario(name="saturating hold", phases=phases, about_rest=False, final_error=0.005 * rest, on="held")
@@ -336,7 +338,7 @@ def _payload(names: tuple[str, ...], force: float, lasting: float, tail: float) 
 
 
 def _fall(angle: str, lasting: float) -> Scenario:
-    """Let go above the horizontal: the lever arm L_a cos(phi) vanishes at 90 degrees and turns its sign."""
+    """Let go above the horizontal: the lever arm L_a cos(phi) vanishes at 90 degrees and changes sign."""
     return Scenario(
         name="fall through 90 deg",
         phases=(Phase(duration_s=lasting),),

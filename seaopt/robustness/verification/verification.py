@@ -1,4 +1,4 @@
-"""The controller as exported on nonlinear plants: scenarios, what they showed, and whether that is allowed."""
+"""Verification: simulate the controller as exported on nonlinear plants, and judge every run."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.impacts import check_held
 from seaopt.records import record
-from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judged
-from seaopt.robustness.verification.playback import Stage, Trace, play
-from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, left_out
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run
+from seaopt.robustness.verification.playback import Playback, Stage, play
+from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out
 
 
 @record(eq=False)
 class Verification:
-    """What `verify` returns.
+    """The runs of all scenarios, their judgement, and what it takes to simulate them again.
 
     Parameters
     ----------
     passed : bool
-        Every row passed, and there is one.
+        Whether every row passed, and there is at least one.
     rows : tuple of Outcome
     skipped : tuple of (scenario, plant, reason)
-        What was asked for and cannot be played.
+        What was asked for and cannot be simulated.
     real_time_factor : mapping of plant name to float
-        Seconds simulated in a second, over all runs.
+        Simulated seconds per second of computing, over all runs.
     error : float
         Largest estimated integration error of a sample, relative to the state's largest value.
     seed : int
-        Of noise and random excitations.
+        Seed of noise and random excitations.
     stages : mapping of plant name to Stage
     scenarios : mapping of plant name to tuple of Scenario
     draws : mapping of plant name to tuple of ParameterSet
-        Nominal first: what `replay` plays again.
+        Nominal first; `replay` uses them.
     follows_hz : mapping of plant name to (lo, hi) or None
-        Where the linear loop's force is within 3 dB of its reference, at nominal parameters. On a link that swings that
-        does not begin at 0 Hz, and a step does not come to its reference.
+        Band in which the linear loop's force is within 3 dB of its reference, at nominal parameters. With a swinging
+        link it does not begin at 0 Hz, and a step does not reach its reference.
 
     """
 
@@ -60,10 +60,10 @@ class Verification:
 
     def scenario(self, row: Outcome) -> Scenario:
         """Return the scenario of a row."""
-        return next(item for item in self.scenarios[row.plant] if item.name == row.scenario)
+        return next(scenario for scenario in self.scenarios[row.plant] if scenario.name == row.scenario)
 
-    def replay(self, row: Outcome) -> Trace:
-        """Return the trace of a row, played again."""
+    def replay(self, row: Outcome) -> Playback:
+        """Return the samples of a row, simulated again."""
         scenario = self.scenario(row)
         drawn = self.draws[row.plant][0 if row.draw == NOMINAL else int(row.draw)]
         return play(self.stages[row.plant], scenario, [drawn], seed=self.seed)
@@ -74,7 +74,7 @@ class Verification:
         return tuple(row for row in self.rows if not row.passed)
 
     def worst(self) -> tuple[Outcome, ...]:
-        """Return one row a scenario and plant: one that failed, else the one with the largest force."""
+        """Return one row per scenario and plant: one that failed, else the one with the largest force."""
         best: dict[tuple[str, str], Outcome] = {}
         for row in self.rows:
             key = (row.plant, row.scenario)
@@ -82,8 +82,8 @@ class Verification:
                 best[key] = row
         return tuple(best.values())
 
-    def drawn(self) -> list[str]:
-        """Return what each draw is: where it differs from nominal, a line each."""
+    def describe_draws(self) -> list[str]:
+        """Return a line per draw: where it differs from nominal."""
         rows = {(row.plant, row.draw): row for row in self.rows if row.draw != NOMINAL}
         return [
             f"draw {row.draw} on {row.plant}: "
@@ -91,8 +91,8 @@ class Verification:
             for row in rows.values()
         ]
 
-    def following(self) -> list[str]:
-        """Return, a line each, on which plants slow references are not followed."""
+    def describe_tracking(self) -> list[str]:
+        """Return a line per plant on which slow references are not tracked."""
         lines: list[str] = []
         for name, band in self.follows_hz.items():
             if band is None:
@@ -112,22 +112,22 @@ class Verification:
             "real_time_factor": dict(self.real_time_factor),
             "integration_error": self.error,
             "follows_hz": {name: None if band is None else list(band) for name, band in self.follows_hz.items()},
-            "rows": [{f.name: _plain(getattr(row, f.name)) for f in fields(Outcome)} for row in self.rows],
-            "skipped": [dict(zip(("scenario", "plant", "reason"), item, strict=True)) for item in self.skipped],
+            "rows": [{f.name: _to_plain(getattr(row, f.name)) for f in fields(Outcome)} for row in self.rows],
+            "skipped": [dict(zip(("scenario", "plant", "reason"), row, strict=True)) for row in self.skipped],
         }
 
     def __repr__(self) -> str:
         failed = len(self.failures)
         verdict = "passed" if self.passed else (f"FAILED in {failed} of {len(self.rows)} runs" if failed else "EMPTY")
         lines = [f"Verification by simulation: {verdict}"]
-        lines += [f"  {line}" for line in (*_table(self), *self.drawn(), *self.following())]
+        lines += [f"  {line}" for line in (*_format_worst(self), *self.describe_draws(), *self.describe_tracking())]
         lines += [
-            f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{witness(row)}"
+            f"  FAILED {row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{describe_witness(row)}"
             for row in self.failures
         ]
         lines += [f"  not played: {scenario} on {plant}, {reason}" for scenario, plant, reason in self.skipped]
         speed = ", ".join(f"{name} {value:.0f}" for name, value in self.real_time_factor.items())
-        return "\n".join([*lines, f"  seconds simulated in a second: {speed}; seed {self.seed}"])
+        return "\n".join([*lines, f"  simulated seconds per second: {speed}; seed {self.seed}"])
 
     _repr_html_ = html_text
 
@@ -151,22 +151,22 @@ def verify(
     controller : Controller
         Its law runs with its own rate, delay, current limit and anti-windup.
     plants : mapping of name to Plant
-        What it must survive.
+        Plants to simulate it on.
     parameters : ParameterSet
-        Nominal values; the plants' defaults where left out.
+        Nominal values; parameters that are left out have the plants' defaults.
     scenarios : sequence of Scenario, optional
         The same for every plant; `default_scenarios` of each if left out.
     draws : mapping of plant name to sequence of ParameterSet, optional
-        Played besides the nominal values, such as a certificate's worst draws; a condition among them (phi, delay_s) is
-        where, and how late, those runs start (`seaopt.robustness.verification.playback.play`).
+        Simulated besides the nominal values, such as a certificate's worst draws; conditions among them (phi, delay_s)
+        set where those runs start, and how late the loop is (`seaopt.robustness.verification.playback.play`).
     sensors : Sensors, optional
         Noise, offset, range and quantisation of the measured output; ideal if left out.
     current_step_A : float
-        What the current is rounded to; 0 for not at all.
+        Step that the current is rounded to; 0 for none.
     partners : mapping of plant name to Plant, optional
         The same actuator with its link fixed, for scenarios of contact; what the plant's port makes where left out.
     seed : int
-        Of noise and random excitations.
+        Seed of noise and random excitations.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def verify(
     Raises
     ------
     ControlError
-        There is no plant, or an argument names one that is not there.
+        There is no plant, or an argument names an unknown one.
     SimulationError
         A plant cannot be simulated to the accuracy asked for.
 
@@ -207,18 +207,17 @@ def verify(
     error = 0.0
     for name, stage in stages.items():
         chosen = default_scenarios(controller, stage.plant) if scenarios is None else tuple(scenarios)
-        found = [(item, item.obstacle(stage.plant, stage.partner)) for item in chosen]
-        played[name] = tuple(item for item, obstacle in found if obstacle is None)
+        obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
+        played[name] = tuple(scenario for scenario, obstacle in obstacles if obstacle is None)
         if scenarios is None:
-            skipped += [
-                (item, name, "nothing saturates without current_limit_A") for item in left_out(controller, stage.plant)
-            ]
-        skipped += [(item.name, name, obstacle) for item, obstacle in found if obstacle is not None]
+            reason = "nothing saturates without current_limit_A"
+            skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
+        skipped += [(scenario.name, name, obstacle) for scenario, obstacle in obstacles if obstacle is not None]
         simulated = wall = 0.0
-        for item in played[name]:
-            trace = play(stage, item, sets[name], seed=seed)
-            ideal = trace if stage.is_ideal else play(stage.ideal, item, sets[name], seed=seed)
-            rows += [judged(stage, name, item, trace, k, sets[name], ideal) for k in range(len(sets[name]))]
+        for scenario in played[name]:
+            trace = play(stage, scenario, sets[name], seed=seed)
+            ideal = trace if stage.is_ideal else play(stage.ideal, scenario, sets[name], seed=seed)
+            rows += [judge_run(stage, name, scenario, trace, k, sets[name], ideal) for k in range(len(sets[name]))]
             for one in (trace,) if ideal is trace else (trace, ideal):
                 simulated += len(sets[name]) * one.time.size * controller.sample_time_s
                 wall, error = wall + one.wall_s, max(error, one.error)
@@ -233,13 +232,13 @@ def verify(
 
 
 def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
-    """Refuse no plants at all, and draws or partners of plants that are not there."""
+    """Check that there is a plant, and that draws and partners are of known plants."""
     if not isinstance(plants, Mapping) or not plants:
         raise ControlError("verify needs a mapping of name to plant with at least one; give {name: plant}")
-    for what, given in (("draws", draws), ("partners", partners)):
-        for name in given:
+    for argument, names in (("draws", draws), ("partners", partners)):
+        for name in names:
             if name not in plants:
-                raise ControlError(f'{what} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
+                raise ControlError(f'{argument} = {{"{name}": ...}} is none of the plants; {suggestion(name, plants)}')
 
 
 def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
@@ -250,26 +249,26 @@ def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
     return plant.port.held() if plant.port is not None and plant.port.held is not None else None
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def witness(row: Outcome) -> str:
+def describe_witness(row: Outcome) -> str:
     """Return where a row's draw differs from nominal, as text that follows its reason."""
     return "".join(f"; {name} = {value:.6g}" for name, value in row.parameters.items())
 
 
-def _table(found: Verification) -> list[str]:
+def _format_worst(verification: Verification) -> list[str]:
     head = (
         "plant", "scenario", "size", "", "force N", "current A", "angle deg", "energy J", "at limit", "ends off N",
         "allowed N", "draw",
     )  # fmt: skip
     cells: list[tuple[str, ...]] = []
-    for row in found.worst():
+    for row in verification.worst():
         angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)
-        scenario = found.scenario(row)
+        scenario = verification.scenario(row)
         cells.append((
             row.plant, row.scenario, scenario.size, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
             *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),

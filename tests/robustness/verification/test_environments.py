@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control.laws.passivity import passivity
 from seaopt.errors import ControlError
-from seaopt.robustness.verification.environments import against_environment, coupled_stability, environment
+from seaopt.robustness.verification.environments import attach_environment, close_on_environment, coupled_stability
 
 
 @pytest.fixture(scope="module")
@@ -57,16 +57,16 @@ def by_hand(controller, thor, m_2, k_e, d_e):
 def test_the_map_is_the_calculation_by_hand(controller, stand, thor, case):
     expected = by_hand(controller, thor, *case)
     largest = expected[np.argmax(np.abs(expected))]
-    one = environment(controller, against_environment(stand), thor, *case)
+    one = close_on_environment(controller, attach_environment(stand), thor, *case)
     assert one.spectral_radius == pytest.approx(np.abs(largest), abs=1e-8)
     if one.spectral_radius > 1 + 1e-6:
         assert one.frequency_hz == pytest.approx(abs(np.angle(largest)) / (2e-3 * np.pi), rel=1e-6)
 
 
 def test_every_point_of_the_map_is_its_own_loop(controller, stand, thor, found):
-    coupled = against_environment(stand)
+    coupled = attach_environment(stand)
     for d, m, k in ((0, 3, 4), (1, 7, 12), (3, 14, 0)):
-        one = environment(controller, coupled, thor, found.mass[m], found.stiffness[k], found.damping[d])
+        one = close_on_environment(controller, coupled, thor, found.mass[m], found.stiffness[k], found.damping[d])
         assert found.spectral_radius[d, m, k] == pytest.approx(one.spectral_radius, abs=1e-9)
 
 
@@ -80,10 +80,10 @@ def test_the_boundary_is_where_a_pole_crosses_the_circle(controller, thor, found
 def test_what_grows_swings_where_the_port_is_not_passive(controller, stand, thor, found):
     """Colgate and Hogan, both ways: undamped environments grow in the bands where Re Z < 0, and nowhere else."""
     bands = passivity(controller, stand, thor).bands_hz
-    coupled = against_environment(stand)
+    coupled = attach_environment(stand)
     seen = []
     for m_2, k_e in [(m, k) for m in found.mass[::2] for k in found.stiffness[::2]]:
-        one = environment(controller, coupled, thor, float(m_2), float(k_e), 0.0)
+        one = close_on_environment(controller, coupled, thor, float(m_2), float(k_e), 0.0)
         if one.doubling_s is not None:
             seen.append(one.frequency_hz)
     assert len(seen) > 5

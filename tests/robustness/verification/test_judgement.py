@@ -11,7 +11,7 @@ import seaopt as so
 from seaopt.control import Gains, TransferFunction
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import SimulationError
-from seaopt.robustness.verification.linear import linear_view
+from seaopt.robustness.verification.linear import linearise_last_phase
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
@@ -108,7 +108,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
         controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}, quantisation={"F1": 3.0}),
         current_step_A=0.1,
     )  # fmt: skip
-    view = linear_view(stage, default_scenarios(controller, stand)[0], thor)
+    view = linearise_last_phase(stage, default_scenarios(controller, stand)[0], thor)
     system = controller.close(stand, thor).system()
     read = np.outer(system.b[:, 0], system.b[:, 0]) * (4.0 + 9.0 / 12.0)
     c, d = system.c[0], (system.d[0, 0] - 1.0) ** 2 * (4.0 + 9.0 / 12.0)

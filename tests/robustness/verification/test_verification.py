@@ -17,7 +17,7 @@ from seaopt.errors import ControlError
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Stage, play
-from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, left_out, step_limit
+from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, find_step_limit, list_left_out
 from seaopt.robustness.verification.verification import verify
 
 CELL = so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})
@@ -94,7 +94,7 @@ def test_the_step_limit_is_where_the_current_saturates(controller, stand, thor):
         current, memory = law.step(memory, 1.0, float(c @ x))
         x = a @ x + b * current / controller.command.per_effort
         largest = max(largest, abs(current))
-    assert step_limit(controller) == pytest.approx(9.0 / largest, rel=1e-4)
+    assert find_step_limit(controller) == pytest.approx(9.0 / largest, rel=1e-4)
 
 
 @pytest.mark.parametrize("factor", [10.5, 11.0])
@@ -197,15 +197,15 @@ def test_bad_input(controller, thor, attempt, words):
 def test_what_a_missing_current_limit_leaves_out_is_said(controller, stand, swing, thor):
     free = replace(controller, spec=replace(controller.spec, current_limit_A=None))
     verification = verify(free, {"stand": stand}, thor)
-    assert [skipped[:2] for skipped in verification.skipped] == [(name, "stand") for name in left_out(free, stand)]
-    assert left_out(free, stand) == ("saturating doublet", "saturating hold")
-    assert left_out(free, swing) == ("saturating doublet",)
+    assert [skipped[:2] for skipped in verification.skipped] == [(name, "stand") for name in list_left_out(free, stand)]
+    assert list_left_out(free, stand) == ("saturating doublet", "saturating hold")
+    assert list_left_out(free, swing) == ("saturating doublet",)
     assert "saturating hold on stand, nothing saturates without current_limit_A" in repr(verification)
 
 
 def test_a_trace_is_printed_short(verification):
     text = repr(verification.replay(verification.rows[0]))
-    assert text.startswith("Trace of 1 run of ")
+    assert text.startswith("Playback of 1 run of ")
     assert len(text) < 400 and "\n" not in text and "array" not in text
 
 
