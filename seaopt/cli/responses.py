@@ -66,7 +66,7 @@ class Responses:
             for name, survey in self.surveys.items()
             for pair in survey.pairs
         ]
-        for line in format_table(rows, titles, "<<" + ">" * len(titles)):
+        for line in format_table(rows, titles, "<<".ljust(len(titles), ">")):
             console.print(line, highlight=False, markup=False)
         console.print(RESPONSES_NOTE, style="dim", highlight=False, markup=False)
         for name, survey in self.surveys.items():

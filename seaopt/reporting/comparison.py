@@ -1,4 +1,4 @@
-"""The frequency responses of a fit's experiments beside the fit: what the one says of the other."""
+"""The frequency responses of a fit's experiments beside the fitted model: how far they differ, for the report."""
 
 from __future__ import annotations
 
