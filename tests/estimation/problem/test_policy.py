@@ -118,7 +118,7 @@ def test_the_problem_file_declares_it(tmp_path, stand, clipped, limit):
     ("options", "words"),
     [
         ({"mask": "clipped"}, "is not known"),
-        ({"saturation": {"F1": (5.0, -5.0)}}, "is no range"),
+        ({"saturation": {"F1": (5.0, -5.0)}}, "is not a range"),
         ({"saturation": {"F3": (-5.0, 5.0)}}, "not a measured output"),
         ({"saturation": {"F1": (1e4, 2e4)}}, "every sample of F1 is saturated"),
     ],

@@ -362,7 +362,7 @@ def test_shots_too_short_for_the_states_are_refused():
     time, u, y = lag_log(n=8000)
     log = so.Log.from_arrays(time=time, u=u, y=y)
     one = so.Experiment(plant=lag(), log=log, offset=False, name="lag")
-    words = r"experiment lag: {} leaves 1.6 samples a shot, of 8000 .* at least 4 samples: give 2000 or fewer"
+    words = r"experiment lag: {} leaves 1.6 samples per shot, of 8000 .* at least 4 samples: give 2000 or fewer"
     with pytest.raises(EstimationError, match=words.format(r"MultipleShooting\(segments=5000\)")):
         so.fit([one], LAG, method=so.MultipleShooting(segments=5000))
     with pytest.raises(EstimationError, match=words.format("shots = 5000")):
