@@ -1,0 +1,66 @@
+"""The architecture page tells of the code as it is: rooms, their order, and the names it points to."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import tomllib
+from pathlib import Path
+
+import seaopt
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+PACKAGE = Path(seaopt.__file__).parent
+
+
+def drawn_lines():
+    """Return the names of each line of the drawing, and the package whose box it stands in."""
+    (drawing,) = re.findall(r"```text\n(.*?)```", PAGE, flags=re.DOTALL)
+    box, lines = None, []
+    for line in drawing.splitlines():
+        if "┌" in line:
+            box, beside = re.match(r" ┌ (\w+) ─+┐? ?(\w+)?", line).groups()
+            lines.append((None, {box, beside} - {None}))
+        elif "└" in line:
+            box = None
+        else:
+            names = re.match(r"[ │]*((?:\w+)(?: \| \w+)*)", line).group(1)
+            lines.append((box, set(names.split(" | "))))
+    return lines
+
+
+def test_the_drawing_has_the_order_of_the_import_contracts():
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    layers = {item["containers"][0]: item["layers"] for item in contracts if item["type"] == "layers"}
+    for container, rows in layers.items():
+        box = None if container == "seaopt" else container.split(".")[-1]
+        drawn = [names for where, names in drawn_lines() if where == box]
+        assert drawn == [set(row.split(" | ")) for row in rows], container
+
+
+def test_every_room_is_drawn():
+    for package in (None, "control", "estimation", "robustness", "logs"):
+        folder = PACKAGE if package is None else PACKAGE / package
+        rooms = {path.parent.name for path in folder.glob("*/__init__.py")}
+        drawn = set().union(*(names for where, names in drawn_lines() if where == package))
+        assert rooms <= drawn, package
+
+
+def test_every_name_on_the_page_exists():
+    for name in re.findall(r"`(seaopt(?:\.\w+)+)`", PAGE):
+        module, rest = name, []
+        while True:
+            try:
+                value = importlib.import_module(module)
+                break
+            except ModuleNotFoundError:
+                module, _, last = module.rpartition(".")
+                rest.insert(0, last)
+        for attribute in rest:
+            value = getattr(value, attribute)
+
+
+def test_no_room_is_crowded():
+    for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
+        assert len(list(folder.glob("*.py"))) <= 15, folder
