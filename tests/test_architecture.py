@@ -31,8 +31,9 @@ def drawn_lines():
 
 
 def test_the_drawing_has_the_order_of_the_import_contracts():
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
-    layers = {item["containers"][0]: item["layers"] for item in contracts if item["type"] == "layers"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = project["tool"]["importlinter"]["contracts"]
+    layers = {contract["containers"][0]: contract["layers"] for contract in contracts if contract["type"] == "layers"}
     for container, rows in layers.items():
         box = None if container == "seaopt" else container.split(".")[-1]
         drawn = [names for where, names in drawn_lines() if where == box]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.cli.frontier import bandwidths
+from seaopt.cli.frontier import parse_bandwidths
 from seaopt.control import sweep
 from seaopt.errors import ControlError
 from tests.control.loops.test_loop import independent
@@ -64,4 +64,4 @@ def test_the_command_writes_table_json_and_figure(tmp_path):
 @pytest.mark.parametrize("text", ["15", "15:60", "60:15:5", "15:60:0", "a:b:c", "1:2:1e-9", "nan:60:5"])
 def test_bad_sweeps(text):
     with pytest.raises(ControlError, match="--sweep"):
-        bandwidths(text)
+        parse_bandwidths(text)
