@@ -35,7 +35,7 @@ class Parameter:
     description : str
         A few words.
     identified : bool
-        False where a fit gave the value and its data do not tell it: others would have done as well.
+        False where a fit gave the value and its data cannot identify it: other values fit as well.
 
     """
 
@@ -139,7 +139,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
     @property
     def unidentified_names(self) -> tuple[str, ...]:
-        """Names of the parameters whose values come from a fit that cannot tell them, in order."""
+        """Names of the parameters whose values come from a fit that cannot identify them, in order."""
         return tuple(name for name, parameter in self._items.items() if not parameter.identified)
 
     def values_of(self, names: Iterable[str]) -> list[float]:

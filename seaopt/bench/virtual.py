@@ -20,7 +20,7 @@ from seaopt.simulation import simulate
 
 @record
 class Sensors:
-    """What the sensors do to each output, by name; what is left out is ideal.
+    """Errors of the sensors of each output, by name; what is left out is ideal.
 
     Parameters
     ----------

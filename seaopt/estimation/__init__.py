@@ -1,4 +1,4 @@
-"""Least squares on the time-domain logs: parameters, their uncertainty, what the data cannot tell, what to measure."""
+"""Least squares on time-domain logs: parameters, their uncertainty, what cannot be identified, what to measure."""
 
 from seaopt.estimation.advice.compare import Ranking, compare
 from seaopt.estimation.advice.diagnostics import Diagnostics, diagnose

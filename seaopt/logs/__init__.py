@@ -1,4 +1,4 @@
-"""Raw files to `Log`, and what is wrong with them."""
+"""Read raw files as `Log`, and find their faults."""
 
 from seaopt.logs.log.alignment import Hold, Linear, Nearest
 from seaopt.logs.log.concatenation import concatenate

@@ -39,12 +39,12 @@ Matrices = tuple[
 
 @record(eq=False)
 class Plant:
-    r"""States, inputs, outputs and parameters with units, and the equations that tie them.
+    r"""States, inputs, outputs and parameters with units, and the equations that connect them.
 
     Parameters
     ----------
     name : str
-        What errors and reports call it.
+        For errors and reports.
     states, inputs, outputs : mapping of name to SI unit
         In the order of the vectors x, u and y.
     parameters : mapping of name to unit or `Parameter`

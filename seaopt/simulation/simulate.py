@@ -82,8 +82,8 @@ def simulate(
     delay_s : float
         Delay of the input.
     rtol : float
-        Error allowed in each output, relative to its largest value; a linear plant has none, a nonlinear one is
-        stepped finer until two step sizes agree to it.
+        Error allowed in each output, relative to its largest value; a linear plant has no error, and for a
+        nonlinear one the step is refined until two step sizes agree within it.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def simulate(
     LogError
         An input is missing, or the log has a gap.
     SimulationError
-        The trajectory leaves what floats can hold, or no step size reaches `rtol`.
+        The trajectory overflows, or no step size reaches `rtol`.
 
     Examples
     --------

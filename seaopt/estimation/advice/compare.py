@@ -180,7 +180,7 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
     ----------
     fits : sequence of Fit, or mapping of name to Fit
         Two or more, as `fit` returned them, from the same experiments: the same logs, outputs, samples used, band and
-        loss. In a sequence each is called by its plants' names.
+        loss. In a sequence each is named after its plants.
 
     Returns
     -------
@@ -189,11 +189,11 @@ def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
     Raises
     ------
     EstimationError
-        Fewer than two fits, one that was read from a file, or fits to data that are not the same.
+        Fewer than two fits, one that was read from a file, or fits to different data.
 
     Examples
     --------
-    What a load cell at link 2 sees tells the models of the drive apart:
+    A load cell at link 2 distinguishes the models of the drive:
 
     >>> import seaopt as so
     >>> from seaopt.bench import PAPER_STAND, Sensors, virtual_log

@@ -83,8 +83,8 @@ class Diagnostics:
     at_bound : tuple of str
         Unknowns that lie on a bound.
     held : mapping of name to ScoreTest
-        The test of each parameter that was fixed, that which would lower the cost most first; without those that
-        the free ones stand for, or that would make a linear plant nonlinear.
+        The test of each fixed parameter, the one that would lower the cost most first; without those that have
+        the same effect as the free ones, or that would make a linear plant nonlinear.
     aic, bic : float
         Of the fit.
     sentences : tuple of str
@@ -191,7 +191,7 @@ def diagnose(fit: Fit) -> Diagnostics:
 
     Examples
     --------
-    A delay that the fit does not know of:
+    A delay that the model lacks:
 
     >>> import seaopt as so
     >>> from seaopt.bench import PAPER_STAND, Sensors, virtual_log

@@ -39,7 +39,7 @@ from seaopt.records import record
 
 @record(eq=False, repr=False)
 class Comparison:
-    """What another excitation would tell, made as large as the design's in rms.
+    """The expected result of another excitation, scaled to the design's rms.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Design:
     excitation : tuple of Multisine or Chirp
         Ready for `virtual_log`, or for the bench: ``excite(design.excitation, ...)`` gives its samples.
     criterion : str
-        What was made small.
+        What was minimised.
     parameters : ParameterSet
         The guess; the free ones carry the std to be expected.
     covariance : Covariance
@@ -103,7 +103,7 @@ class Design:
         return {name: self.covariance.std(name) for name in self.covariance.names}
 
     def against(self, excitation: Excitation, *, seed: int = 0) -> Comparison:
-        """Return what another excitation of equal rms would tell, its limits on peaks aside.
+        """Compare with another excitation of equal rms, whatever its peaks.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ def design_experiment(
         "A": the sum of the relative variances; "D": the determinant of the covariance; or the name of one free
         parameter, whose variance alone counts.
     signal : Multisines or Chirps, optional
-        What is looked for. If left out, multisines; and where a peak limits the one that is found, chirps as well,
+        The kind of signal. If left out, multisines; and where a peak limits the result, chirps as well,
         whose peaks are low: the better is returned.
     offset : bool
         Whether the fit estimates an offset of each output.
@@ -197,7 +197,7 @@ def design_experiment(
     Raises
     ------
     EstimationError
-        Nothing is free, a name is unknown, or the outputs do not tell the free parameters apart.
+        Nothing is free, a name is unknown, or the outputs cannot identify the free parameters.
 
     References
     ----------

@@ -82,11 +82,11 @@ class Multisines:
     Parameters
     ----------
     lines : int
-        Candidates, log-spaced over the band; the best need few of them.
+        Candidates, log-spaced over the band; a design uses few of them.
     band_hz : (low, high), optional
         From four periods in the log to 0.4 of the sample rate if left out.
     spread : float
-        The part of the power that is spread evenly over all candidates whatever they tell, 0 to below 1: a log with
+        The part of the power that is spread evenly over all candidates, 0 to below 1: a log with
         power everywhere also shows what the model lacks, and depends less on the guess.
 
     """

@@ -57,18 +57,18 @@ class Experiment:
     delay_s : float or Parameter
         Of the input; a free Parameter is estimated.
     hold : {"zero", "first"}
-        The input between samples: a command is held, a measured current is better drawn as a line.
+        The input between samples: "zero" for a command, "first" for a measured current.
     gaps : {"split", "error"}
         A gap in the log starts a new segment with its own initial state, or is an error.
     saturation : mapping of output to (low, high)
         Ranges of the sensors: samples at an end or beyond it become missing.
     mask : {"auto", "declared", "none"}
-        Saturated samples of outputs become missing, which `notes` says: those outside the declared ranges, and those at
-        clear flat tops where no range is declared; the declared ones alone; or none. An input that saturates is what
-        the plant got.
+        Saturated samples of outputs become missing, as `notes` states: those outside the declared ranges, and those at
+        clear flat tops where no range is declared; the declared ones alone; or none. A saturated input is what
+        the plant received.
     shots : int
-        Cut each segment into so many that start from states of their own: for a plant that runs away in simulation, at
-        the price of what the joints would tell.
+        Cut each segment into this many shots, each with its own initial state: for a plant that diverges in
+        simulation. The information of the joints is lost.
 
     Attributes
     ----------
@@ -257,7 +257,7 @@ class Experiment:
 
     @property
     def pieces(self) -> list[slice]:
-        """The stretches that are simulated each from a state of its own."""
+        """The stretches that are simulated, each from its own initial state."""
         return [slice(a, b) for whole in self.stretches for a, b in pairwise(self._cuts(whole))]
 
     def _cuts(self, stretch: slice) -> list[int]:

@@ -31,7 +31,7 @@ class Squares:
 
 @record
 class Huber:
-    """Squares up to `threshold` sigma, absolute values beyond (Huber 1964): outliers pull less.
+    """Squares up to `threshold` sigma, absolute values beyond (Huber 1964): outliers weigh less.
 
     Parameters
     ----------

@@ -85,7 +85,7 @@ class DerivedFigure:
 
 @record(eq=False)
 class ModelledOutputs:
-    """Measured and model outputs of an experiment on its clock; NaN where there is nothing."""
+    """Measured and model outputs of an experiment on its clock; NaN where there is no value."""
 
     time: Float[np.ndarray, " n"]
     inputs: dict[str, Float[np.ndarray, " n"]]

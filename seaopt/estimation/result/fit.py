@@ -49,14 +49,14 @@ def fit(
         The last fraction of each log is kept back, for validation.
     diagnostics : bool
         False leaves out what needs the residuals of every sample: the stds are then those for white residuals, and
-        the outputs' figures are not there.
+        the outputs' figures are missing.
     callback : callable, optional
         Called with (iteration, cost).
 
     Returns
     -------
     Fit
-        With status "not_identifiable" when the data cannot tell some direction; it then holds what can be told.
+        With status "not_identifiable" when the data do not determine some direction; it then holds what they do determine.
 
     Raises
     ------

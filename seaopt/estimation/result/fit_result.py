@@ -47,14 +47,14 @@ class Fit:
     Parameters
     ----------
     status : str
-        "converged", "max_iterations", "stalled" or "not_identifiable"; `message` says it in words.
+        "converged", "max_iterations", "stalled" or "not_identifiable"; `message` explains it.
     parameters : ParameterSet
         Every parameter of the plants, free ones with their std (infinite where not identifiable); `identified` is False
-        of those that the data do not tell.
+        for those that the data cannot identify.
     covariance : Covariance
         Of the free parameters; posterior, and allowing for coloured residuals.
     white_covariance : Covariance
-        What it would be if the residuals were white: beside the other, it shows what their colour costs.
+        The covariance for white residuals; compared with the other it shows the effect of their colour.
     derived : mapping
         Figures that follow from the parameters.
     outputs : mapping of experiment to mapping of output to OutputFit
@@ -72,7 +72,7 @@ class Fit:
     log_likelihood : float
         Gaussian, with each output's sigma at its best value.
     unknowns : int
-        All that was estimated, experiments' own included, sigmas not.
+        Number of all unknowns, those of the experiments included, sigmas not.
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
     notes : tuple of str
@@ -108,7 +108,7 @@ class Fit:
 
     @property
     def ok(self) -> bool:
-        """Whether the search converged and every free parameter can be told."""
+        """Whether the search converged and every free parameter is identified."""
         return self.status == "converged"
 
     @property
@@ -123,7 +123,7 @@ class Fit:
 
     @property
     def all_unknowns(self) -> int:
-        """All that was estimated, sigmas included."""
+        """Number of all unknowns, sigmas included."""
         return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
 
     def require_minimum(self, what: str) -> Minimum:

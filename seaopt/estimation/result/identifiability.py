@@ -28,7 +28,7 @@ RICH = 600  # samples of made-up input
 
 @record
 class Identifiability:
-    """What the data tell of the free parameters.
+    """What the data can identify of the free parameters.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ class Identifiability:
     condition : float
         Ratio of the largest to the smallest singular value of the normalised sensitivities.
     unidentifiable : tuple of mappings
-        One per direction that is not seen: relative changes {NAME: weight} that leave every output as it is.
+        One per direction that has no effect: relative changes {NAME: weight} that leave every output as it is.
     weak : tuple of mappings
-        The same for directions that are hardly seen.
+        The same for directions that have hardly any effect.
     structural_rank : int
-        Directions that a rich input would show on the same outputs; below `free`, no log can tell.
+        Directions that a rich input would show on the same outputs; below `free`, no log can identify all parameters.
 
     """
 

@@ -46,7 +46,7 @@ class OutputError(Method):
         Of least squares.
     search : bool
         Look for a start: from the logs' frequency responses, over two decades around the given values, and, where that
-        ends badly, by predicting sample by sample with a filter that holds the simulation to the log. The given
+        fails, by predicting sample by sample with a filter that keeps the simulation near the log. The given
         values are kept where they explain the logs better.
     seed : int
         Of that search.
@@ -74,7 +74,7 @@ class OutputError(Method):
 class PredictionError(Method):
     """The residual is the error of the prediction one sample ahead, by a steady-state Kalman filter.
 
-    For plants that noise drives, not only sensors: process noise (one strength per state) over the measurement noise is
+    For plants with noise on the plant itself, not only on the sensors: process noise (one strength per state) over the measurement noise is
     estimated with the parameters, and the filter's gain follows from it and from the plant. The measurement noise is
     taken from the outputs' third differences; together they are scaled by the size of the prediction errors. A band is
     refused: the filter is itself a model of the noise.

@@ -48,9 +48,9 @@ ANOTHER_FIT = 2.0  # residual power of single shooting, over that of the joined 
 class MultipleShooting(Method):
     """Each segment is cut into shots that start from states of their own; the shots are joined while the fit goes on.
 
-    For plants that are unstable, or start far off: a simulation that starts anew every so often cannot run away. At the
-    end the shots join to rounding: the result is that of `OutputError` wherever both find it. Where the plant runs away
-    in one go the shots keep initial states of their own, which the message says: the intervals are then wider.
+    For plants that are unstable, or a start far off: a simulation that restarts at intervals cannot diverge. At the
+    end the shots join to rounding: the result is that of `OutputError` wherever both find it. Where the plant diverges
+    in one pass the shots keep their own initial states, as the message states: the intervals are then wider.
 
     Parameters
     ----------

@@ -113,7 +113,7 @@ class Bootstrap:
 
 
 def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False, block: int | None = None) -> Bootstrap:
-    """Return how the parameters vary when blocks of the residuals are drawn anew.
+    """Return how the parameters vary when blocks of the residuals are resampled.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     seed : int
         Of the draws.
     refit : bool
-        Make a fit for each draw, from the minimum, instead of one Gauss-Newton step: slower; it shows what bends.
+        Make a fit for each draw, from the minimum, instead of one Gauss-Newton step: slower; it includes nonlinearity.
     block : int, optional
         Length of the blocks in samples; from the residuals' correlation if left out.
 
@@ -135,8 +135,8 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     Raises
     ------
     EstimationError
-        The fit was read from a file, or cannot tell some parameter; fewer than 20 draws; `refit` of errors of
-        prediction, which cannot be put on top of a simulation.
+        The fit was read from a file, or does not identify some parameter; fewer than 20 draws; `refit` of prediction
+        errors, which cannot be added to a simulation.
 
     Examples
     --------

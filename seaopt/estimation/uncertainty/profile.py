@@ -57,7 +57,7 @@ class Profile:
     wald : (float, float)
         Estimate ± quantile x std, for comparison.
     values : array, shape (n,)
-        Where the others were refitted, in order, the estimate among them.
+        Values at which the other parameters were refitted, in order, the estimate among them.
     rises : array, shape (n,)
         Of the cost above the fit's, scaled; half of tau squared.
     scale : float
@@ -65,7 +65,7 @@ class Profile:
     refits : int
         How many there were.
     message : str
-        What is to be known about it; empty if nothing.
+        Remarks; empty if there are none.
 
     """
 

@@ -88,7 +88,7 @@ class Linear:
 
 @record
 class Nearest:
-    """The sample nearest in time, if it is within the tolerance: clocks that tick together with a little jitter.
+    """The sample nearest in time, if it is within the tolerance: clocks of one rate with a little jitter.
 
     Parameters
     ----------

@@ -142,7 +142,7 @@ class Log:
 
     @property
     def segments(self) -> list[slice]:
-        """The stretches without a gap, as slices of at least two samples; a sample alone between gaps is in none.
+        """The stretches without a gap, as slices of at least two samples; a single sample between gaps is left out.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class Log:
 
     @property
     def quality(self) -> Quality:
-        """What is wrong with the data, and what they can tell: see `seaopt.logs.assess_quality`."""
+        """Faults of the data, and what they excite: see `seaopt.logs.assess_quality`."""
         return assess_quality(self)
 
     def resample(self, *, rate_hz: float, rule: Rule | None = None, bridge_s: float | None = None) -> Log:
@@ -201,8 +201,8 @@ class Log:
         rate_hz : float
             Of the new clock, which starts at the log's first sample; at least 0.8 of the log's own rate.
         rule : Linear, Hold or Nearest, optional
-            Linear if left out. A line between samples is a low-pass filter: it takes 0.9 dB at a quarter of the sample
-            rate and 3.9 dB at half.
+            Linear if left out. A line between samples is a low-pass filter: it attenuates by 0.9 dB at a quarter of the
+            sample rate and 3.9 dB at half.
         bridge_s : float, optional
             Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out.
 
@@ -227,7 +227,7 @@ class Log:
         return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, bridge_s=bridge_s))
 
     def restamp(self) -> Log:
-        """Put a log whose timestamps were rounded on the uniform clock that explains them; samples are not touched.
+        """Replace rounded timestamps by the uniform clock that explains them; samples are not changed.
 
         Returns
         -------
@@ -264,7 +264,7 @@ class Log:
         Log
             With a note that names the pass band and the samples that were cut at the ends: 25 periods of the new clock
             at each end of each stretch. A short run of missing samples is bridged by a line for the filter, and the
-            output is missing where they carry more than 20 % of its weight. An input that was held no longer is: fit
+            output is missing where they carry more than 20 % of its weight. An input that was held is so no longer: fit
             with ``hold="first"``.
 
         Raises

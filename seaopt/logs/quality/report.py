@@ -38,7 +38,7 @@ INPUT_UNITS = frozenset({"A", "V"})
 
 @record(eq=False)
 class Quality:
-    """What is wrong with a log's data, and what they can tell; ``print(quality)`` is a report.
+    """Faults of a log's data, and what they excite; ``print(quality)`` is a report.
 
     Parameters
     ----------

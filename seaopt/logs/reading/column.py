@@ -15,7 +15,7 @@ from seaopt.units import factor, si_unit
 
 @record
 class Column:
-    """A column of a file and the way from its numbers to SI: (value, wrapped, times scale, plus offset) in `unit`.
+    """A column of a file and its conversion to SI: (value, unwrapped, times scale, plus offset) in `unit`.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Column:
     scale, offset : float
         Applied before the unit, in this order.
     wrap_bits : int, optional
-        The numbers are unsigned integers of so many bits that stand for signed ones (two's complement).
+        The numbers are unsigned integers of this many bits that represent signed ones (two's complement).
     file : path, optional
         Which of several files; needed where more than one has the column.
     time : str or Column, optional
@@ -34,7 +34,7 @@ class Column:
     clock_offset_s : float
         Seconds to add to its own clock.
     align : Hold, Linear or Nearest, optional
-        How it comes from its own clock to the log's.
+        How it is aligned from its own clock to the log's.
 
     Examples
     --------

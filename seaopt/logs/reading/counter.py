@@ -44,7 +44,7 @@ class Counter:
     def open_gaps(
         self, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], place: str
     ) -> tuple[Float[np.ndarray, " n"], str]:
-        """Return time with the later samples moved by what was lost, and what was done.
+        """Return time with the later samples moved by the lost ones, and a note of what was done.
 
         Raises
         ------

@@ -22,7 +22,7 @@ class Contents:
     fields : tuple of Field
         Name, kind, length, unit and clock of each column; the name is what `Column(column=...)` takes.
     notes : tuple of str
-        Remarks on how the file was understood.
+        Remarks on how the file was read.
 
     """
 

@@ -45,18 +45,18 @@ def read_table(
         Which column is which channel; where it is left out, every column of numbers on the clock, named by its header
         without the unit's brackets.
     align : Hold, Linear or Nearest, optional
-        How channels of other clocks come to this one; a Column's own rule goes first.
+        How channels of other clocks are aligned to this one; a Column's own rule takes precedence.
     window_s : tuple, optional
         Read only what lies between these times of the clock; formats with an index skip the rest of the file.
     counter : Counter, optional
         A column that counts samples: where it skips, the later times are moved to open a gap.
     digest : bool
-        Whether to note the files' SHA-256, for which they are read whole, though never held.
+        Whether to note the files' SHA-256, for which each is read as a whole, but not kept in memory.
 
     Raises
     ------
     LogError
-        The file is missing or damaged, a column is missing or doubled, a cell is not a number, a channel is on another
+        The file is missing or damaged, a column is missing or occurs twice, a cell is not a number, a channel is on another
         clock and no rule is given, or two channels of one SI unit are one column.
     UnitError
         A unit is unknown or of the wrong dimension.
@@ -116,7 +116,7 @@ def read_log(
     Raises
     ------
     LogError
-        What `read_table` raises, a channel holds no number, or time does not increase.
+        What `read_table` raises; or a channel contains no number, or time does not increase.
     UnitError
         A unit is unknown or of the wrong dimension.
 
@@ -139,7 +139,7 @@ def read_log(
 
 
 def write_log(log: Log, path: str | Path) -> Path:
-    """Write a log as CSV, units in the header's brackets, numbers with all their digits."""
+    """Write a log as CSV, with units in the header's brackets and numbers with all their digits."""
     return write_text(path, log.to_polars().write_csv())
 
 
