@@ -1,4 +1,4 @@
-"""Frequency responses of logs: H1 estimates, second-order forms, and what a whole log shows."""
+"""Frequency responses of logs: H1 estimates, second-order forms, and the survey of a whole log."""
 
 from seaopt.frequency.response import FrequencyResponse, h1
 from seaopt.frequency.second_order import DriveEstimate, SecondOrder, Uncertain, second_order

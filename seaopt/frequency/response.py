@@ -57,7 +57,7 @@ class FrequencyResponse:
     def expected(self, response: Callable[[Any], Any]) -> Complex[np.ndarray, "m ..."]:
         """Return what H1 is on average where the plant's response is `response`, a function of frequencies in Hz.
 
-        The first line, beside the mean that every stretch is rid of, is taken as it is.
+        The first line, beside the mean that every stretch is rid of, is not corrected.
         """
         f = self.frequency_hz
         line = f[1] - f[0]

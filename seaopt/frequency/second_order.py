@@ -55,7 +55,7 @@ class Uncertain:
 
 @record
 class DriveEstimate:
-    """What a second-order form says of a linear actuator with both links fixed and k known.
+    """Parameters that a second-order form implies for a linear actuator with both links fixed and k known.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class DriveEstimate:
     efficiency : Uncertain
         Static gain of F1/F_m, eta.
     m_k_averaged, b_m_averaged : Uncertain
-        The paper's: k/m_k is the mean of K and b, which takes the static gain to be 1.
+        The paper's: k/m_k is the mean of K and b, which assumes a static gain of 1.
     K : Uncertain
         Of F1/F_m, as printed in (16).
 

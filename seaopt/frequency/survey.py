@@ -134,7 +134,7 @@ class Survey:
         return response
 
     def drive(self, pair: Pair, params: ParameterSet) -> DriveEstimate | None:
-        """Return what a pair's second-order form says of the actuator, with k known, as the source paper reads (16).
+        """Return the actuator's parameters that a pair's second-order form implies, with k known, as in (16).
 
         None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output.
         """

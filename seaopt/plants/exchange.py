@@ -49,7 +49,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     path : path
         The .fmu file.
     include : path, optional
-        A folder with the FMI 3.0 headers: with it and a C compiler, a binary for this platform goes in too. Without,
+        A folder with the FMI 3.0 headers: with it and a C compiler, a binary for this platform is included. Without,
         the importing tool compiles the sources.
 
     Returns

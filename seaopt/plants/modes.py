@@ -36,7 +36,7 @@ class Resonance:
 
 @record(eq=False)
 class Modes:
-    """What a linearised plant is made of.
+    """Poles, zeros, static gains and resonances of a linearised plant.
 
     Parameters
     ----------

@@ -186,7 +186,7 @@ _FILTERS = {
 def wrapped(
     plant: Plant, parts: Sequence[str], *, source: str | None = None, outputs: Sequence[str] | None = None
 ) -> Plant:
-    """Return a plant behind its current loop and delays, read through its load cells; any plant will do.
+    """Return a plant behind its current loop and delays, read through its load cells; any plant is possible.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ class Actuation:
     unit : str
         Of the effort: N or N m.
     efficiency : str or None
-        The parameter that scales the effort and says what the transmission loses.
+        The parameter that scales the effort by the losses of the transmission.
 
     """
 
@@ -46,7 +46,7 @@ class Actuation:
 
 @record
 class Sensing:
-    """What is regulated, and what a sensor may feed back: names of outputs, or of states.
+    """Regulated and sensed signals: names of outputs, or of states.
 
     Parameters
     ----------
@@ -119,9 +119,9 @@ class Port:
     Parameters
     ----------
     motion : str or None
-        The output that says where the port is; None where the plant has it held.
+        The output that is the port's position; None where the plant has it held.
     coordinate, rate : str or None
-        The states of the link alone, which are gone in the plant with the port held.
+        The states of the link alone, which the plant with the port held does not have.
     effort : str or None
         The input that is the world's force or torque along the motion, where the plant has one.
     payload : tuple of str

@@ -54,8 +54,8 @@ def rotary(parts: Sequence[Part] = ()) -> Plant:
 
     The housing carries the stator, :math:`-(K_\tau I - b_r\dot\theta_m)`, and the gearbox, which turns the torque
     :math:`\tau_s/N` into :math:`\tau_s`: :math:`\tau_h = -J_m \ddot\theta_m - \tau_s`, so that motor, link and housing
-    together conserve angular momentum but for d_l. The unlumped view matters here as in the paper: the motor's inertia
-    does not turn with the link at :math:`N^2 J_m`, it turns N times as fast (Orekhov et al. 2015, Sec. V).
+    together conserve angular momentum except for d_l. The unlumped view matters here as in the paper: the motor's
+    inertia does not turn with the link at :math:`N^2 J_m`, it turns N times as fast (Orekhov et al. 2015, Sec. V).
 
     With the motor held the link swings at :math:`\sqrt{k_s/J_l}` (the antiresonance of theta_m, and a clamped flexible
     link's frequency); free, both swing at :math:`\sqrt{k_s(1/J_l + 1/(N^2 J_m))}`. N = 1 is the two-mass drive.

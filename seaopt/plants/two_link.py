@@ -343,12 +343,12 @@ def two_link(
     spring : {"link1", "link2"}
         Between housing and link 1 (the paper), or between ball nut and link 2 (its future work).
     parts : sequence of str
-        What a real actuator has besides; see `seaopt.plants.parts`.
+        Effects of a real actuator to add; see `seaopt.plants.parts`.
 
     Returns
     -------
     Plant
-        Inputs I (A) and the external forces Fe1, Fe2 (N, positive along x; on a fixed link the ground takes them;
+        Inputs I (A) and the external forces Fe1, Fe2 (N, positive along x; on a fixed link the ground carries them;
         any of the three is zero where a log leaves it out). Outputs F1, F2 (N), q (m), and of each moving link
         x_i (m) and phi (rad).
 

@@ -264,7 +264,7 @@ def read_problem(path: Path | str) -> Problem:
         The file is missing or not TOML, a key is unknown or missing, or a value is out of range; the message names
         the file, the key, the value and the remedy.
     SeaoptError
-        What the plants, the parameters or the controller specification refuse.
+        The plants, the parameters or the controller specification are refused.
 
     Examples
     --------

@@ -51,8 +51,8 @@ def write_report(
     Parameters
     ----------
     results : sequence of Fit, Ranking, Controller, Certificate, Verification, StabilityMap, LargeSignal
-        At most one of each, of the last any number; sections of what is not there are left out. A fit that was not
-        read from a file has a section of diagnostics. What a certificate has simulated stands for itself.
+        At most one of each, of the last any number; sections without a result are left out. A fit that was not
+        read from a file has a section of diagnostics. A certificate's simulations need not be listed.
     path : path
         The page; figures go to the folder ``figures`` beside it.
     title : str

@@ -60,15 +60,15 @@ def export(
     controller : Controller or mapping
         The controller, or the content of its controller.json.
     folder : path
-        Where NAME.h, NAME.c, NAME_gains.h and NAME_gains.m go; made if it is not there.
+        For NAME.h, NAME.c, NAME_gains.h and NAME_gains.m; created if it does not exist.
     precision : {"double", "float"}
         Of the C code.
     name : str
-        Begins every name in C; characters that C does not take become underscores.
+        Prefix of every name in C; characters that C does not allow become underscores.
     current_limit_A, tracking_time_s : float, optional
         As in `seaopt.control.laws.realisation.runnable`.
     allow_infeasible : bool
-        Write a controller that misses its limits too; the files say so.
+        Also write a controller that misses its limits; the files state it.
 
     Returns
     -------

@@ -47,21 +47,21 @@ class Controller:
     reference, measurement : TransferFunction
         C_r and C_y.
     command : Command
-        What is commanded for an effort, of the design plant.
+        The commanded input for an effort, of the design plant.
     spec : ControllerSpec
-        What was asked.
+        The specification that it was tuned for.
     achieved : LoopFigures
         Of the design plant.
     feasible : bool
         Whether every limit is met, as measured.
     active_constraints : tuple of str
-        The limits that are broken; if none is, those met with nothing to spare.
+        The limits that are broken; if none is, those that are just met.
     robust_to : tuple of str
         The plants, besides the design plant, that Ms and Mt were kept on.
     design : (Plant, ParameterSet) or None
         The design plant and its parameters.
     observer : DisturbanceObserver or None
-        The disturbance observer of a pid_dob, which is in the law already.
+        The disturbance observer of a pid_dob, which the law includes.
     blocked_by : tuple of str
         The limits that are broken, each with its figure.
     largest_bandwidth_hz : float or None
@@ -89,7 +89,7 @@ class Controller:
 
     @property
     def explanation(self) -> str:
-        """One line: what blocks, and what bandwidth can be had; empty where every limit is met."""
+        """One line: the limits that block, and the bandwidth that is possible; empty where every limit is met."""
         if self.feasible:
             return ""
         blocked = " and ".join(self.blocked_by or self.active_constraints)
@@ -104,7 +104,7 @@ class Controller:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader should know besides the limits, one sentence each."""
+        """Remarks besides the limits, one sentence each."""
         if self.design is None:
             return ()
         plant, values = self.design
@@ -149,7 +149,7 @@ class Controller:
     def force_limit(self, frequency_hz: float) -> float | None:
         """Return the largest amplitude of F_ref (N) at a frequency that `current_limit_A` allows on the design plant.
 
-        The motor force per reference is |T_r/P|, the plant's property whatever the controller; None without a limit.
+        The motor force per reference is |T_r/P|, a property of the plant whatever the controller; None without a limit.
         """
         if self.spec.current_limit_A is None or self.design is None:
             return None

@@ -68,7 +68,7 @@ class Passivity:
     Parameters
     ----------
     low_hz, high_hz : float
-        What was looked at.
+        The band that was examined.
     held_stable : bool
         No closed-loop eigenvalue is outside the circle with link 2 held.
     bands_hz : tuple of (low, high)
@@ -76,7 +76,7 @@ class Passivity:
     violated_hz : float or None
         The lowest frequency at which Re Z < 0 begins, `low_hz` if not `held_stable`; None: nowhere.
     least_damping_N_s_per_m : float
-        The least Re Z; where it is negative, this much viscous damping at the port would make up for it.
+        The smallest Re Z; where it is negative, this much viscous damping at the port would compensate it.
     least_hz : float
         Where that is.
     least_cosine : float
@@ -102,7 +102,7 @@ class Passivity:
         Raises
         ------
         ControlError
-            The band is not within what was looked at.
+            The band is not within the examined one.
 
         """
         low, high = band_hz
@@ -145,11 +145,11 @@ def passivity(
     Parameters
     ----------
     controller : Controller
-        Its measurement path closes the loop; the reference stands still.
+        Its measurement path closes the loop; the reference is constant.
     plant, params
-        An actuator with a port at link 2; what its links are does not matter, link 1 is held and link 2 moved.
+        An actuator with a port at link 2; its own links do not matter: link 1 is held and link 2 moved.
     low_hz, high_hz : float
-        Where to look; up to the Nyquist frequency if left out.
+        The band to examine; up to the Nyquist frequency if left out.
 
     Returns
     -------
@@ -240,8 +240,8 @@ def passivity_rows(
     Raises
     ------
     ControlError
-        The measured force does not tell the force at the port (an elastic screw between them), so that the condition
-        is quadratic in the gains.
+        The measured force does not determine the force at the port (an elastic screw between them), so that the
+        condition is quadratic in the gains.
 
     """
     port = port_of(plant, params, spec.measured, per_effort)

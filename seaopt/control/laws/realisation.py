@@ -47,7 +47,7 @@ SAME = 1e-6  # how well the state space must have the response of its transfer f
 
 @record(eq=False)
 class LawState:
-    """What a running law remembers.
+    """The state of a running law.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class RunnableLaw:
     def reset(self, reference: float = 0.0, measurement: float = 0.0, current_A: float = 0.0) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
 
-        A law without integrator has no such freedom: its next command follows from the inputs alone.
+        A law without an integrator cannot be set: its next command follows from the inputs alone.
 
         Raises
         ------
@@ -250,8 +250,8 @@ def realise(
     Raises
     ------
     ControlError
-        A number is out of range, the law by itself is unstable other than by integrators, or its poles lie so close
-        together that double precision does not hold it.
+        A number is out of range, the law by itself is unstable other than by integrators, or its poles lie too close
+        together for double precision.
 
     """
     for name, value in (

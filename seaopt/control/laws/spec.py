@@ -19,7 +19,7 @@ LOWEST_HZ = 1e-3  # limits are kept from here
 
 @record
 class ControllerSpec:
-    """A bandwidth and the limits to keep, those of `laws.limits`; a limit left out (None) is not imposed.
+    """A bandwidth and the limits of `seaopt.control.laws.limits`; a limit left out (None) is not imposed.
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ class ControllerSpec:
     bandwidth_hz : float
         Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
     bandwidth_range_hz : (low, high)
-        What bandwidth_hz may be; give another range to leave 15 to 60.
+        Allowed range of bandwidth_hz; 15 to 60 if left out.
     structure : {"pd", "pid", "pid_dob"}
         Each with feedforward of the reference; a pid_dob has a disturbance observer whose nominal plant is the design
         plant.
     notch : Notch, optional
-        A notch in series; what its fields leave open is tuned.
+        A notch in series; fields that are None are tuned.
     derivative : {"error", "measurement"}
         What is differentiated.
     sample_rate_hz : float
@@ -60,8 +60,8 @@ class ControllerSpec:
     step_N : float, optional
         A step of the reference that the current limit must at least hold.
     reserve : float
-        Ms, Mt and the other limits are met with this fraction to spare, so that parameters as uncertain as a fit
-        leaves them do not break them.
+        Fraction by which Ms, Mt and the other limits are met with room to spare, so that parameters as uncertain as a
+        fit leaves them do not break them.
 
     Raises
     ------
@@ -183,7 +183,7 @@ class ControllerSpec:
         return 1.0 / self.sample_rate_hz
 
     def allowed(self, limit: Limit) -> float | None:
-        """Return what a limit allows; None where it is not imposed."""
+        """Return the value that a limit allows; None where it is not imposed."""
         value = getattr(self, limit.name) if limit.has_field else limit.allowed
         if value is None:
             return None if limit.bandwidth_divisor is None else self.bandwidth_hz / limit.bandwidth_divisor
@@ -191,7 +191,7 @@ class ControllerSpec:
 
     @property
     def sensitivity_bandwidth_limit_hz(self) -> float:
-        """The least sensitivity bandwidth: as given, or bandwidth_hz/5."""
+        """The smallest allowed sensitivity bandwidth: as given, or bandwidth_hz/5."""
         return float(self.allowed(BY_NAME["min_sensitivity_bandwidth_hz"]) or 0.0)
 
     def to_dict(self) -> dict[str, Any]:

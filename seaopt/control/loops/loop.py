@@ -26,7 +26,7 @@ STABLE, GROWING = 1.0 - 1e-11, 1.0 + 1e-9
 
 @record
 class LoopFigures:
-    """What describes a closed loop; frequencies in Hz, None where there is none.
+    """Figures of a closed loop; frequencies in Hz, None where there is none.
 
     Parameters
     ----------

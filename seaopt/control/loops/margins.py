@@ -32,7 +32,7 @@ SKEWS = {"symmetric": (0.0, 2), "S-based": (1.0, 0), "T-based": (-1.0, 1)}  # sk
 
 @record
 class DiskMargin:
-    """A disk of gains that the loop survives.
+    """A disk of complex gains for which the loop stays stable.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class DiskMargin:
     alpha : float
         The disk's size.
     frequency_hz : float
-        Where the loop comes nearest.
+        Where the loop is nearest to instability.
     perturbation : complex
-        The factor on L that puts a pole on the unit circle there, of all such the smallest.
+        The smallest factor on L that puts a pole on the unit circle there.
     gain_range : (low, high)
         Real factors inside the disk.
     phase_deg : float
@@ -66,7 +66,7 @@ class Margins:
     Parameters
     ----------
     gain_up_db, gain_down_db : float or None
-        How far the gain may rise, or fall (negative), before the loop is unstable; None: as far as one likes.
+        How far the gain may rise, or fall (negative), before the loop is unstable; None: without limit.
     phase_deg, phase_hz : float or None
         The smallest phase, lag (positive) or lead (negative), that makes the loop unstable, and its crossover.
     delay_s, delay_hz : float or None
@@ -169,7 +169,7 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     where :math:`1 + \overline{L_2} L_1` winds about zero as often as :math:`L_2` has more poles outside the circle than
     :math:`L_1`; else it is 1 (Vinnicombe, Uncertainty and Feedback, 2001, 3.3). Computed on a grid that resolves the
     poles of both loops, their plants and their laws, halved until neighbours turn by less than a right angle; every
-    local maximum on it is climbed by thirds. A plant that is not finite is 1 from any.
+    local maximum on it is refined by ternary search. The gap of a plant that is not finite is 1.
 
     Raises
     ------

@@ -82,7 +82,7 @@ class DigitalPlant:
         return (x @ self.c + self.d) * z**-self.delay_samples
 
     def delayed(self) -> StateSpace:
-        """Return a state-space model that holds the delay as states."""
+        """Return a state-space model with the delay as states."""
         k, n = self.delay_samples, self.b.size
         if k == 0:
             return self.a, self.b, self.c, self.d

@@ -42,7 +42,7 @@ RATE_TOLERANCE = 1e-6  # of the log's period against the estimator's
 
 @record(eq=False)
 class EstimatorState:
-    """What the filter knows after a sample.
+    """The filter's state after a sample.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class EstimatorState:
     applied : array, shape (nu,)
         What reached the plant's inputs at this sample.
     past : array, shape (delay_samples, nu)
-        Inputs that are on their way, oldest first.
+        Delayed inputs, oldest first.
     innovation : array, shape (ny,)
         Measured less predicted, in the outputs' units; NaN where nothing was measured.
 
@@ -151,13 +151,13 @@ class Estimator:
 
     @property
     def std(self) -> dict[str, float]:
-        """Standard deviation of each estimate once the filter has settled; it counts the noise, not the parameters."""
+        """Standard deviation of each estimate once the filter has settled, with the parameters taken as exact."""
         variance = np.einsum("ij,jk,ik->i", self.G, self.covariance, self.G)
         return dict(zip(self.names, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True))
 
     @property
     def start(self) -> EstimatorState:
-        """The plant at rest at zero, nothing on its way."""
+        """The plant at rest at zero, with no delayed input."""
         n, nu = self.B.shape
         return EstimatorState(
             predicted=np.zeros(n), corrected=np.zeros(n), applied=np.zeros(nu),
@@ -172,7 +172,7 @@ class Estimator:
         return state.predicted + self.gain @ np.where(np.isnan(innovation), 0.0, innovation), innovation
 
     def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
-        """Take one sample in: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
+        """Process one sample: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
         line = np.vstack([state.past, u])
         applied = line[0]
         corrected, innovation = self.correct(state, y, applied)
@@ -278,8 +278,8 @@ def estimator(
     Raises
     ------
     ControlError
-        A name is unknown, a number is out of range, nothing but the sensors is noisy, or something that does not die
-        out by itself is seen by no sensor.
+        A name is unknown, a number is out of range, only the sensors are noisy, or a motion that does not die
+        out by itself is measured by no sensor.
 
     Examples
     --------

@@ -28,7 +28,7 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
     mpc : ForceMPC
         As `force_mpc` makes it.
     folder : path
-        Made if it is not there; files of these names in it are written anew.
+        Created if it does not exist; files of these names in it are overwritten.
     single_precision : bool
         float instead of double.
 

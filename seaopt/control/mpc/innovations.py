@@ -42,7 +42,7 @@ def estimate_noise(
 ) -> NoiseModel:
     """Return the sensors' noise and offsets, and a white noise on the plant's first input, that explain a log best.
 
-    An offset that the plant's own place would explain, as that of a free body, is left at zero.
+    An offset that the plant's position could explain, such as that of a free body, is left at zero.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then
 
 @record(eq=False)
 class MPCState:
-    """What the controller carries from sample to sample.
+    """The controller's state from sample to sample.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class ForceMPC:
     design : (Plant, ParameterSet)
     kalman : Estimator
     regulator : Regulator
-        What it is without limits.
+        The controller without limits.
     prediction : HorizonProgram
         The quadratic program.
     static_gain : float
@@ -121,7 +121,7 @@ class ForceMPC:
     rest : array, shape (nx,)
         The plant's state at rest per ampere.
     shift : array, shape (n, n)
-        The plan at the knots one sample later.
+        Shifts the plan at the knots by one sample.
 
     """
 
@@ -304,7 +304,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     ------
     ControlError
         The measured output does not settle under a constant current, or responds to it at once; the limits hold less
-        than `spec.largest_force_N`; or the bandwidth cannot be had.
+        than `spec.largest_force_N`; or the bandwidth is not possible.
 
     Examples
     --------

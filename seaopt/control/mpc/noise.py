@@ -69,8 +69,8 @@ class NoiseModel:
     ) -> NoiseModel:  # fmt: skip
         """Return the sensors of one of a fit's experiments: residuals' sigma and offsets; the inputs' noise is given.
 
-        Where something besides the input moves the plant the residuals hold that too: `estimate_noise` tells them
-        apart.
+        Where something besides the input moves the plant the residuals contain that too: `estimate_noise` separates
+        them.
 
         Parameters
         ----------

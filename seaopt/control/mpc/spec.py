@@ -16,14 +16,14 @@ MAX_MPC_DELAY_SAMPLES = 100
 
 @record
 class MPCSpec:
-    """Limits to plan within, and a bandwidth where they are not felt.
+    """Limits of the plan, and the bandwidth while none is active.
 
     Parameters
     ----------
     current_limit_A : float
         The command stays within plus and minus this.
     current_slew_A_per_s : float, optional
-        It changes no faster than this; None: as fast as it likes.
+        Largest rate of change of the command; None: no limit.
     measured : str
         The output that is fed back, F1 as a rule.
     bandwidth_hz : float
@@ -39,7 +39,7 @@ class MPCSpec:
     horizon_s : float
         How far it plans.
     moves : int
-        Currents that are free in the plan; straight lines between.
+        Number of free currents in the plan, with straight lines between.
     largest_force_N : float, optional
         A force that the current limit must be able to hold; a limit too low for it is refused.
     noise : NoiseModel, optional

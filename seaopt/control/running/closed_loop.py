@@ -139,7 +139,7 @@ def run_loop(
     Returns
     -------
     LoopRun
-        Not finite where a run left what floats can hold.
+        Not finite where a run overflows.
 
     Raises
     ------

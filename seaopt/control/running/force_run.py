@@ -110,7 +110,8 @@ def close_loop(
     start
         Its state at the first sample.
     plant, params
-        As it is, not only as the law was designed for; `delay_s` among the parameters is delay besides `delay_samples`.
+        The plant to run on, which may differ from the design plant; `delay_s` among the parameters is delay besides
+        `delay_samples`.
     reference : array, shape (n,)
         N, one value per sample.
     measured : str
@@ -131,8 +132,8 @@ def close_loop(
     Raises
     ------
     ControlError
-        The plant has no such output or shows the present current in it, the parameters hold another condition than
-        `delay_s`, or the loop runs away.
+        The plant has no such output or that output responds to the current at once, the parameters contain another
+        condition than `delay_s`, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
 

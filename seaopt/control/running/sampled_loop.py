@@ -20,7 +20,7 @@ ENERGY = "energy"
 
 @record(eq=False)
 class SampledLoop:
-    """A plant, the law that runs, and what stands between them.
+    """A plant, the law that runs, and the devices between them.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class SampledLoop:
     current_step_A : float
         What the current is rounded to; 0 for not at all. The largest is the last whole step within the law's limit.
     longest_delay_s : float
-        The longest `delay_s` that a run's parameters hold: delay besides `delay_samples`, of any length.
+        The longest `delay_s` of any run's parameters: delay besides `delay_samples`, of any length.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class SampledLoop:
 
     @property
     def waiting(self) -> int:
-        """How many commands wait, or act, behind the newest."""
+        """Number of commands that are delayed, or act, behind the newest."""
         if not self.longest_delay_s:
             return self.delay_samples
         return self.delay_samples + whole_samples(self.longest_delay_s, self.law.sample_time_s)[0] + 1

@@ -93,7 +93,7 @@ def sweep(
     *,
     draws: Sequence[Mapping[str, float]] = (),
 ) -> Frontier:
-    """Tune at each of several bandwidths, every one from the one before too; an infeasible row is a result.
+    """Tune at each of several bandwidths, also starting from the one before; an infeasible row is a result.
 
     Parameters
     ----------

@@ -69,20 +69,20 @@ def tune(
     robust_to : mapping of name to Plant or (Plant, ParameterSet), optional
         Plants that must be stable and meet Ms, Mt and disk margin too, driven by the same current.
     draws : sequence of mappings of parameter to value, optional
-        Values at which the design plant and every plant of robust_to must do so too; see `corners` and `draw`.
+        Values at which the design plant and every plant of robust_to must meet them too; see `corners` and `draw`.
 
     Returns
     -------
     Controller
         With `feasible` False, and the limits that block in `active_constraints`, when the limits cannot all be met;
-        it is then the controller found that misses them least, and `largest_bandwidth_hz` says what can be had.
+        it is then the controller that misses them least, and `largest_bandwidth_hz` is what is possible.
 
     Raises
     ------
     ControlError
         The measured output does not respond to the motor at 0 Hz, the plant is unstable without control, a draw names
-        a parameter that no plant has, delay or current limit rule the request out for every controller, or a passive
-        band is asked of a plant without a port at link 2, or with an elastic screw before it.
+        a parameter that no plant has, delay or current limit make the request impossible for every controller, or a
+        passive band is required of a plant without a port at link 2, or with an elastic screw before it.
 
     Examples
     --------

@@ -56,7 +56,8 @@ def fit(
     Returns
     -------
     Fit
-        With status "not_identifiable" when the data do not determine some direction; it then holds what they do determine.
+        With status "not_identifiable" when the data do not determine some direction; it then holds what they do
+        determine.
 
     Raises
     ------

@@ -74,10 +74,10 @@ class OutputError(Method):
 class PredictionError(Method):
     """The residual is the error of the prediction one sample ahead, by a steady-state Kalman filter.
 
-    For plants with noise on the plant itself, not only on the sensors: process noise (one strength per state) over the measurement noise is
-    estimated with the parameters, and the filter's gain follows from it and from the plant. The measurement noise is
-    taken from the outputs' third differences; together they are scaled by the size of the prediction errors. A band is
-    refused: the filter is itself a model of the noise.
+    For plants with noise on the plant itself, not only on the sensors: process noise (one strength per state) over the
+    measurement noise is estimated with the parameters, and the filter's gain follows from it and from the plant. The
+    measurement noise is taken from the outputs' third differences; together they are scaled by the size of the
+    prediction errors. A band is refused: the filter is itself a model of the noise.
 
     Parameters
     ----------

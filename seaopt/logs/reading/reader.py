@@ -56,8 +56,8 @@ def read_table(
     Raises
     ------
     LogError
-        The file is missing or damaged, a column is missing or occurs twice, a cell is not a number, a channel is on another
-        clock and no rule is given, or two channels of one SI unit are one column.
+        The file is missing or damaged, a column is missing or occurs twice, a cell is not a number, a channel is on
+        another clock and no rule is given, or two channels of one SI unit are one column.
     UnitError
         A unit is unknown or of the wrong dimension.
 

@@ -82,11 +82,11 @@ class Bracket:
     proven_stable : bool
         Every plant of the set is stable with this controller.
     boxes : int
-        How many boxes it took.
+        Number of boxes used.
     left_out : str
         Why there is no bound; empty if there is one.
     parameters : mapping of name to value
-        Those of the severest plant measured on the way, if it is worse than the worst case given; else empty.
+        Those of the worst plant measured meanwhile, if it is worse than the given worst case; else empty.
 
     """
 

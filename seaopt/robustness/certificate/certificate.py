@@ -56,7 +56,8 @@ class Requirement:
 class MonteCarlo:
     """Draws and failures; with `confidence`, the probability of failure is below `failure_probability_bound`.
 
-    Of the failures, `unstable` draws are so on some plant; of the others, `over_ms` break Ms, and `over_mt` Mt alone.
+    Of the failures, `unstable` draws are unstable on some plant; of the others, `over_ms` break Ms, and `over_mt` Mt
+    alone.
     """
 
     samples: int
@@ -95,10 +96,10 @@ class PlantMargins:
         Gain, phase and delay both ways, every crossing, and disk margins with their witnesses.
     sampled_delay_s : float or None
         The smallest extra delay that makes the loop unstable when the plant is sampled with that delay in it; None:
-        none as long as was looked for, `searched_delay_s`. The classical `margins.delay_s` takes the delay for a phase,
+        none up to `searched_delay_s`. The classical `margins.delay_s` treats the delay as a phase,
         which is exact for whole samples only.
     searched_delay_s : float
-        How far it was looked for: three times the classical margin and two samples, up to 20,000 samples. A delay
+        The end of the search: three times the classical margin and two samples, up to 20,000 samples. A delay
         that long is beyond what the loop's model means.
     nu_gap, nu_gap_hz : float and float or None
         Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: see docs/margins.md.
@@ -153,10 +154,10 @@ class Certificate:
     plants : mapping of name to LoopFigures
         At the nominal parameters.
     margins : mapping of name to PlantMargins
-        Every margin at the nominal parameters, with the perturbation that uses it up.
+        Every margin at the nominal parameters, with the perturbation that exhausts it.
     worst : mapping of name to Worst
         The worst that the draws, and a search from the worst of them, found: each is a pair (plant, parameters), so
-        that `tune(..., robust_to=certificate.worst)` takes them back.
+        that `tune(..., robust_to=certificate.worst)` accepts them.
     monte_carlo : MonteCarlo
         Over all plants: a draw fails if it fails on any of them.
     varied : tuple of Varied
@@ -166,9 +167,9 @@ class Certificate:
     models : mapping of name to Plant
         What it was certified on, at `parameters`.
     simulated : Simulated or None
-        What `with_simulation` found.
+        The results of `with_simulation`.
     brackets : mapping of name to Bracket
-        What the worst case is proven to be below; empty if bounds were not asked for.
+        Proven bounds on the worst case; empty if bounds were not requested.
 
     """
 
@@ -190,8 +191,8 @@ class Certificate:
     ) -> Certificate:
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
-        Each scenario that fails is a requirement that is not met. Large signals, on every plant, passivity and coupled
-        stability, on the design plant, require nothing.
+        Each scenario that fails is a requirement that is not met. Large signals (on every plant), passivity and
+        coupled stability (on the design plant) are not requirements.
 
         Parameters
         ----------
@@ -298,7 +299,7 @@ class Certificate:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader should know besides the requirements, one sentence each."""
+        """Remarks besides the requirements, one sentence each."""
         used = {name for plant in self.models.values() for name in plant.parameters}
         outside = (
             f"the nominal {varied.name} = {varied.value:.4g} lies outside its range of {varied.low:.4g} to "

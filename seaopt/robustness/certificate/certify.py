@@ -83,7 +83,7 @@ def certify(
 ) -> Certificate:
     """Check a controller against plants, at the nominal parameters and over draws.
 
-    Everything is computed from the controller's two transfer functions; every plant is closed from the current that
+    Everything is computed from the controller's two transfer functions; every loop is closed with the current that
     the controller commands, so that its own eta, K_tau and lead change the loop gain.
 
     Parameters
@@ -91,7 +91,7 @@ def certify(
     controller : Controller
         The law.
     plants : mapping of name to Plant
-        What it must survive. The design plant is certified too, as "design" where it is not among them.
+        Plants on which it must pass. The design plant is certified too, as "design" where it is not among them.
     parameters : Fit or ParameterSet
         A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one.
     ranges : mapping of name to (low, high), optional
@@ -102,17 +102,17 @@ def certify(
     samples : int
         Draws; 1375 without a failure bound the failure probability by 1 % at a confidence of 1 - 1e-6.
     seed : int
-        Of the draws. They come from a stream of the law's own: none is a draw of the tuner's, nor of the certificate
+        Of the draws. It is combined with the law's coefficients: no draw is one of the tuner's, nor of the certificate
         whose worst cases the law was tuned with.
     confidence : float
         Of the bound (Clopper-Pearson).
     max_failure_probability : float, optional
-        Required of that bound, so that too few draws are no certificate; left out, it is stated and requires nothing.
+        Required of that bound, so that too few draws do not pass; if left out, the bound is stated, not required.
     bounds : Budget, optional
-        Also bound the worst case from above, with this much work on each plant; not at all if left out. What is proven
-        requires nothing; a plant met on the way that is worse than the worst case found takes its place.
+        Also bound the worst case from above, with this much work on each plant; not at all if left out. The bounds
+        are not a requirement; a plant that this meets and that is worse than the worst case found replaces it.
     progress : callable, optional
-        Called with the number of draws done and of all, now and then.
+        Called with the number of draws done and their total, now and then.
 
     Returns
     -------
@@ -122,7 +122,8 @@ def certify(
     Raises
     ------
     ControlError
-        There is no plant, a plant lacks the measured output, a range is empty, or the fit leaves a parameter open.
+        There is no plant, a plant lacks the measured output, a range is empty, or the fit does not identify a
+        parameter.
 
     Examples
     --------

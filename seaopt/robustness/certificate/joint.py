@@ -36,14 +36,14 @@ Pairs = Mapping[str, tuple[Plant, ParameterSet]]
 
 @record(eq=False)
 class Round:
-    """One round: what was tuned, on how many plants, and what certifying it found.
+    """One round: the controller, the number of plants that it was tuned on, and its certificate.
 
     Parameters
     ----------
     number : int
         From 1.
     plants : int
-        That the tuner kept its limits on, the design plant among them.
+        Number of plants on which the tuner kept its limits, the design plant included.
     controller : Controller
     certificate : Certificate or None
         None if the controller misses its limits on those plants already.
@@ -67,14 +67,15 @@ class JointTuning:
     ----------
     status : str
         "certified"; "infeasible": the limits cannot be met on the witnesses together; "stuck": the certificate fails
-        at what the tuner has met already, or at something that it does not treat; "rounds": there were too few.
+        on plants where the tuner met its limits, or on a requirement that it does not treat; "rounds": there were too
+        few.
     controller : Controller
         Of the last round.
     certificate : Certificate or None
         Of that controller; None if it is infeasible.
     rounds : tuple of Round
     robust_to : mapping of name to (plant, parameters)
-        Every plant besides the design plant on which the last controller was asked to keep its limits.
+        Every plant besides the design plant on which the last controller had to keep its limits.
 
     """
 
@@ -138,7 +139,7 @@ def tune_certified(
     spec : ControllerSpec
         Bandwidth and limits.
     plants : mapping of name to Plant
-        What the controller must survive; each is in the first round at the nominal parameters.
+        Plants on which the controller must pass; each is in the first round at the nominal parameters.
     ranges, others, samples
         As in `certify`.
     robust_to : mapping of name to (Plant, ParameterSet), optional
@@ -150,7 +151,7 @@ def tune_certified(
     confidence : float
         Of the certificate that passes, over all rounds.
     rounds : int
-        The most that there may be.
+        Largest number of rounds.
     progress : callable, optional
         Called with each round when it is done.
 

@@ -115,12 +115,12 @@ def run_simulations(
     Returns
     -------
     Simulated
-        What cannot be attempt is None, and `left_out` says why.
+        What cannot be simulated is None, and `left_out` gives the reason.
 
     Raises
     ------
     ControlError
-        There is no plant, the controller does not know its design plant, or `draws` names a plant that is not there.
+        There is no plant, the controller does not know its design plant, or `draws` names an unknown plant.
 
     """
     if controller.design is None:

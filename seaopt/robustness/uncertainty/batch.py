@@ -69,7 +69,7 @@ def batch_figures(
     threads : int
         Blocks of draws computed at once.
     peaks : bool
-        Whether Ms and Mt are wanted; if not, they are nan where stable.
+        Whether to compute Ms and Mt; if not, they are NaN where stable.
 
     """
     values, extra = expand_draws(plant, nominal, draws)

@@ -101,7 +101,7 @@ class Uncertainty:
     modes : mapping of name to ModeTable
         For every range of a mode's frequency, which values of its parameter put it where.
     absent : mapping of name to Parameter
-        What a range may name and `nominal` has no value of: the plants' defaults, and conditions.
+        What a range may name besides `nominal`: the plants' defaults, and conditions.
 
     """
 
@@ -138,7 +138,7 @@ class Uncertainty:
         Raises
         ------
         ControlError
-            The bounds leave next to nothing of the distribution.
+            The bounds leave almost nothing of the distribution.
 
         """
         width = len(self.names)
@@ -207,7 +207,7 @@ class Uncertainty:
         """Return the covariance's factor, coordinates to parameters: standard deviations times the correlation's root.
 
         The root is taken of the correlation, whose entries are of one size: the eigenvalues of a covariance in m, N/m
-        and kg m^2 span so many decades that the small ones would be rounding.
+        and kg m^2 span so many decades that the small ones would be lost in rounding.
         """
         std = np.sqrt(np.diag(self.covariance))
         scale = np.where(std > 0.0, std, 1.0)

@@ -54,7 +54,7 @@ class Witness:
 
 
 class Worst(tuple[Plant, ParameterSet]):
-    """A plant and the parameters at which it comes nearest to failing, or fails most.
+    """A plant and the parameters at which it is nearest to failing, or fails most.
 
     It is the pair (plant, parameters) that `tune(..., robust_to=...)` takes, with the figures there. Points are ranked
     by instability, then by the fraction of the Ms or Mt limit that they use; by Ms where there is no limit.

@@ -22,7 +22,7 @@ from seaopt.robustness.verification.scenarios import Scenario, default_scenarios
 
 @record(eq=False)
 class Verification:
-    """The runs of all scenarios, their judgement, and what it takes to simulate them again.
+    """The runs of all scenarios, their judgement, and the data to simulate them again.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Verification:
         Whether every row passed, and there is at least one.
     rows : tuple of Outcome
     skipped : tuple of (scenario, plant, reason)
-        What was asked for and cannot be simulated.
+        Requested runs that cannot be simulated.
     real_time_factor : mapping of plant name to float
         Simulated seconds per second of computing, over all runs.
     error : float
