@@ -228,13 +228,13 @@ LIMITS = (
     Limit(
         name="max_complementary", label="Mt", figure=lambda loop: loop.figures.mt, sense="at most",
         scope="every plant", curve=LimitCurve(of="L"),
-        meaning="Mt, peak of |L/(1 + L)|: 1/Mt is the relative error of the plant that the loop bears",
+        meaning="Mt, peak of |L/(1 + L)|: 1/Mt is the relative error of the plant that the loop tolerates",
         remedy="lower the bandwidth, or raise max_sensitivity with it",
     ),
     Limit(
         name="min_disk_margin", label="disk margin", figure=lambda loop: loop.figures.disk_margin, sense="at least",
         scope="every plant", below=2.0, curve=LimitCurve(of="1 - L", level=lambda margin: 2.0 / margin),
-        meaning="symmetric disk margin, below 2: gain and phase may both be off by so much at once",
+        meaning="symmetric disk margin, below 2: gain and phase may both be off by this much at once",
         remedy="lower the bandwidth",
     ),
     Limit(
