@@ -11,6 +11,7 @@ from seaopt.errors import SeaoptError, suggestion
 
 DOCUMENTS = {
     "problem": ("seaopt.problem.schema", "ProblemTable"),
+    "controller": ("seaopt.control.laws.stored", "StoredController"),
     "fit": ("seaopt.estimation.result.stored", "StoredFit"),
     "robustness": ("seaopt.robustness.certificate.stored", "StoredCertificate"),
 }

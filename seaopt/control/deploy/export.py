@@ -20,7 +20,6 @@ import numpy as np
 
 from seaopt.control.laws.controller import GAIN_UNITS, Controller
 from seaopt.control.laws.realisation import RunnableLaw, realise
-from seaopt.control.laws.stored import stored
 from seaopt.errors import ControlError, FileError
 from seaopt.files import write_text
 
@@ -101,7 +100,9 @@ def export(
         given = {field.name: getattr(controller, field.name) for field in fields(Controller)}
         figures = _figures(controller)
     else:
-        given, figures = stored(controller), _stated(controller)
+        from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+
+        given, figures = read_controller(controller), _stated(controller)
     if not given["feasible"] and not allow_infeasible:
         missed = ", ".join(given["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")

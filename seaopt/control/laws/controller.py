@@ -11,7 +11,6 @@ import numpy as np
 from seaopt.control.laws.command import Command, actuation_notes
 from seaopt.control.laws.limits import Limit
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.stored import stored
 from seaopt.control.laws.structures import DisturbanceObserver
 from seaopt.control.laws.verdict import list_design_figures
 from seaopt.control.loops.loop import Loop, LoopFigures
@@ -206,11 +205,13 @@ class Controller:
             A field is missing or malformed, or gains and coefficients differ.
 
         """
-        given = stored(content)
-        law = {name: given[name] for name in ("reference", "measurement")}
-        ts, gain = given["sample_time_s"], given["command"].per_effort
-        sampled = sample(plant, params, given["spec"].measured, gain, ts, given["delay_samples"])
-        return cls(**given, achieved=Loop(plant=sampled, **law).figures(), design=(plant, params))
+        from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+
+        stored = read_controller(content)
+        law = {name: stored[name] for name in ("reference", "measurement")}
+        ts, gain = stored["sample_time_s"], stored["command"].per_effort
+        sampled = sample(plant, params, stored["spec"].measured, gain, ts, stored["delay_samples"])
+        return cls(**stored, achieved=Loop(plant=sampled, **law).figures(), design=(plant, params))
 
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec

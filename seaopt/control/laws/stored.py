@@ -1,26 +1,98 @@
-"""Reading controller.json: what a controller needs of it, each field checked, and all of them against each other."""
+"""What a controller needs of its controller.json, as pydantic models, and whether its fields agree with each other."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal, Notch
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
+from seaopt.files import plain
 
-LAW = ("k_p", "k_i", "k_d", "T_f", "k_ff")
-NOTCH = ("notch_frequency_hz", "notch_width", "notch_depth")
-AGREE = 1e-9  # of the largest coefficient
+LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_ff")
+NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
+GAINS_AGREE = 1e-9  # of the largest coefficient
+REMEDY = "tune again"
+
+Finite = Annotated[FiniteFloat, Strict()]
+Coefficients = Annotated[list[Finite], Field(min_length=1)]
 
 
-def stored(content: Mapping[str, Any]) -> dict[str, Any]:
+def _begin_with_one(values: list[float]) -> list[float]:
+    if values[0] != 1.0:
+        raise ValueError("should begin with 1")
+    return values
+
+
+class StoredTransferFunction(ResultTable):
+    """num(q)/den(q), ascending powers of q = z^-1."""
+
+    num: Coefficients
+    den: Coefficients
+
+    def build(self) -> TransferFunction:
+        """Return the transfer function."""
+        return TransferFunction(num=np.array(self.num), den=np.array(self.den))
+
+
+class StoredLaw(StoredTransferFunction):
+    """One of the law's two transfer functions."""
+
+    den: Annotated[Coefficients, AfterValidator(_begin_with_one)]
+
+
+class StoredObserver(ResultTable):
+    """A disturbance observer: the two parts of its nominal plant, and the time constant of Q."""
+
+    kept: Coefficients
+    inverse: StoredTransferFunction
+    T_q: Finite
+
+
+class StoredCommand(ResultTable):
+    """What the controller sends to the motor for an effort."""
+
+    input: str
+    unit: str
+    per_effort: Annotated[Finite, Field(gt=0.0)]
+    effort_unit: str
+
+
+class StoredSpec(ResultTable):
+    """A specification; what is not here is checked by `ControllerSpec` itself."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    bandwidth_range_hz: tuple[Finite, Finite]
+    passive_band_hz: tuple[Finite, Finite] | None = None
+    robust_to: list[str] = []
+
+
+class StoredController(ResultTable):
+    """A controller.json."""
+
+    structure: str
+    gains: dict[str, Finite]
+    sample_time_s: Finite
+    delay_samples: Whole
+    reference: StoredLaw
+    measurement: StoredLaw
+    command: StoredCommand
+    spec: StoredSpec
+    feasible: Flag
+    active_constraints: list[str]
+    blocked_by: list[str] = []
+    largest_bandwidth_hz: Finite | None = None
+    observer: StoredObserver | None = None
+
+
+def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a `Controller` that a controller.json holds; not what it achieves.
 
     Raises
@@ -29,140 +101,69 @@ def stored(content: Mapping[str, Any]) -> dict[str, Any]:
         A field is missing or malformed, or two contradict each other: the gains must give the coefficients.
 
     """
-    spec, robust_to = _spec(_item(content, "spec"))
-    observer, gains = _observer(content.get("observer")), _gains(_item(content, "gains"))
-    law = {name: _transfer_function(content, name) for name in ("reference", "measurement")}
+    table = check_table(StoredController, plain(content), "controller.json", remedy=REMEDY)
+    spec, robust_to = _build_spec(table.spec)
     for name, expected in (("structure", spec.structure), ("delay_samples", spec.delay_samples)):
-        if _item(content, name) != expected:
-            raise _wrong(name, f"is {content[name]!r} and spec.{name} {expected!r}")
-    ts, feasible = _number(content, "sample_time_s"), _item(content, "feasible")
-    if not abs(ts * spec.sample_rate_hz - 1.0) < 1e-9:
-        raise _wrong("sample_time_s", f"is {ts:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}")
-    if not isinstance(feasible, bool):
-        raise _wrong("feasible", f"is {feasible!r}, neither true nor false")
-    _agree(gains, observer, spec, law)
-    largest = None if content.get("largest_bandwidth_hz") is None else _number(content, "largest_bandwidth_hz")
-    return {
-        "structure": spec.structure, "gains": gains, "sample_time_s": ts, "delay_samples": spec.delay_samples, **law,
-        "command": _command(content), "spec": spec, "feasible": feasible, "robust_to": robust_to,
-        "active_constraints": _names(content, "active_constraints"), "observer": observer,
-        "blocked_by": _names(content, "blocked_by") if "blocked_by" in content else (),
-        "largest_bandwidth_hz": largest,
+        if getattr(table, name) != expected:
+            raise _contradict(name, f"is {getattr(table, name)!r} and spec.{name} {expected!r}")
+    if not abs(table.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
+        stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
+        raise _contradict("sample_time_s", stated)
+    law = {"reference": table.reference.build(), "measurement": table.measurement.build()}
+    observer = None
+    if table.observer is not None:
+        nominal = Nominal(kept=np.array(table.observer.kept), inverse=table.observer.inverse.build())
+        observer = DisturbanceObserver(nominal=nominal, T_q=table.observer.T_q)
+    _check_agreement(table.gains, observer, spec, law)
+    return law | {
+        "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
+        "delay_samples": table.delay_samples, "command": Command(**table.command.model_dump()), "spec": spec,
+        "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
+        "observer": observer, "blocked_by": tuple(table.blocked_by),
+        "largest_bandwidth_hz": table.largest_bandwidth_hz,
     }  # fmt: skip
 
 
-def _agree(
+def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:
+    """Return the specification and the names of the plants that it was tuned for besides."""
+    fields = stored.model_dump(exclude={"robust_to"})
+    try:
+        if fields.get("notch") is not None:
+            fields["notch"] = Notch(**fields["notch"])
+        return ControllerSpec(**fields), tuple(stored.robust_to)
+    except (ControlError, TypeError, ValueError) as error:
+        raise FileError(f"controller.json: spec: {error}; {REMEDY}") from error
+
+
+def _check_agreement(
     gains: Mapping[str, float],
     observer: DisturbanceObserver | None,
     spec: ControllerSpec,
     law: Mapping[str, TransferFunction],
 ) -> None:
     """Refuse gains that do not give the coefficients."""
-    needed = {*LAW, *(NOTCH if "notch_depth" in gains else ()), *(("T_q",) if observer is not None else ())}
+    needed = {*LAW_GAINS, *(NOTCH_GAINS if "notch_depth" in gains else ()), *(("T_q",) if observer is not None else ())}
     if set(gains) != needed:
-        raise _wrong("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")
+        raise _contradict("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")
     if (observer is not None) != (spec.structure == "pid_dob") or (
         observer is not None and gains["T_q"] != observer.T_q
     ):
-        raise _wrong("observer", "is not that of structure and gains")
-    notch = Notch(**{name.removeprefix("notch_"): gains[name] for name in NOTCH}) if "notch_depth" in gains else None
-    own = Gains(**{name: gains[name] for name in LAW}, derivative=spec.derivative, observer=observer, notch=notch)
-    made_of_gains = own.transfer_functions(spec.structure, spec.sample_time_s)
+        raise _contradict("observer", "is not that of structure and gains")
+    notch = (
+        Notch(**{name.removeprefix("notch_"): gains[name] for name in NOTCH_GAINS}) if "notch_depth" in gains else None
+    )
+    law_gains = Gains(
+        **{name: gains[name] for name in LAW_GAINS}, derivative=spec.derivative, observer=observer, notch=notch
+    )
+    made_of_gains = law_gains.transfer_functions(spec.structure, spec.sample_time_s)
     for name, made in zip(("reference", "measurement"), made_of_gains, strict=True):
         for part in ("num", "den"):
-            given, expected = getattr(law[name], part), getattr(made, part)
-            if given.shape != expected.shape or not np.all(
-                np.abs(given - expected) <= AGREE * np.max(np.abs(expected), initial=0.0)
+            stated, expected = getattr(law[name], part), getattr(made, part)
+            if stated.shape != expected.shape or not np.all(
+                np.abs(stated - expected) <= GAINS_AGREE * np.max(np.abs(expected), initial=0.0)
             ):
-                raise _wrong(f"{name}.{part}", "is not what gains, observer and spec give")
+                raise _contradict(f"{name}.{part}", "is not what gains, observer and spec give")
 
 
-def _spec(content: Any) -> tuple[ControllerSpec, tuple[str, ...]]:
-    if not isinstance(content, Mapping):
-        raise _wrong("spec", f"is {_short(content)}, not a table")
-    given = dict(content)
-    robust_to = _names(given, "robust_to") if "robust_to" in given else ()
-    given.pop("robust_to", None)
-    given["bandwidth_range_hz"] = tuple(_numbers(given, "bandwidth_range_hz", "spec."))
-    if len(given["bandwidth_range_hz"]) != 2:
-        raise _wrong("spec.bandwidth_range_hz", "is not two numbers")
-    if given.get("passive_band_hz") is not None:
-        given["passive_band_hz"] = tuple(_numbers(given, "passive_band_hz", "spec.").tolist())
-    try:
-        if given.get("notch") is not None:
-            given["notch"] = Notch(**given["notch"])
-        return ControllerSpec(**given), robust_to
-    except (ControlError, TypeError) as error:
-        raise FileError(f"controller.json: spec: {error}; tune again") from error
-
-
-def _command(content: Mapping[str, Any]) -> Command:
-    table = _item(content, "command")
-    texts = {name: _item(table, name, "command.") for name in ("input", "unit", "effort_unit")}
-    for name, value in texts.items():
-        if not isinstance(value, str):
-            raise _wrong(f"command.{name}", f"is {_short(value)}, not text")
-    per_effort = _number(table, "per_effort", "command.")
-    if not per_effort > 0.0:
-        raise _wrong("command.per_effort", f"is {per_effort:g}, not positive")
-    return Command(per_effort=per_effort, **texts)
-
-
-def _gains(content: Any) -> dict[str, float]:
-    if not isinstance(content, Mapping):
-        raise _wrong("gains", f"is {_short(content)}, not a table")
-    return {str(name): _number(content, name, "gains.") for name in content}
-
-
-def _transfer_function(content: Mapping[str, Any], name: str) -> TransferFunction:
-    table = _item(content, name)
-    num, den = (_numbers(table, part, f"{name}.") for part in ("num", "den"))
-    if den[0] != 1.0:
-        raise _wrong(f"{name}.den", f"begins with {den[0]:g}, not 1")
-    return TransferFunction(num=num, den=den)
-
-
-def _observer(content: Any) -> DisturbanceObserver | None:
-    if content is None:
-        return None
-    table = _item(content, "inverse", "observer.")
-    inverse = TransferFunction(**{part: _numbers(table, part, "observer.inverse.") for part in ("num", "den")})
-    nominal = Nominal(kept=_numbers(content, "kept", "observer."), inverse=inverse)
-    return DisturbanceObserver(nominal=nominal, T_q=_number(content, "T_q", "observer."))
-
-
-def _item(content: Any, name: str, before: str = "") -> Any:
-    if not isinstance(content, Mapping) or name not in content:
-        raise _wrong(before + name, "is missing")
-    return content[name]
-
-
-def _number(content: Any, name: str, before: str = "") -> float:
-    value = _item(content, name, before)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise _wrong(before + name, f"is {_short(value)}, not a number")
-    return float(value)
-
-
-def _numbers(content: Any, name: str, before: str = "") -> Float[np.ndarray, " n"]:
-    given = _item(content, name, before)
-    values = given.tolist() if isinstance(given, np.ndarray) else given
-    if not isinstance(values, (list, tuple)) or not values:
-        raise _wrong(before + name, f"is {_short(values)}, not a list of numbers")
-    return np.array([_number({f"{name}[{k}]": item}, f"{name}[{k}]", before) for k, item in enumerate(values)])
-
-
-def _names(content: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    values = _item(content, name)
-    if not isinstance(values, (list, tuple)) or not all(isinstance(item, str) for item in values):
-        raise _wrong(name, f"is {_short(values)}, not a list of names")
-    return tuple(values)
-
-
-def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) < 40 else text[:36] + " ..."
-
-
-def _wrong(name: str, what: str) -> FileError:
-    return FileError(f"controller.json: {name} {what}; tune again")
+def _contradict(name: str, what: str) -> FileError:
+    return FileError(f"controller.json: {name} {what}; {REMEDY}")
