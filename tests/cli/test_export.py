@@ -56,7 +56,7 @@ def test_without_a_target_it_is_a_usage_error(done, seaopt):
     ("old", "new", "words"),
     [
         ("seaopt/controller/2", "seaopt/controller/1", "schema is"),
-        ('"den": [', '"den": [2.0,', "begins with 2, not 1"),
+        ('"den": [', '"den": [2.0,', "should begin with 1"),
         ('"reference"', '"referense"', "reference is missing"),
         ('"made_from": {', '"made_from": {}, "before": {', "made_from does not say of which problem file"),
         ("{", "", "not valid JSON"),
