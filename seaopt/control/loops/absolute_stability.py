@@ -1,0 +1,276 @@
+r"""Stability of a sampled loop for every friction curve of a sector, between the samples too, for the certificate.
+
+The plant is linear but for friction efforts :math:`-\varphi_i(v_i)`, each a monotone function of one velocity with a
+slope between 0 and :math:`\kappa_i` (Coulomb's, smoothed: :math:`\kappa = f_c/v_s`; a falling Stribeck part belongs
+into the plant's damping first, so that the rest rises). The law is sampled with period T and d samples of delay, and
+its output held. Seen from the friction efforts w to the velocities v the closed loop is a linear T-periodic operator H.
+If :math:`M (H + \kappa^{-1})` is strictly passive on L2 for a multiplier M that keeps every :math:`\varphi` passive,
+the loop is stable for all of them, stick and slip included: the circle criterion with M = 1 (Sandberg; Zames, IEEE TAC
+11(2-3), 1966), Popov's with :math:`M = 1 + \eta s`, that of Zames and Falb (SIAM J. Control 6(1), 1968) with
+:math:`M = 1 - \rho\, a/(a \pm s)`, whose second term has a non-negative impulse response of area
+:math:`\rho \le 1`, so that monotone curves are enough and they need not be odd. A static load that friction carries
+shifts the curve and leaves it monotone.
+
+At :math:`\theta = \omega T` in :math:`[0, \pi]` the operator acts on the aliases :math:`\omega_k = (\theta + 2\pi k)/T`:
+
+.. math::
+    H_{kl} = G_v(j\omega_k)\,\delta_{kl} + a_k b_l^*, \qquad a_k = -G_{vm}(j\omega_k)\, h(j\omega_k)\, z^{-d} K(z),
+    \qquad b_l^* = G_y(j\omega_l)/T
+
+with :math:`G_v` from friction effort to velocity, :math:`G_{vm}` from motor effort to velocity, :math:`G_y` from
+friction effort to the measured force, the hold :math:`h(s) = (1 - e^{-sT})/s`, :math:`z = e^{j\theta}`, and
+:math:`K = C_y/(1 + P z^{-d} C_y)`. The Hermitian part of :math:`M (H + \kappa^{-1})` is a block-diagonal
+:math:`D_k`, the Hermitian part of :math:`M(j\omega_k) (G_v(j\omega_k) + \kappa^{-1})`, and
+:math:`\tfrac12 (a b^* + b a^*)` of rank two, a multiplied by M. With
+:math:`\alpha = \sum a_k^* D_k^{-1} a_k`, :math:`\beta = \sum b_k^* D_k^{-1} b_k`,
+:math:`\gamma = \sum b_k^* D_k^{-1} a_k` it is positive definite where all :math:`D_k > 0` and
+:math:`|2 + \gamma|^2 > \alpha\beta` (the inertia of a block matrix and its Schur complement; Haynsworth, Linear Algebra
+Appl. 1, 1968). The sums converge like :math:`1/k^2`; what is beyond the last alias is bounded by its size there and
+counted against the test.
+
+The largest :math:`\kappa` for which the test holds, at the same proportion for every friction, is the *friction
+margin*; divided by the curve's own steepest slope it is a factor, above 1 where stability is proved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.special import polygamma
+
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.records import record
+
+ALIASES = 30  # on either side; what is beyond is bounded
+TAIL_GROWTH = 1.1  # of the terms beyond the last alias, times frequency squared, over those at it
+ANGLES = 160
+LOWEST_ANGLE = 1e-4  # rad; below, a loop with an integrator is nearly static
+NEAR_MODES = np.geomspace(0.1, 10.0, 7)  # half widths of a mode
+REFINEMENTS, REFINED_DIPS, POINTS_PER_DIP = 3, 4, 9
+MULTIPLIER_POINTS = 9  # corner frequencies tried
+ZAMES_FALB_AREAS = (0.5, 0.9, 0.99)
+SMALLEST_INVERSE, LARGEST_INVERSE = 1e-6, 1e6  # 1/kappa looked at, in units of the curves' own 1/slope
+MARGIN_PRECISION = 1e-2
+WORTHWHILE = 0.9  # of the inverse: a multiplier that gains less is not looked at further
+
+Angles = Float[np.ndarray, " m"]
+Multiplier = Callable[[Complex[np.ndarray, "*n"]], Complex[np.ndarray, "*n"]]
+
+
+@record(eq=False)
+class FrictionLoop:
+    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = c x.
+
+    Parameters
+    ----------
+    a, motor : arrays, shapes (n, n) and (n,)
+        The continuous plant without friction, and the effect of the motor effort u.
+    friction : array, shape (n, p)
+        The effect of each friction effort in the direction of its velocity.
+    velocity, measured : arrays, shapes (p, n) and (n,)
+        The velocities that friction acts on, and the fed-back output.
+    slopes : array, shape (p,)
+        The steepest slope of each friction curve, N s/m (N m s/rad).
+    plant : DigitalPlant
+        The same plant, sampled, from u to y, with its delay.
+    law : TransferFunction
+        C_y.
+
+    """
+
+    a: Float[np.ndarray, "n n"]
+    motor: Float[np.ndarray, " n"]
+    friction: Float[np.ndarray, "n p"]
+    velocity: Float[np.ndarray, "p n"]
+    measured: Float[np.ndarray, " n"]
+    slopes: Float[np.ndarray, " p"]
+    plant: DigitalPlant
+    law: TransferFunction
+
+
+@record
+class FrictionMargin:
+    """How much steeper than they are all friction curves may be with stability still proved.
+
+    Parameters
+    ----------
+    factor : float
+        Of the curves' own steepest slopes, 1 and more where stability is proved for the curves as they are; infinite
+        where even a jump (ideal Coulomb friction) is proved, zero where nothing is.
+    slopes : tuple of float
+        The slopes that are proved, N s/m (N m s/rad).
+    frequency_hz : float
+        Where the test fails first with steeper curves.
+    multiplier : str
+        What proves it.
+
+    """
+
+    factor: float
+    slopes: tuple[float, ...]
+    frequency_hz: float
+    multiplier: str
+
+    @property
+    def proved(self) -> bool:
+        """Whether stability is proved for the curves as they are."""
+        return self.factor >= 1.0
+
+
+def friction_margin(loop: FrictionLoop) -> FrictionMargin:
+    """Return the steepest friction for which the loop is proved stable, the best over all multipliers tried.
+
+    The loop without friction must be stable, by its eigenvalues; the caller sees to that. Sums over aliases are
+    truncated with a bound on the rest; rounding is not enclosed.
+    """
+    responses = _respond(loop, _angles(loop))
+    best = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
+    for name, multiplier in _multipliers(loop):
+        inverse = _least_inverse(responses, multiplier, WORTHWHILE / best.factor if best.factor else np.inf)
+        if inverse is None:
+            continue
+        fine = responses
+        for _ in range(REFINEMENTS):  # between the angles the test may fail: look there, and give way
+            fine = _refine(loop, fine, multiplier, inverse)
+            again = _least_inverse(fine, multiplier, LARGEST_INVERSE)
+            if again is None or again <= inverse * (1.0 + MARGIN_PRECISION):
+                break
+            inverse = again
+        if again is None or (best.factor and inverse >= 1.0 / best.factor):
+            continue
+        worst = int(np.argmin(_definiteness(fine, multiplier, inverse * (1.0 - 0.01))))
+        factor = np.inf if inverse == 0.0 else 1.0 / inverse
+        best = FrictionMargin(
+            factor=float(factor), slopes=tuple(float(slope) for slope in factor * loop.slopes),
+            frequency_hz=float(fine.theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
+        )  # fmt: skip
+    return best
+
+
+@record(eq=False)
+class _Responses:
+    """The loop's responses at m angles and k aliases, efforts in units that make each curve's steepest slope 1."""
+
+    theta: Angles
+    s: Complex[np.ndarray, "m k"]
+    mobility: Complex[np.ndarray, "m k p p"]
+    command: Complex[np.ndarray, "m k p"]
+    sensed: Complex[np.ndarray, "m k p"]
+    tail: Float[np.ndarray, " m"]
+    order: Float[np.ndarray, " m"]
+
+
+def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
+    """Return G_v, a (without M) and b at angles."""
+    period, n = loop.plant.sample_time_s, loop.motor.size
+    z = np.exp(1j * theta)
+    f = theta / (2 * np.pi * period)
+    law = loop.law.response(f, period)
+    through = loop.plant.response(f)
+    gain = law / (1.0 + through * law) * z**-loop.plant.delay_samples
+    s = 1j * (theta[:, None] + 2 * np.pi * np.arange(-ALIASES, ALIASES + 1)) / period
+    root = np.sqrt(loop.slopes)  # phi = slope v: with v' = root v and phi' = phi / root the slope is 1
+    causes = np.column_stack([loop.friction * root, loop.motor])
+    inner = s[..., None, None] * np.eye(n) - loop.a
+    x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (*s.shape, n, causes.shape[1])))
+    velocity = (root[:, None] * loop.velocity) @ x
+    hold = -np.expm1(-s * period) / s
+    return _Responses(
+        theta=theta, s=s, mobility=velocity[..., :-1], command=-velocity[..., -1] * (hold * gain[:, None])[..., None],
+        sensed=np.conj(loop.measured @ x)[..., :-1] / period,
+        tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
+        order=ALIASES + theta / (2 * np.pi),
+    )  # fmt: skip
+
+
+def _definiteness(at: _Responses, multiplier: Multiplier, inverse: float) -> Angles:
+    """Return, per angle, what is positive where M (H + inverse) is positive definite."""
+    weight = multiplier(at.s)
+    block = weight[..., None, None] * (at.mobility + inverse * np.eye(at.mobility.shape[-1]))
+    right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
+    if block.shape[-1] == 1:  # one friction: numbers, not matrices
+        real = np.real(block[..., 0, 0])
+        negative = np.any(real <= 0.0, axis=-1)
+        columns = right[..., 0, :]
+        sums = np.conj(columns)[..., :, None] * columns[..., None, :] / np.where(real > 0.0, real, 1.0)[..., None, None]
+    else:
+        block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
+        negative = np.any(np.linalg.eigvalsh(block) <= 0.0, axis=(-2, -1))
+        block = np.where(negative[:, None, None, None], np.eye(block.shape[-1]), block)
+        sums = np.conj(np.swapaxes(right, -1, -2)) @ np.linalg.solve(block, right)
+    total = np.sum(sums, axis=-3)
+    # The terms fall like 1/omega^2: the rest of each sum is at most this multiple of its last term.
+    edge = np.maximum(np.abs(sums[..., 0, :, :]), np.abs(sums[..., -1, :, :]))
+    rest = TAIL_GROWTH * edge * (at.order**2 * at.tail)[:, None, None]
+    alpha, beta = (np.real(total[..., i, i]) + rest[..., i, i] for i in (0, 1))
+    gamma = np.abs(2.0 + total[..., 1, 0]) - rest[..., 1, 0]
+    plain = (np.sign(gamma) * gamma**2 - alpha * beta) / (4.0 + np.abs(alpha * beta))
+    return np.where(negative, -1.0, plain)
+
+
+def _least_inverse(at: _Responses, multiplier: Multiplier, bar: float) -> float | None:
+    """Return the least 1/kappa, in units of the curves' own 1/slope, that holds at all angles; None if none below bar.
+
+    More of it adds the Hermitian part of M, which is not negative: what holds at one value holds above it.
+    """
+
+    def holds(inverse: float) -> bool:
+        return bool(np.min(_definiteness(at, multiplier, inverse)) > 0.0)
+
+    high = min(bar, LARGEST_INVERSE)
+    if not holds(high):
+        return None
+    if holds(0.0):
+        return 0.0
+    low = SMALLEST_INVERSE
+    if holds(low):
+        return low
+    while high / low > 1.0 + MARGIN_PRECISION:
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high
+
+
+def _angles(loop: FrictionLoop) -> Angles:
+    """Return angles from nearly static to the Nyquist frequency, close about the modes of plant and closed loop."""
+    period = loop.plant.sample_time_s
+    even = np.concatenate([np.geomspace(LOWEST_ANGLE, 0.1, ANGLES // 2), np.linspace(0.1, np.pi, ANGLES)])
+    poles = np.linalg.eigvals(loop.a)
+    turns, widths = np.abs(np.imag(poles)) * period, np.maximum(np.abs(np.real(poles)) * period, 1e-6)
+    around = turns[:, None] + widths[:, None] * np.concatenate([-NEAR_MODES, [0.0], NEAR_MODES])
+    folded = np.abs((around.ravel() + np.pi) % (2 * np.pi) - np.pi)
+    return np.unique(np.concatenate([even, folded[folded >= LOWEST_ANGLE]]))
+
+
+def _refine(loop: FrictionLoop, at: _Responses, multiplier: Multiplier, inverse: float) -> _Responses:
+    """Return the responses at more angles, about the least values of the test."""
+    values = _definiteness(at, multiplier, inverse)
+    dips = [i for i in range(values.size) if values[i] <= min(values[max(i - 1, 0)], values[min(i + 1, values.size - 1)])]
+    dips = sorted(dips, key=lambda i: values[i])[:REFINED_DIPS]
+    new = [
+        np.linspace(at.theta[max(i - 1, 0)], at.theta[min(i + 1, values.size - 1)], POINTS_PER_DIP) for i in dips
+    ]  # fmt: skip
+    return _respond(loop, np.unique(np.concatenate([at.theta, *new])))
+
+
+def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
+    """Yield multipliers by name: none, Popov's, and those of Zames and Falb, over corner frequencies."""
+    yield "circle", np.ones_like
+    rates = np.geomspace(0.02, 2.0, MULTIPLIER_POINTS) * np.pi / loop.plant.sample_time_s
+
+    def popov(eta: float) -> Multiplier:
+        return lambda s: 1.0 + eta * s
+
+    def zames_falb(share: float, rate: float) -> Multiplier:
+        return lambda s: 1.0 - share * rate / (rate + s)
+
+    for rate in rates:
+        for sign in (1.0, -1.0):
+            yield f"Popov, {sign / rate:.3g} s", popov(sign / rate)
+            for share in ZAMES_FALB_AREAS:
+                name = f"Zames-Falb, {share:g} at {sign * rate / (2 * np.pi):.3g} Hz"
+                # A negative rate is the anticausal one: -rate / (-rate + s) = rate / (rate - s).
+                yield name, zames_falb(share, sign * rate)
