@@ -153,6 +153,18 @@ def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
     return level * ca.tanh(speed / p.v_s)
 
 
+def bound_friction_slopes(parts: Sequence[str], p: Any) -> tuple[Any, Any]:
+    """Return bounds of the slope of `dry_friction` over all speeds, N s/m: the flattest and the steepest.
+
+    The smoothing's slope is largest at rest, level/v_s, and never negative; that of (f_s - f_c) exp(-(v/v_st)^2) is
+    largest at v_st/sqrt(2), |f_s - f_c| sqrt(2/e)/v_st.
+    """
+    if "stribeck" not in parts:
+        return 0.0, p.f_c / p.v_s
+    turn = math.sqrt(2.0 / math.e) / p.v_st
+    return -ca.fmax(p.f_s - p.f_c, 0.0) * turn, p.f_s / p.v_s + ca.fmax(p.f_c - p.f_s, 0.0) * turn
+
+
 @record
 class _Filter:
     """A linear filter z' = A z + b v, out = c z + d v, its entries expressions of the parameters."""

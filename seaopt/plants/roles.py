@@ -103,6 +103,8 @@ class Friction:
         Of the force.
     effort : callable ``p -> expression``
         The effort at the spring that one unit of the force takes; 1 if left out.
+    slopes : callable ``p -> (flattest, steepest)``, optional
+        Bounds of the curve's slope over all velocities, negative where it falls; sampled if left out.
 
     """
 
@@ -110,6 +112,7 @@ class Friction:
     force: Callable[[Any, Any], Any]
     unit: str = "N"
     effort: Expression = _one
+    slopes: Callable[[Any], tuple[Any, Any]] | None = None
 
 
 @record(eq=False)

@@ -285,7 +285,10 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         ports=_ports(name, build, external),
         friction={
             "F_f": Friction(
-                velocity=lambda x, p: x.qd, force=lambda v, p: part_laws.dry_friction(build.parts, v, p), unit="N"
+                velocity=lambda x, p: x.qd,
+                force=lambda v, p: part_laws.dry_friction(build.parts, v, p),
+                unit="N",
+                slopes=lambda p: part_laws.bound_friction_slopes(build.parts, p),
             )
         },
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in build.parts else None,

@@ -11,7 +11,7 @@ the loop is stable for all of them, stick and slip included: the circle criterio
 :math:`\rho \le 1`, so that monotone curves are enough and they need not be odd. A static load that friction carries
 shifts the curve and leaves it monotone.
 
-At :math:`\theta = \omega T` in :math:`[0, \pi]` the operator acts on the aliases :math:`\omega_k = (\theta + 2\pi k)/T`:
+At :math:`\theta = \omega T` in :math:`[0, \pi]` it acts on the aliases :math:`\omega_k = (\theta + 2\pi k)/T`:
 
 .. math::
     H_{kl} = G_v(j\omega_k)\,\delta_{kl} + a_k b_l^*, \qquad a_k = -G_{vm}(j\omega_k)\, h(j\omega_k)\, z^{-d} K(z),
@@ -72,12 +72,16 @@ class FrictionLoop:
         The effect of each friction effort in the direction of its velocity.
     velocity, measured : arrays, shapes (p, n) and (n,)
         The velocities that friction acts on, and the fed-back output.
+    through : array, shape (p,)
+        The effect of each friction effort on the output itself.
     slopes : array, shape (p,)
         The steepest slope of each friction curve, N s/m (N m s/rad).
     plant : DigitalPlant
         The same plant, sampled, from u to y, with its delay.
     law : TransferFunction
         C_y.
+    delay_s : float
+        Of the motor effort, besides the whole samples of `plant`.
 
     """
 
@@ -86,9 +90,11 @@ class FrictionLoop:
     friction: Float[np.ndarray, "n p"]
     velocity: Float[np.ndarray, "p n"]
     measured: Float[np.ndarray, " n"]
+    through: Float[np.ndarray, " p"]
     slopes: Float[np.ndarray, " p"]
     plant: DigitalPlant
     law: TransferFunction
+    delay_s: float = 0.0
 
 
 @record
@@ -177,10 +183,10 @@ def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
     inner = s[..., None, None] * np.eye(n) - loop.a
     x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (*s.shape, n, causes.shape[1])))
     velocity = (root[:, None] * loop.velocity) @ x
-    hold = -np.expm1(-s * period) / s
+    hold = -np.expm1(-s * period) / s * np.exp(-s * loop.delay_s)
     return _Responses(
         theta=theta, s=s, mobility=velocity[..., :-1], command=-velocity[..., -1] * (hold * gain[:, None])[..., None],
-        sensed=np.conj(loop.measured @ x)[..., :-1] / period,
+        sensed=np.conj((loop.measured @ x)[..., :-1] + loop.through * root) / period,
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
         order=ALIASES + theta / (2 * np.pi),
     )  # fmt: skip
@@ -248,7 +254,9 @@ def _angles(loop: FrictionLoop) -> Angles:
 def _refine(loop: FrictionLoop, at: _Responses, multiplier: Multiplier, inverse: float) -> _Responses:
     """Return the responses at more angles, about the least values of the test."""
     values = _definiteness(at, multiplier, inverse)
-    dips = [i for i in range(values.size) if values[i] <= min(values[max(i - 1, 0)], values[min(i + 1, values.size - 1)])]
+    dips = [
+        i for i in range(values.size) if values[i] <= min(values[max(i - 1, 0)], values[min(i + 1, values.size - 1)])
+    ]
     dips = sorted(dips, key=lambda i: values[i])[:REFINED_DIPS]
     new = [
         np.linspace(at.theta[max(i - 1, 0)], at.theta[min(i + 1, values.size - 1)], POINTS_PER_DIP) for i in dips

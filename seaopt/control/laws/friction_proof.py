@@ -1,0 +1,65 @@
+"""Whether a controller is proved stable on a plant for every friction curve of its sector, for the certificate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.loops.absolute_stability import FrictionLoop, FrictionMargin, friction_margin
+from seaopt.control.loops.loop import STABLE, Loop
+from seaopt.control.loops.sampled_plant import DELAY, conditions_of, linearised, resting, sample
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states, has_friction
+
+
+def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
+    """Return how much steeper friction may be with stability proved, between the samples too; None without friction.
+
+    The linear plant of the proof is the sliding one; what a curve's slope is above its flattest is in the sector.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its measurement path closes the loop; the reference stands still.
+    plant, params
+        The plant with its friction, and parameters, conditions among them.
+
+    Returns
+    -------
+    FrictionMargin or None
+        With a factor of zero where the sliding loop is not stable itself, or where nothing was proved: that is no
+        proof of an oscillation.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
+    >>> controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    >>> prove_friction(controller, stand, rubbing).proved
+    True
+
+    """
+    if not has_friction(plant, params):
+        return None
+    sliding = friction_states(plant)[SLIDING]
+    flattest, steepest = friction_slopes(plant, params)
+    measured, gain = controller.spec.measured, controller.command.per_effort
+    conditions = conditions_of(plant, params)
+    at = {name: np.array([value]) for name, value in conditions.items()}
+    values = np.array(plant.parameter_values(params))
+    a, motor, output, _ = (block[0] for block in linearised(sliding, values[:, None], at, measured, gain))
+    x, u = resting(plant, params)
+    on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, values))
+    sampled = sample(sliding, params, measured, gain, controller.sample_time_s, controller.delay_samples)
+    loop = Loop(plant=sampled, reference=controller.reference, measurement=controller.measurement)
+    if np.max(np.abs(loop.eigenvalues())) >= STABLE:
+        zeros = (0.0,) * flattest.size
+        return FrictionMargin(factor=0.0, slopes=zeros, frequency_hz=0.0, multiplier="none: unstable without friction")
+    return friction_margin(
+        FrictionLoop(
+            a=a, motor=motor, friction=on_states, velocity=velocity, measured=output,
+            through=on_outputs[list(plant.outputs).index(measured)], slopes=steepest - flattest, plant=sampled,
+            law=controller.measurement, delay_s=conditions.get(DELAY, 0.0),
+        )
+    )  # fmt: skip

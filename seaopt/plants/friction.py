@@ -1,0 +1,150 @@
+"""Friction as a linear loop meets it: stuck, where its curve is steepest, and sliding, where it is flattest.
+
+Dry friction smoothed through zero, f_c tanh(v/v_s), looks at rest like a damper of f_c/v_s, which vanishes as soon as
+the joint moves; Stribeck's falling part is then even a negative one. A loop is therefore looked at on two plants that
+are linear in that velocity: with every friction replaced by viscous friction of its steepest and of its flattest slope.
+They have the names, roles and parameters of the plant they stand for, so that all that works on a plant works on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.parameters import ParameterSet
+from seaopt.plants.memo import memo
+from seaopt.plants.plant import Plant
+from seaopt.plants.roles import Friction, PlantMaker, Port
+
+SLIDING, STUCK = "sliding", "stuck"
+STATES = (SLIDING, STUCK)
+# Speeds at which a curve that does not state its slopes is looked at, m/s or rad/s.
+SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
+
+
+def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
+    """Return the flattest and the steepest slope of a friction curve at parameters p, numbers or expressions.
+
+    They are what the role states; else the least and largest at `SAMPLED_SPEEDS` in both directions.
+    """
+    if friction.slopes is not None:
+        return friction.slopes(p)
+    v = ca.SX.sym("v")
+    slope = ca.jacobian(ca.SX(friction.force(v, p)), v)
+    sampled = [ca.substitute(slope, v, float(sign * speed)) for speed in SAMPLED_SPEEDS for sign in (1.0, -1.0)]
+    return ca.mmin(ca.vertcat(*sampled)), ca.mmax(ca.vertcat(*sampled))
+
+
+def friction_slopes(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Return the flattest and the steepest slope of each friction of a plant, in the order of its roles.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> flattest, steepest = friction_slopes(so.plants.high_impedance(), so.plants.thor().update(f_c=50.0))
+    >>> float(flattest[0]), float(steepest[0])  # N s/m: f_c / v_s
+    (0.0, 50000.0)
+
+    """
+    values = plant.complete(params)
+    p = SimpleNamespace(**{name: parameter.value for name, parameter in values.items()})
+    bounds = [[float(ca.DM(bound)) for bound in bound_slopes(friction, p)] for friction in plant.friction.values()]
+    flattest, steepest = np.reshape(np.array(bounds, dtype=float), (-1, 2)).T
+    return flattest, steepest
+
+
+@memo
+def friction_states(plant: Plant) -> Mapping[str, Plant]:
+    """Return the plant with every friction at its flattest slope and at its steepest, as "sliding" and "stuck"."""
+    return {state: _with_slope(plant, state) for state in STATES}
+
+
+def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()) -> dict[str, Plant]:
+    """Return the plants, one with friction twice, as NAME sliding and NAME stuck.
+
+    Parameters
+    ----------
+    plants : mapping of name to Plant
+        The plants as they are.
+    params : ParameterSet
+        Values; a plant whose friction is nothing there has none.
+    varied : collection of str
+        Parameters that may take other values: friction that depends on one of them is there.
+
+    """
+    split: dict[str, Plant] = {}
+    for name, plant in plants.items():
+        if has_friction(plant, params, varied):
+            split |= {f"{name} {state}": variant for state, variant in friction_states(plant).items()}
+        else:
+            split[name] = plant
+    return split
+
+
+def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = ()) -> bool:
+    """Tell whether a plant's friction differs between sticking and sliding."""
+    if not plant.friction:
+        return False
+    flattest, steepest = friction_slopes(plant, params)
+    return bool(np.any(flattest != steepest)) or bool(_friction_parameters(plant) & set(varied))
+
+
+@memo
+def _friction_parameters(plant: Plant) -> frozenset[str]:
+    """Return the parameters on which the difference of the slopes depends."""
+    p = SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
+    spans = [ca.SX(steepest - flattest) for flattest, steepest in (bound_slopes(f, p) for f in plant.friction.values())]
+    return frozenset(name for name in plant.parameters if ca.depends_on(ca.vertcat(*spans), getattr(p, name)))
+
+
+def _with_slope(plant: Plant, state: str) -> Plant:
+    """Return the plant with viscous friction of one slope in the place of each curve."""
+    which = STATES.index(state)
+
+    def viscous(friction: Friction) -> Friction:
+        return replace(
+            friction,
+            force=lambda v, p: bound_slopes(friction, p)[which] * v,
+            slopes=lambda p: (bound_slopes(friction, p)[which],) * 2,
+        )
+
+    def follow(maker: PlantMaker | None) -> PlantMaker | None:
+        return None if maker is None else lambda: friction_states(maker())[state]
+
+    def port(one: Port) -> Port:
+        return replace(one, held=follow(one.held), probe=follow(one.probe))
+
+    return replace(
+        plant, name=f"{plant.name} {state}", ports=tuple(port(one) for one in plant.ports),
+        friction={name: viscous(friction) for name, friction in plant.friction.items()},
+    )  # fmt: skip
+
+
+@memo
+def friction_matrices(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p) -> (effect of each friction force on f, on h; velocities' rows), at t = 0.
+
+    The effects are those of a force in the direction of its velocity, shapes (nx, p) and (ny, p); the rows are
+    derivatives of the velocities by the states, shape (p, nx).
+    """
+    forces = {name: ca.SX.sym(name) for name in plant.friction}
+    x, u, p = (
+        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
+        for names, symbols in ((plant.states, plant.x), (plant.inputs, plant.u), (plant.parameters, plant.p))
+    )
+    for name, symbol in forces.items():
+        setattr(u, name, symbol)
+    stacked = ca.vertcat(*forces.values())
+    f, h = plant.f(plant.t, x, u, p), plant.h(plant.t, x, u, p)
+    on_states = -ca.jacobian(ca.vertcat(*(ca.SX(f[name]) for name in plant.states)), stacked)
+    on_outputs = -ca.jacobian(ca.vertcat(*(ca.SX(h[name]) for name in plant.outputs)), stacked)
+    velocities = ca.vertcat(*(ca.SX(friction.velocity(x, p)) for friction in plant.friction.values()))
+    at_rest = [ca.substitute(block, plant.t, 0.0) for block in (on_states, on_outputs)]
+    blocks = [ca.densify(block) for block in (*at_rest, ca.jacobian(velocities, plant.x))]
+    return ca.Function("friction", [plant.x, plant.u, plant.p], blocks)

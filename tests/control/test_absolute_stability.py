@@ -1,0 +1,140 @@
+"""The proof of stability with friction against a fine lifted discretisation and eigenvalues."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import seaopt as so
+from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.loops import absolute_stability as proof
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import TransferFunction
+
+STIFFNESS, MASS, DAMPING, PERIOD, DELAY = 120e3, 18.9, 395.0, 1e-3, 2
+A = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
+B = np.array([0.0, 1.0 / MASS])
+C = np.array([STIFFNESS, 0.0])
+
+
+def discretise(period):
+    block = expm(np.block([[A, B[:, None]], [np.zeros((1, 3))]]) * period)
+    return block[:2, :2], block[:2, 2]
+
+
+def pid(k_p, k_d, k_i=0.6, T_f=1.3e-3):
+    alpha = T_f / (T_f + PERIOD)
+    lag, difference = np.array([1.0, -alpha]), np.array([1.0, -1.0])
+    den = np.convolve(difference, lag)
+    num = k_p * den + k_d / (T_f + PERIOD) * np.convolve(difference, difference)
+    return TransferFunction(num=num + k_i * PERIOD / 2 * np.convolve([1.0, 1.0], lag), den=den)
+
+
+def loop_of(law, slope=1.0):
+    a, b = discretise(PERIOD)
+    plant = DigitalPlant(a=a, b=b, c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0)
+    return proof.FrictionLoop(
+        a=A, motor=B, friction=B[:, None], velocity=np.array([[0.0, 1.0]]), measured=C, through=np.zeros(1),
+        slopes=np.array([slope]), plant=plant, law=law,
+    )  # fmt: skip
+
+
+def closed_loop_matrices(law, substeps):
+    """Return the loop over one period, from friction effort in each substep to the velocity's mean in each.
+
+    Written for this test: states are the plant's, the two commands under way, and the law's own; the effort is
+    constant within a substep.
+    """
+    h = PERIOD / substeps
+    a, b = discretise(h)
+    # Mean of the state over a substep, for a velocity whose power is that of the effort.
+    mean = expm(np.block([[A, np.eye(2)], [np.zeros((2, 4))]]) * h)[:2, 2:] / h
+    whole = expm(np.block([[A, B[:, None], np.zeros((2, 1))], [np.zeros((1, 3)), 1.0], [np.zeros((1, 4))]]) * h)
+    mean_effort = whole[:2, 3] / h
+    law_a, law_b, law_c, law_d = law.state_space()
+    n, waiting = law_a.shape[0], DELAY
+    size = 2 + waiting + n
+    first = np.zeros((size, size))  # what happens at the sample: u_k = -C_y y_k joins the queue
+    first[:2, :2] = np.eye(2)
+    for i in range(1, waiting):
+        first[2 + i - 1, 2 + i] = 1.0
+    first[2 + waiting - 1, :2], first[2 + waiting - 1, 2 + waiting :] = -law_d * C, -law_c
+    first[2 + waiting :, :2], first[2 + waiting :, 2 + waiting :] = np.outer(law_b, C), law_a
+    applied = np.zeros(size)
+    applied[2] = 1.0  # the oldest command is applied over this period
+    transition, efforts = np.eye(size), np.zeros((size, substeps))
+    out_state, out_effort = np.zeros((substeps, size)), np.zeros((substeps, substeps))
+    for i in range(substeps):
+        motion, drive = transition[:2], efforts[:2]
+        out_state[i] = (mean @ motion)[1] + mean_effort[1] * applied
+        out_effort[i] = (mean @ drive)[1]
+        out_effort[i, i] += mean_effort[1]
+        transition = np.vstack([a @ motion + np.outer(b, applied), transition[2:]])
+        efforts = np.vstack([a @ drive, efforts[2:]])
+        efforts[:2, i] += b
+    return first @ transition, first @ efforts, out_state, out_effort, h
+
+
+@pytest.mark.parametrize("gains", [(0.53, 0.018), (3.0, 0.018), (1.2, 0.03), (0.1, 0.002)])
+def test_the_test_agrees_with_a_fine_lifted_discretisation(gains):
+    """At every angle the sign is that of the Hermitian part of a matrix with 120 substeps."""
+    law = pid(*gains)
+    loop = loop_of(law)
+    theta = np.array([0.02, 0.1, 0.3, 0.8, 1.5, 2.5, 3.1])
+    responses = proof._respond(loop, theta)
+    transition, effort, state, direct, _ = closed_loop_matrices(law, 120)
+    compared = 0
+    for i, angle in enumerate(theta):
+        z = np.exp(1j * angle)
+        lifted = direct + state @ np.linalg.solve(z * np.eye(len(transition)) - transition, effort)
+        for inverse in (1e-3, 1.6e-4, 5e-5, 2e-5, 1e-5, 3e-6):
+            least = np.linalg.eigvalsh(0.5 * (lifted + lifted.conj().T) + inverse * np.eye(120))[0]
+            value = proof._definiteness(responses, np.ones_like, inverse)[i]
+            assert value <= 0.0 or least > 0.0, (angle, inverse, least, value)  # what is proved is true
+            if least > 0.1 * inverse and inverse > 1e-5:  # and, where substeps and aliases resolve it, proved
+                assert value > 0.0, (angle, inverse, least, value)
+            compared += least < 0.0
+    assert compared or gains[0] < 1.0  # the others meet matrices that are not definite
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_viscous_friction_within_the_margin_is_stable(seed):
+    """Viscous friction is in the sector: eigenvalues of the loop with it must agree with what was proved."""
+    rng = np.random.default_rng(seed)
+    law = pid(rng.uniform(0.1, 4.0), rng.uniform(0.0, 0.04), k_i=rng.uniform(0.3, 200.0))
+    loop = loop_of(law, slope=6250.0)
+    margin = proof.friction_margin(loop)
+    if np.max(np.abs(so.control.Loop(plant=loop.plant, reference=law, measurement=law).eigenvalues())) >= 1.0:
+        return  # the proof is for loops that are stable without friction
+    assert margin.factor > 0.0
+    for share in np.linspace(0.0, 0.999, 25):
+        slope = share * min(margin.slopes[0], 1e9)
+        block = expm(np.block([[A - slope * np.outer(B, [0, 1]), B[:, None]], [np.zeros((1, 3))]]) * PERIOD)
+        plant = DigitalPlant(
+            a=block[:2, :2], b=block[:2, 2], c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0
+        )
+        closed = so.control.Loop(plant=plant, reference=law, measurement=law)
+        assert np.max(np.abs(closed.eigenvalues())) < 1.0 + 1e-9, share
+
+
+def test_a_tuned_controller_is_proved_on_the_stand():
+    """On the stand a tuned pid is proved stable at THOR's friction; a plant without friction needs no proof."""
+    stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=4e-3)
+    controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    margin = prove_friction(controller, stand, rubbing)
+    assert margin.proved
+    assert margin.slopes[0] == pytest.approx(margin.factor * 50.0 / 4e-3)
+    assert prove_friction(controller, stand, so.plants.thor()) is None
+
+
+def test_a_loop_that_needs_friction_is_not_proved():
+    actuator = so.plants.thor().update(
+        k=120e3, m_l=0.9, l=0.005, N_p=1, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, eta=0.86, f_c=25, v_s=0.004
+    )
+    spec = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, delay_samples=2)
+    controller = so.tune(so.plants.high_impedance(), actuator.update(f_c=0.0), spec)
+    swing = so.plants.moving_output()
+    margin = prove_friction(controller, swing, actuator)
+    eigenvalues = controller.close(swing, actuator.update(f_c=0.0)).eigenvalues()
+    assert margin.proved <= bool(np.max(np.abs(eigenvalues)) < 1.0)
