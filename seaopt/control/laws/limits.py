@@ -129,6 +129,8 @@ class Limit:
         What is allowed where the specification leaves it out; None: it is then not imposed.
     bandwidth_divisor : float, optional
         The default is bandwidth_hz over this instead.
+    stuck_too : bool
+        Of a limit of the design plant: where friction sticks it holds there too, not on the sliding plant alone.
     allowed : float, optional
         What is always allowed, of a limit whose field says where it holds, or that has none.
     has_field : bool
@@ -159,6 +161,7 @@ class Limit:
     unit: str = ""
     default: float | None = None
     bandwidth_divisor: float | None = None
+    stuck_too: bool = False
     allowed: float | None = None
     has_field: bool = True
     condition: Callable[[MeasuredLoop], bool] | None = None
@@ -239,13 +242,14 @@ LIMITS = (
     ),
     Limit(
         name="max_reference_peak", label="reference peak", figure=lambda loop: loop.figures.reference_peak,
-        sense="at most", scope="design plant", above=1.0, curve=LimitCurve(of="P C_r"),
+        sense="at most", scope="design plant", above=1.0, stuck_too=True,
+        curve=LimitCurve(of="P C_r"),
         meaning="peak of |F/F_ref| over its static value",
         remedy="use a pid_dob or derivative = \"measurement\", or lower the bandwidth",
     ),
     Limit(
         name="max_noise_gain", label="noise gain", figure=lambda loop: loop.figures.noise_gain, sense="at most",
-        scope="design plant", unit="N/N", curve=LimitCurve(of="C_y"),
+        scope="design plant", unit="N/N", stuck_too=True, curve=LimitCurve(of="C_y"),
         meaning="peak of |F_m/noise on F|: motor force that the sensor's noise makes",
         remedy="lower the bandwidth, or filter the sensor",
     ),

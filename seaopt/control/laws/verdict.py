@@ -30,12 +30,13 @@ class Verdict:
         return f"{self.limit.name} ({self.plant})" if self.limit.scope == "every plant" else self.limit.name
 
 
-def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope) -> list[Verdict]:
-    """Judge a loop by every limit of a scope that the specification imposes."""
+def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
+    """Judge a loop by every limit of a scope that the specification imposes; `stuck`: by those of a stuck design plant.
+    """
     verdicts: list[Verdict] = []
     for limit in LIMITS:
         allowed = spec.allowed(limit)
-        if limit.scope != scope or allowed is None:
+        if limit.scope != scope or allowed is None or (stuck and not limit.stuck_too):
             continue
         value = limit.figure(loop)
         met = limit.keeps(value, allowed) and (limit.condition is None or limit.condition(loop))
@@ -43,10 +44,14 @@ def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope) -> list[Verdic
     return verdicts
 
 
-def judge_all(spec: ControllerSpec, loops: Sequence[MeasuredLoop]) -> list[Verdict]:
-    """Judge every plant's loop, and the design plant's, which is the first, by its own limits too."""
+def judge_all(spec: ControllerSpec, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
+    """Judge every plant's loop, and the design plant's, which is the first, by its own limits too.
+
+    Of two `design_states` the first is the design plant sliding, the second the same plant stuck by its friction.
+    """
     verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant")]
-    return verdicts + judge(spec, loops[0], "design plant")
+    verdicts += judge(spec, loops[0], "design plant")
+    return verdicts + (judge(spec, loops[1], "design plant", stuck=True) if design_states == 2 else [])
 
 
 def list_broken(verdicts: Sequence[Verdict]) -> list[str]:

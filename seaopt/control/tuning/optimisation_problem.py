@@ -63,6 +63,8 @@ class Grid:
         Frequencies in Hz, and exp(-j omega T_s).
     p : array, shape (plants, m)
         Plants with hold and delay; the first is the design plant.
+    rows : tuple of int
+        Which of the task's plants they are.
     kept, inverse
         The nominal plant's parts at q; zeros without an observer.
     port, unit
@@ -73,6 +75,7 @@ class Grid:
     f: Float[np.ndarray, " m"]
     q: Complex[np.ndarray, " m"]
     p: Complex[np.ndarray, "n m"]
+    rows: tuple[int, ...]
     kept: Complex[np.ndarray, " m"]
     inverse: Complex[np.ndarray, " m"]
     port: Complex[np.ndarray, " m"]
@@ -81,14 +84,18 @@ class Grid:
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
-            f=self.f[index], q=self.q[index], p=self.p[:, index], kept=self.kept[index], inverse=self.inverse[index],
-            port=self.port[index], unit=self.unit[index],
+            f=self.f[index], q=self.q[index], p=self.p[:, index], rows=self.rows, kept=self.kept[index],
+            inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
         )  # fmt: skip
 
 
 @record(eq=False)
 class Task:
-    """A specification with the plants it is to hold for; the first is the design plant, whose port must be passive."""
+    """A specification with the plants it is to hold for.
+
+    The first is the design plant, whose port must be passive; of two `design_states` it is the sliding one, and the
+    second plant is the same one stuck by its friction.
+    """
 
     spec: ControllerSpec
     plants: tuple[DigitalPlant, ...]
@@ -96,6 +103,7 @@ class Task:
     k_ff: float
     nominal: Nominal | None
     port: PortModel | None = None
+    design_states: int = 1
 
     @property
     def least_rate(self) -> float:
@@ -168,8 +176,8 @@ class Task:
         if self.nominal is not None:
             kept = np.polynomial.polynomial.polyval(q, self.nominal.kept)
             inverse = self.nominal.inverse.response(f, self.spec.sample_time_s)
-        chosen = self.plants if rows is None else [self.plants[row] for row in rows]
-        p = np.array([plant.response(f) for plant in chosen])
+        rows = tuple(range(len(self.plants)) if rows is None else rows)
+        p = np.array([self.plants[row].response(f) for row in rows])
         port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
         if self.port is not None and self.spec.passive_band_hz is not None:
             low, high = self.spec.passive_band_hz
@@ -177,7 +185,7 @@ class Task:
             port[inside], unit[inside] = sight(
                 self.port, self.spec.sample_time_s, self.spec.delay_samples, f[inside]
             )  # fmt: skip
-        return Grid(f=f, q=q, p=p, kept=kept, inverse=inverse, port=port, unit=unit)
+        return Grid(f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit)
 
     def terms(self, grid: Grid, x: LawNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
@@ -193,30 +201,29 @@ class Task:
         on_reference = x[2] * rate if self.spec.derivative == "error" else 0.0
         return series * (both + on_reference + self.k_ff), c_y
 
-    def usage(self, grid: Grid, x: LawNumbers, *, design: bool = True) -> dict[str, Float[np.ndarray, "k m"]]:
-        """Return how much of each limit is used, by its name, as arrays with one row per plant.
-
-        The limits of the design plant, which is then the grid's first, are left out on request.
-        """
+    def usage(self, grid: Grid, x: LawNumbers) -> dict[str, Float[np.ndarray, "k m"]]:
+        """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
         c_r, c_y = self.law(grid, x)
-        out = self.curves("every plant", grid.f, grid.p, c_y, c_r)
-        if design:
-            out |= {name: value[None] for name, value in self.design_usage(grid, c_y, c_r).items()}
-        return out
+        rows: dict[str, list[Float[np.ndarray, " m"]]] = {}
+        for position in range(len(grid.rows)):
+            for name, curve in self.design_usage(grid, position, c_y, c_r).items():
+                rows.setdefault(name, []).append(curve)
+        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r)
+        return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
     def curves(
         self,
-        scope: Scope,
+        names: Sequence[str],
         f: Float[np.ndarray, " m"],
         p: Complex[np.ndarray, "*k m"],
         c_y: Complex[np.ndarray, "*n m"],
         c_r: Complex[np.ndarray, "*n m"],
     ) -> dict[str, np.ndarray]:
-        """Return the usage of the limits that every plant, or the design plant, must keep."""
+        """Return the usage of some limits on plants p."""
         levels, open_loop = self.levels(), p * c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
-        for name in SCOPES[scope]:
+        for name in names:
             curve = CURVES[name]
             size, allowed = np.abs(curve.numerator(p, c_y, c_r, open_loop)), levels[name] * distance
             usage = allowed / np.maximum(size, 1e-12) if curve.floor else size / allowed
@@ -231,11 +238,16 @@ class Task:
         return curve.until_hz(allowed, self.spec.bandwidth_hz) * (1 + 1e-9)
 
     def design_usage(
-        self, grid: Grid, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
+        self, grid: Grid, position: int, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
     ) -> dict[str, np.ndarray]:
-        """Return the usage of the limits of the design plant, the grid's first."""
-        out = self.curves("design plant", grid.f, grid.p[0], c_y, c_r)
-        if self.port is not None:
+        """Return the usage of the limits that one of the grid's plants keeps as the design plant, sliding or stuck."""
+        row, names = grid.rows[position], SCOPES["design plant"]
+        if row >= self.design_states:
+            return {}
+        if row:
+            names = tuple(name for name in names if BY_NAME[name].stuck_too)
+        out = self.curves(names, grid.f, grid.p[position], c_y, c_r)
+        if self.port is not None and row == 0:
             one = 1.0 + grid.port * c_y
             cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
             out[PASSIVE] = np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)
@@ -280,7 +292,7 @@ class Task:
         _, c_y = self.law(grid, x)
         distance = np.abs(1.0 + grid.p * c_y)
         if self.spec.objective == "noise":
-            return float(np.max(np.abs(c_y) / distance[0]))
+            return float(np.max(np.abs(c_y) / distance[: self.design_states]))
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))
 
 

@@ -25,6 +25,7 @@ from seaopt.control.tuning.optimisation_problem import (
     INTEGRAL_RAD_S,
     LOWEST_NOTCH,
     OBJECTIVE_HZ,
+    SCOPES,
     Grid,
     LawNumbers,
     Task,
@@ -101,7 +102,7 @@ def _thin_grid(task: Task, grid: Grid) -> Grid:
     even = np.searchsorted(grid.f, np.geomspace(OBJECTIVE_HZ, grid.f[-1], COARSE_FREQUENCIES))
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
-    return replace(coarse, p=coarse.p[:SCANNED_PLANTS])
+    return replace(coarse, p=coarse.p[:SCANNED_PLANTS], rows=coarse.rows[:SCANNED_PLANTS])
 
 
 def _list_shapes(task: Task) -> Iterator[tuple[float, float, float, float, float]]:
@@ -187,8 +188,8 @@ def _measure_merit(
     weights, worst = task.weights(grid.f), np.zeros(c_y.shape[0])
     value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
     for row, p in enumerate(grid.p):
-        usage = task.curves("every plant", grid.f, p, c_y, c_r)
-        usage |= task.design_usage(grid, c_y, c_r) if row == 0 else {}
+        usage = task.curves(SCOPES["every plant"], grid.f, p, c_y, c_r)
+        usage |= task.design_usage(grid, row, c_y, c_r)
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = 1.0 + p * c_y
@@ -196,8 +197,8 @@ def _measure_merit(
         turned = np.minimum(turned, turn[:, -1] - turn[:, 0])
         if task.spec.objective == "disturbance":
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
-        elif row == 0:
-            value = np.max(np.abs(c_y / distance), axis=1)
+        elif row < task.design_states:
+            value = np.maximum(value, np.max(np.abs(c_y / distance), axis=1))
     broken = np.log(np.maximum(worst, 1.0))
     size = np.min(value) if value.size else 1.0
     return np.log(value / size) + 20.0 * broken + np.where(turned < LEAST_TURN, 50.0, 0.0)

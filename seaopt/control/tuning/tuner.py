@@ -40,6 +40,7 @@ from seaopt.control.tuning.starts import find_starts
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import split_friction
 from seaopt.plants.plant import dry_friction_effort
 
 STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
@@ -99,7 +100,7 @@ def tune(
     check_current(spec, task.k_ff, command.per_effort, dry_friction_effort(plant, params))
     x, loops = solve(task)
     largest = None
-    if list_broken(judge_all(spec, loops)):
+    if list_broken(judge_all(spec, loops, task.design_states)):
         largest, near = find_largest_bandwidth(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near is not None:
@@ -122,9 +123,14 @@ def make_task(
     gain = command_of(plant, params, spec.measured).per_effort
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
-    models = {"design plant": (plant, params)}
-    models |= {str(name): p if isinstance(p, tuple) else (p, params) for name, p in robust_to.items()}
+    named = {"design plant": (plant, params)}
+    named |= {str(name): p if isinstance(p, tuple) else (p, params) for name, p in robust_to.items()}
+    varied = {parameter for values in draws for parameter in values}
+    models: dict[str, tuple[Plant, ParameterSet]] = {}
+    for name, (model, values) in named.items():
+        models |= {one: (variant, values) for one, variant in split_friction({name: model}, values, varied).items()}
     names, pairs = [*models], [*models.values()]
+    design_states = 1 if pairs[0][0] is plant else 2
     for name, pair in _draw_plants(models, draws):
         names.append(name)
         pairs.append(pair)
@@ -141,8 +147,11 @@ def make_task(
         if np.max(np.abs(np.linalg.eigvals(sampled.a))) > GROWING:
             raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
-    port = None if spec.passive_band_hz is None else port_of(plant, params, spec.measured, gain)
-    return Task(spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal, port=port)
+    port = None if spec.passive_band_hz is None else port_of(pairs[0][0], params, spec.measured, gain)
+    return Task(
+        spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal, port=port,
+        design_states=design_states,
+    )  # fmt: skip
 
 
 def _draw_plants(
@@ -210,7 +219,7 @@ def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
     for row in range(len(task.plants)):
         dense = task.loop(x, row).grid()
         f = dense[(dense >= LOWEST_HZ) & (dense < grid.f[-1])]
-        for name, curve in task.usage(task.grid(f, [row]), x, design=row == 0).items():
+        for name, curve in task.usage(task.grid(f, [row]), x).items():
             top = int(np.argmax(curve))
             if curve[0, top] > allowed[name] * (1.0 + max(0.4 * task.spec.reserve, 1e-6)):
                 out.append(float(f[top]))
@@ -271,7 +280,7 @@ def make_controller(
 ) -> Controller:
     """Return the controller of tuned numbers."""
     spec, gains = task.spec, task.gains(x)
-    verdicts = judge_all(spec, loops)
+    verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
     reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
     return Controller(
@@ -286,7 +295,7 @@ def make_controller(
         achieved=loops[0].figures,
         feasible=not broken,
         active_constraints=tuple(broken or list_active(spec, verdicts)),
-        robust_to=task.names[1:],
+        robust_to=task.names[task.design_states :],
         design=design,
         observer=gains.observer,
         blocked_by=tuple(explain_broken(spec, verdicts, loops[0], task.loop(x))),
