@@ -203,7 +203,7 @@ def _select(results: Sequence[Result], kind: type) -> Any:
 
 def _plants(controller: Controller | None, certificate: Certificate | None) -> dict[str, tuple[Plant, ParameterSet]]:
     if certificate is not None:
-        return {name: (plant, certificate.parameters) for name, plant in certificate.models.items()}
+        return {name: (plant, certificate.parameters) for name, plant in certificate.linear_models.items()}
     if controller is not None and controller.design is not None:
         return {"design plant": controller.design}
     return {}

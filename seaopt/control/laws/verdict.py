@@ -31,8 +31,7 @@ class Verdict:
 
 
 def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
-    """Judge a loop by every limit of a scope that the specification imposes; `stuck`: by those of a stuck design plant.
-    """
+    """Judge a loop by every limit of a scope that the specification imposes; `stuck`: by those of a stuck design plant."""
     verdicts: list[Verdict] = []
     for limit in LIMITS:
         allowed = spec.allowed(limit)

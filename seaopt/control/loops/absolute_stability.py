@@ -125,6 +125,13 @@ class FrictionMargin:
         """Whether stability is proved for the curves as they are."""
         return self.factor >= 1.0
 
+    def __str__(self) -> str:
+        if not self.factor:
+            return f"friction: stability between sliding and stuck is not proved ({self.multiplier})"
+        steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as its own"
+        missing = "" if self.proved else "; for its own it is not"
+        return f"friction: stability is proved for every curve {steep}, between the samples too{missing}"
+
 
 def friction_margin(loop: FrictionLoop) -> FrictionMargin:
     """Return the steepest friction for which the loop is proved stable, the best over all multipliers tried.

@@ -10,13 +10,16 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
+from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
 from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
@@ -130,12 +133,22 @@ class PlantMargins:
         }  # fmt: skip
 
 
+def prove_frictions(
+    controller: Controller, models: Mapping[str, Plant], params: ParameterSet
+) -> dict[str, FrictionMargin]:
+    """Return the friction margin of every plant that has friction."""
+    margins = {name: prove_friction(controller, model, params) for name, model in models.items()}
+    return {name: margin for name, margin in margins.items() if margin is not None}
+
+
 def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:
     """Measure the margins of a controller on a plant; the controller knows its design plant."""
     loop = controller.close(plant, params)
     classical = margins(loop)
     assert controller.design is not None
-    gap, gap_hz = nu_gap(controller.close(*controller.design), loop)
+    design, values = controller.design
+    first = next(iter(split_friction({"": design}, values).values()))
+    gap, gap_hz = nu_gap(controller.close(first, values), loop)
     period = controller.sample_time_s
     reach = min(SEARCHED_DELAYS * ((classical.delay_s or 0.0) + 2 * period), LONGEST_DELAY * period)
     exact = sampled_delay_margin(controller, plant, params, reach) if classical.disks else 0.0
@@ -152,7 +165,8 @@ class Certificate:
         Every requirement is met.
     requirements : tuple of Requirement
     plants : mapping of name to LoopFigures
-        At the nominal parameters.
+        At the nominal parameters. A plant with friction is there twice, as NAME sliding and NAME stuck, here and in
+        what follows by plant.
     margins : mapping of name to PlantMargins
         Every margin at the nominal parameters, with the perturbation that exhausts it.
     worst : mapping of name to Worst
@@ -165,11 +179,13 @@ class Certificate:
     controller : Controller
         What was certified.
     models : mapping of name to Plant
-        What it was certified on, at `parameters`.
+        What it was certified on, at `parameters`: the plants as they are, friction and all.
     simulated : Simulated or None
         The results of `with_simulation`.
     brackets : mapping of name to Bracket
         Proven bounds on the worst case; empty if bounds were not requested.
+    friction : mapping of name to FrictionMargin
+        Of each model with friction: for how steep a friction stability is proved, between sliding and stuck.
 
     """
 
@@ -185,6 +201,12 @@ class Certificate:
     varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
+    friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
+
+    @property
+    def linear_models(self) -> dict[str, Plant]:
+        """The plants whose loops are measured: one with friction is there sliding and stuck."""
+        return split_friction(self.models, self.parameters, [varied.name for varied in self.varied])
 
     def with_simulation(
         self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1
@@ -220,7 +242,10 @@ class Certificate:
         return replace(self, simulated=simulations, requirements=requirements, passed=passed)
 
     def _simulate(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
-        draws = {name: [worst[1]] for name, worst in self.worst.items()}
+        draws: dict[str, list[ParameterSet]] = {name: [] for name in self.models}
+        for name, model in self.models.items():
+            states = split_friction({name: model}, self.parameters, [varied.name for varied in self.varied])
+            draws[name] += [self.worst[state][1] for state in states]
         return run_simulations(
             self.controller, self.models, self.parameters, draws=draws, sensors=sensors,
             current_step_A=current_step_A, seed=seed,
@@ -247,28 +272,38 @@ class Certificate:
         stored = read_certificate(content)
         if controller.design is not None:  # certified too where nobody listed it
             models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
+        varied = tuple(Varied(**row.model_dump()) for row in stored.varied)
+        states = {
+            name: split_friction({name: plant}, parameters, [row.name for row in varied])
+            for name, plant in models.items()
+        }
+        models = {
+            name: plant for name, plant in models.items() if any(state in stored.plants for state in states[name])
+        }
+        known = {state: plant for name in models for state, plant in states[name].items()}
         for name in stored.plants:
-            if name not in models:
+            if name not in known:
                 raise FileError(f'robustness.json: plants has "{name}", which is not a plant given; {REMEDY}')
         try:
-            models = {name: models[name] for name in stored.plants}
+            linear = {name: known[name] for name in stored.plants}
             requirements = tuple(Requirement(**row.model_dump()) for row in stored.requirements)
             bounds = {name: plant.worst.bounds for name, plant in stored.plants.items()}
             certificate = cls(
                 passed=all(row.met for row in requirements),
                 requirements=requirements,
-                plants={name: controller.close(plant, parameters).figures() for name, plant in models.items()},
-                margins={name: plant_margins(controller, plant, parameters) for name, plant in models.items()},
+                plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
+                margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
                 worst={
                     name: measure_worst(controller, plant, parameters, stored.plants[name].worst.parameters)
-                    for name, plant in models.items()
+                    for name, plant in linear.items()
                 },
                 monte_carlo=MonteCarlo(**stored.monte_carlo.model_dump()),
                 controller=controller,
                 models=models,
                 parameters=parameters,
-                varied=tuple(Varied(**row.model_dump()) for row in stored.varied),
+                varied=varied,
                 brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
+                friction=prove_frictions(controller, models, parameters),
             )
             played = stored.simulation
             if played is None:
@@ -289,6 +324,10 @@ class Certificate:
                 | self.margins[name].to_dict()
                 | {"worst": _list_fields(self.worst[name].witness) | self._bounds(name)}
                 for name, figures in self.plants.items()
+            },
+            "friction": {
+                name: {"sector_stable": True if margin.proved else None} | _list_fields(margin)
+                for name, margin in self.friction.items()
             },
             "monte_carlo": _list_fields(self.monte_carlo),
             "varied": [_list_fields(varied) for varied in self.varied],
@@ -314,7 +353,8 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        return (*warn_unidentified(self.parameters, used), *outside, *little)
+        friction = (f"{name}: {margin}" for name, margin in self.friction.items())
+        return (*warn_unidentified(self.parameters, used), *friction, *outside, *little)
 
     def _bounds(self, name: str) -> dict[str, Any]:
         return self.brackets[name].to_dict() if name in self.brackets else {}

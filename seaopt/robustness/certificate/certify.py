@@ -7,7 +7,7 @@ and with failures the bound is Clopper's and Pearson's. Draws are made and measu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 
@@ -22,8 +22,16 @@ from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import split_friction
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
-from seaopt.robustness.certificate.certificate import DESIGN_NAMES, Certificate, MonteCarlo, Requirement, plant_margins
+from seaopt.robustness.certificate.certificate import (
+    DESIGN_NAMES,
+    Certificate,
+    MonteCarlo,
+    Requirement,
+    plant_margins,
+    prove_frictions,
+)
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
@@ -91,7 +99,8 @@ def certify(
     controller : Controller
         The law.
     plants : mapping of name to Plant
-        Plants on which it must pass. The design plant is certified too, as "design" where it is not among them.
+        Plants on which it must pass. The design plant is certified too, as "design" where it is not among them. One
+        with friction is certified twice: sliding, where its friction is flattest, and stuck, where it is steepest.
     parameters : Fit or ParameterSet
         A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one.
     ranges : mapping of name to (low, high), optional
@@ -137,10 +146,11 @@ def certify(
 
     """
     _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability)
-    plants, others = _with_design(controller, plants, others or ParameterSet())
-    unknown = combine_uncertainty(parameters, others, ranges or {}, plants)
+    models, others = _with_design(controller, plants, others or ParameterSet())
+    unknown = combine_uncertainty(parameters, others, ranges or {}, models)
     _check_delay(controller, unknown.ranges)
-    nominal = unknown.nominal
+    nominal, varied = unknown.nominal, unknown.varied()
+    plants = split_friction(models, nominal, [row.name for row in varied])
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
@@ -161,16 +171,15 @@ def certify(
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
     requirements = (
-        *_design_requirements(controller, nominal),
+        *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
     )
     return Certificate(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
-        monte_carlo=monte_carlo, controller=controller, models=dict(plants), parameters=nominal,
-        varied=unknown.varied(),
-        brackets=brackets,
+        monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
+        brackets=brackets, friction=prove_frictions(controller, models, nominal),
     )  # fmt: skip
 
 
@@ -278,9 +287,9 @@ def failure_bound(samples: int, failures: int, confidence: float) -> float:
     return float(betaincinv(failures + 1, samples - failures, confidence))
 
 
-def _design_requirements(controller: Controller, nominal: ParameterSet) -> list[Requirement]:
+def _design_requirements(controller: Controller, nominal: ParameterSet, varied: Collection[str]) -> list[Requirement]:
     """Return what is required of the design plant at the nominal parameters, computed from the law again."""
     assert controller.design is not None
     plant, values = controller.design
     named = values.with_parameters(*(nominal[name] for name in nominal if name in plant.parameters))
-    return design_requirements(controller, controller.close(plant, named).figures(), named)
+    return design_requirements(controller, split_friction({"design": plant}, named, varied), named)

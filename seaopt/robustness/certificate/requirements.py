@@ -12,6 +12,7 @@ from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import Verdict, judge
 from seaopt.control.loops.port import port_of
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 from seaopt.robustness.certificate.certificate import MonteCarlo, Requirement
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
@@ -19,14 +20,21 @@ from seaopt.robustness.uncertainty.worst import Worst
 WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
 
-def design_requirements(controller: Controller, achieved: LoopFigures, values: ParameterSet) -> list[Requirement]:
-    """Return what is required of the design plant at the nominal parameters `values`; `achieved` is its loop there."""
+def design_requirements(controller: Controller, states: Mapping[str, Plant], values: ParameterSet) -> list[Requirement]:
+    """Return what is required of the design plant at the nominal parameters `values`.
+
+    Of two `states` the first is the plant sliding, the second the plant stuck.
+    """
+    figures = {name: controller.close(plant, values).figures() for name, plant in states.items()}
+    (name, achieved), *stuck = figures.items()
     spec, band = controller.spec, controller.spec.passive_band_hz
     port = None
     if band is not None and controller.design is not None:
-        held = port_of(controller.design[0], values, spec.measured, controller.command.per_effort)
+        held = port_of(states[name], values, spec.measured, controller.command.per_effort)
         port = measure_port(held, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
-    verdicts = judge(spec, MeasuredLoop(name="design", figures=achieved, port=port), "design plant")
+    verdicts = judge(spec, MeasuredLoop(name=name, figures=achieved, port=port), "design plant")
+    for other, loop in stuck:
+        verdicts += judge(spec, MeasuredLoop(name=other, figures=loop), "design plant", stuck=True)
     return [_make_requirement(verdict, _place_passive(verdict, port, band)) for verdict in verdicts]
 
 
