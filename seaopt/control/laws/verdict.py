@@ -31,7 +31,10 @@ class Verdict:
 
 
 def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
-    """Judge a loop by every limit of a scope that the specification imposes; `stuck`: by those of a stuck design plant."""
+    """Judge a loop by every limit of a scope that the specification imposes.
+
+    With `stuck`, only by those that also hold where the design plant is stuck by its friction.
+    """
     verdicts: list[Verdict] = []
     for limit in LIMITS:
         allowed = spec.allowed(limit)

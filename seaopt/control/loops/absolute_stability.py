@@ -145,14 +145,8 @@ def friction_margin(loop: FrictionLoop) -> FrictionMargin:
         inverse = _least_inverse(responses, multiplier, WORTHWHILE / best.factor if best.factor else np.inf)
         if inverse is None:
             continue
-        fine = responses
-        for _ in range(REFINEMENTS):  # between the angles the test may fail: look there, and give way
-            fine = _refine(loop, fine, multiplier, inverse)
-            again = _least_inverse(fine, multiplier, LARGEST_INVERSE)
-            if again is None or again <= inverse * (1.0 + MARGIN_PRECISION):
-                break
-            inverse = again
-        if again is None or (best.factor and inverse >= 1.0 / best.factor):
+        fine, inverse = _settle(loop, responses, multiplier, inverse)
+        if np.isinf(inverse) or (best.factor and inverse >= 1.0 / best.factor):
             continue
         worst = int(np.argmin(_definiteness(fine, multiplier, inverse * (1.0 - 0.01))))
         factor = np.inf if inverse == 0.0 else 1.0 / inverse
@@ -161,6 +155,21 @@ def friction_margin(loop: FrictionLoop) -> FrictionMargin:
             frequency_hz=float(fine.theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
         )  # fmt: skip
     return best
+
+
+def _settle(
+    loop: FrictionLoop, responses: _Responses, multiplier: Multiplier, inverse: float
+) -> tuple[_Responses, float]:
+    """Look between the angles, where the test may fail, and give way until it holds; infinite where it never does."""
+    for _ in range(REFINEMENTS):
+        responses = _refine(loop, responses, multiplier, inverse)
+        again = _least_inverse(responses, multiplier, LARGEST_INVERSE)
+        if again is None:
+            return responses, np.inf
+        if again <= inverse * (1.0 + MARGIN_PRECISION):
+            return responses, max(again, inverse)
+        inverse = again
+    return responses, inverse
 
 
 @record(eq=False)
