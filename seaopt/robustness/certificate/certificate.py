@@ -245,7 +245,7 @@ class Certificate:
         draws: dict[str, list[ParameterSet]] = {name: [] for name in self.models}
         for name, model in self.models.items():
             states = split_friction({name: model}, self.parameters, [varied.name for varied in self.varied])
-            draws[name] += [self.worst[state][1] for state in states]
+            draws[name] += [self.worst[state][1] for state in states if state in self.worst]
         return run_simulations(
             self.controller, self.models, self.parameters, draws=draws, sensors=sensors,
             current_step_A=current_step_A, seed=seed,
