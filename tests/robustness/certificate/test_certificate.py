@@ -333,3 +333,47 @@ def test_a_ranged_parameter_that_nobody_gave_has_its_default(controller, stand, 
     (told,) = found.varied
     assert told.value == 0.36
     assert not told.outside
+
+
+@pytest.fixture(scope="module")
+def rubbing():
+    """The actuator of a published complaint: certified at rest, it rang when its friction let go."""
+    return so.plants.thor().update(
+        k=120e3, m_l=0.9, l=0.005, N_p=1, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, eta=0.86, f_c=25, v_s=0.004
+    )
+
+
+def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
+    """Its figures are those of the loops with viscous friction of no slope, and of f_c/v_s, computed by hand."""
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25, delay_samples=2)
+    controller = so.tune(stand, rubbing.update(f_c=0.0), spec)
+    certificate = so.certify(controller, {"stand": stand}, rubbing, samples=10)
+    assert list(certificate.plants) == ["stand sliding", "stand stuck"]
+    radius = rubbing["l"].value / (2 * np.pi * rubbing["N_p"].value)
+    for state, slope in (("sliding", 0.0), ("stuck", 25 / 0.004)):
+        viscous = rubbing.update(f_c=0.0, b_r=2.5e-4 + slope * radius**2)
+        expected = controller.close(stand, viscous).figures()
+        assert certificate.plants[f"stand {state}"].ms == pytest.approx(expected.ms, rel=1e-8)
+        assert certificate.plants[f"stand {state}"].mt == pytest.approx(expected.mt, rel=1e-8)
+    assert not certificate.passed
+    assert any(
+        row.name == "max_sensitivity" and "stuck" in row.where for row in certificate.requirements if not row.met
+    )
+    content = certificate.to_dict()
+    assert content["friction"]["stand"]["sector_stable"] is True
+    again = type(certificate).from_dict(content, controller, {"stand": stand}, certificate.parameters)
+    assert list(again.plants) == list(certificate.plants)
+    assert again.friction == certificate.friction
+
+
+def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
+    rubbing = thor.update(f_c=5.0)
+    controller = so.tune(
+        stand, rubbing, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_reference_peak=1.4)
+    )
+    assert controller.feasible
+    radius = thor["l"].value / (2 * np.pi * thor["N_p"].value)
+    for slope in (0.0, 5.0 / thor["v_s"].value):
+        figures = controller.close(stand, thor.update(b_r=thor["b_r"].value + slope * radius**2)).figures()
+        assert figures.stable and figures.ms <= 1.6 * (1 + 1e-6) and figures.reference_peak <= 1.4 * (1 + 1e-6)
+    assert controller.achieved.bandwidth_hz == pytest.approx(30, rel=5e-3)
