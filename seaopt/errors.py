@@ -23,8 +23,13 @@ class SeaoptError(Exception):
     """
 
 
-class ParameterError(SeaoptError):
-    """A parameter is unknown, lacks a value, or lies outside its bounds."""
+class ParameterError(SeaoptError, KeyError):
+    """A parameter is unknown, lacks a value, or lies outside its bounds.
+
+    It is a KeyError too, which is what the methods of a mapping expect: `ParameterSet.get` rests on it.
+    """
+
+    __str__ = Exception.__str__  # KeyError's puts quotes around the message
 
 
 class UnitError(SeaoptError):

@@ -52,3 +52,10 @@ def test_interval_is_centred(value, std):
     low, high = item.ci95
     assert low < value < high
     assert high - low == pytest.approx(2 * 1.959964 * std, rel=1e-6)
+
+
+def test_a_set_is_a_mapping_for_unknown_names_too(thor):
+    assert thor.get("nope") is None and thor.get("nope", thor["J"]) is thor["J"]
+    with pytest.raises(KeyError) as caught:
+        thor["nope"]
+    assert str(caught.value).startswith('parameter "nope" is not in this set')

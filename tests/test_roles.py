@@ -1,4 +1,4 @@
-"""A plant whose every name is unlike the built-in ones goes the whole way and comes to the built-in plant's figures."""
+"""Plants without defaults, every name unlike the built-in ones, go the whole way and come to the built-in figures."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def reworded(plant: so.Plant) -> so.Plant:
         states=outer(plant.states),
         inputs=outer(plant.inputs),
         outputs=outer(plant.outputs),
-        parameters={WORDS[name]: reworded_parameter(item) for name, item in plant.parameters.items()},
+        parameters={WORDS[name]: UNITS.get(item.unit, item.unit) for name, item in plant.parameters.items()},
         f=lambda t, x, u, p: {WORDS[name]: rate for name, rate in plant.f(t, *map(inner, (x, u, p))).items()},
         h=lambda t, x, u, p: {WORDS[name]: value for name, value in plant.h(t, *map(inner, (x, u, p))).items()},
         energy=of_states(plant.energy),
@@ -98,7 +98,8 @@ RANGES = {"I_p": (0.2, 0.6), "phi": (-0.3, 0.3), "J": (2.5e-6, 4e-6)}
 
 @pytest.fixture(scope="module")
 def words(thor):
-    return so.ParameterSet(reworded_parameter(item) for item in thor.values())
+    bare_inertia = so.plants.two_link("fixed", "mass").defaults["m_2"]  # of the port's probe
+    return so.ParameterSet(reworded_parameter(item) for item in (*thor.values(), bare_inertia))
 
 
 @pytest.fixture(scope="module")

@@ -297,17 +297,15 @@ def _make_plant(name: str, kind: str, options: Mapping[str, Any]) -> Plant:
 
 
 def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:
-    known = dict(known_parameters())
+    declared = {name: default for plant in plants.values() for name, default in plant.defaults.items()}
     for plant in plants.values():
         for name in plant.parameters:
-            if name in plant.defaults:
-                known[name] = plant.defaults[name]
-            elif name not in known:
+            if name not in declared:
                 if name not in tables:
                     raise ProblemError(f"parameters.{name} is missing; plant {plant.name} needs it")
-                known[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
-    used = {name for plant in plants.values() for name in plant.parameters}
-    parameters = {name: known[name] for name in known if name in used or name in tables}
+                declared[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
+    known = known_parameters() | declared  # a plant of the file may use a built-in plant's name for something else
+    parameters = {name: known[name] for name in known if name in declared or name in tables}
     for name, value in tables.items():
         if name not in known:
             raise ProblemError(f'parameters: unknown parameter "{name}"; {suggestion(name, known)}')

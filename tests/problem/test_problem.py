@@ -176,3 +176,28 @@ def test_import_is_light():
     code = f"import sys, seaopt; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_a_plants_own_parameter_is_not_that_of_a_built_in_plant(write, monkeypatch):
+    """k, N and J of a foreign plant are neither the spring's 655 kN/m nor a gear ratio's or an inertia's bounds."""
+    import seaopt.plants.kinds as kinds
+
+    class Entry:
+        name, value = "foreign", "foreign:plant"
+
+        @staticmethod
+        def load():
+            return lambda: so.Plant(
+                name="foreign", states={"x": "rad", "v": "rad/s"}, inputs={"U": "V"}, outputs={"T": "N m"},
+                parameters={"J": "kg m^2", "k": "N m/rad", "N": "N m/V"},
+                f=lambda t, x, u, p: {"x": x.v, "v": (p.N * u.U - p.k * x.x) / p.J},
+                h=lambda t, x, u, p: {"T": p.k * x.x},
+            )  # fmt: skip
+
+    monkeypatch.setattr(kinds, "entry_points", lambda group: [Entry])
+    text = 'schema = 1\n[plant.own]\nkind = "foreign"\n[parameters]\nJ = 0.1\nN = -2.0\n'
+    parameters = so.read_problem(write(text + "k = 300.0\nm_l = 0.7\n")).parameters
+    values = {name: (item.value, item.unit) for name, item in parameters.items()}
+    assert values == {"J": (0.1, "kg m^2"), "k": (300.0, "N m/rad"), "N": (-2.0, "N m/V"), "m_l": (0.7, "kg")}
+    with pytest.raises(so.SeaoptError, match=r"parameters\.k is missing"):
+        so.read_problem(write(text))

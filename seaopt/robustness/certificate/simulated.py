@@ -161,7 +161,7 @@ def run_simulations(
 def _list_sweeps(
     controller: Controller, plants: Mapping[str, Plant], parameters: ParameterSet
 ) -> list[tuple[str, tuple[Plant, ParameterSet], str]]:
-    """Return what is swept: a name, plant and parameters, and what to call it where it cannot be attempt."""
+    """Return what is swept: a name, plant and parameters, and what to call the sweep if it fails."""
     assert controller.design is not None
     design, values = controller.design
     if controller.spec.current_limit_A is None:  # one reason for all of them
