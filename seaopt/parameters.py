@@ -148,7 +148,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
     def with_parameters(self, *parameters: Parameter) -> ParameterSet:
         """Return a set in which `parameters` replace those of the same name, or are added."""
-        return type(self)({**self._items, **{parameter.name: parameter for parameter in parameters}}.values())
+        return ParameterSet({**self._items, **{parameter.name: parameter for parameter in parameters}}.values())
 
     def update(self, **values: float | tuple[float, str]) -> ParameterSet:
         """Return a set with new values; a tuple (value, unit) is converted to the declared unit.
@@ -190,7 +190,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
     def subset(self, names: Iterable[str]) -> ParameterSet:
         """Return the parameters `names`, in that order."""
-        return type(self)(self[name] for name in names)
+        return ParameterSet(self[name] for name in names)
 
     def _rows(self) -> list[tuple[str, str, str, str, str]]:
         rows: list[tuple[str, str, str, str, str]] = []

@@ -200,7 +200,7 @@ def test_parts_pass_the_roles_on(swing, thor):
 
 def test_rotary_roles():
     plant = so.plants.rotary()
-    params = plant.defaults
+    params = plant.complete(plant.defaults)
     command = command_of(plant, params, "tau_s")
     assert (command.input, command.effort_unit) == ("I", "N m")
     assert 1.0 / command.per_effort == pytest.approx(50.0 * 0.05)
@@ -220,14 +220,14 @@ def test_friction_enters_by_its_role(thor):
     p = SimpleNamespace(**{name: item.value for name, item in plant.complete(params).items()})
     f = ca.Function("f", [plant.x, plant.u, plant.p], [plant.dynamics])
     mass = plant.derived_values()["m_k"]
-    m_k = float(ca.Function("m", [plant.p], [mass[0]])(plant.parameter_values(params)))
+    m_k = float(ca.Function("m", [plant.p], [mass[0]])(plant.complete(params).vector))
     for speed in (-0.02, 1e-3, 0.1):
         with_it, without = (
-            float(f([0.0, speed], [0.0], plant.parameter_values(values))[1])
+            float(f([0.0, speed], [0.0], plant.complete(values).vector)[1])
             for values in (params, params.update(f_c=0.0, f_s=0.0))
         )
         assert m_k * (without - with_it) == pytest.approx(float(friction.force(speed, p)), rel=1e-9)
-    assert dry_friction_effort(plant, params) == 20.0
+    assert dry_friction_effort(plant, plant.complete(params)) == 20.0
 
 
 def mass_on_a_spring(**roles):

@@ -144,8 +144,12 @@ class Survey:
         if not _is_form(self.plant, spring, values, pair):
             return None
         k = values[spring.stiffness]
-        lossless = values if actuation.efficiency is None else values.update(**{actuation.efficiency: 1.0})
-        per_input = evaluate(self.plant, actuation.effort, lossless) * self.gain.get(pair.output, 1.0)
+        lossless = (
+            values
+            if actuation.efficiency is None
+            else self.plant.complete(values.update(**{actuation.efficiency: 1.0}))
+        )
+        per_input = evaluate(actuation.effort, lossless) * self.gain.get(pair.output, 1.0)
         return pair.second_order.drive(k.value, per_input, k_std=k.std or k.prior_std or 0.0)
 
     def to_dict(self, params: ParameterSet) -> dict[str, Any]:

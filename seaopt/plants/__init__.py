@@ -4,7 +4,7 @@ from seaopt.plants.exchange import export_fmu, to_control
 from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
 from seaopt.plants.modes import Modes, Resonance, modes
 from seaopt.plants.parts import PARTS, wrapped
-from seaopt.plants.plant import Plant, jacobians, state_space
+from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_space
 from seaopt.plants.published import thor
 from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring
 from seaopt.plants.rotary import rotary
@@ -14,6 +14,7 @@ __all__ = [
     "KINDS",
     "PARTS",
     "Actuation",
+    "CompletedParameters",
     "Friction",
     "Mode",
     "Modes",

@@ -16,14 +16,14 @@ import numpy as np
 from seaopt.errors import PlantError
 from seaopt.files import write_bytes
 from seaopt.parameters import ParameterSet
-from seaopt.plants.plant import Plant
+from seaopt.plants.plant import CompletedParameters, Plant
 
 
 def to_control(plant: Plant, params: ParameterSet) -> Any:
     """Return the plant as a continuous-time `control.NonlinearIOSystem` with named signals, at fixed parameters."""
     import control  # deferred: it imports matplotlib
 
-    p = plant.parameter_values(params)
+    p = plant.complete(params).vector
     f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
     h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
 
@@ -74,7 +74,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     target = Path(path)
     if include is not None and not Path(include).is_dir():
         raise PlantError(f"include = {include} is no folder; give the one with the FMI 3.0 headers")
-    builder = _builder(plant, params, "plant_" + re.sub("[^A-Za-z0-9]+", "_", plant.name).strip("_"))
+    builder = _builder(plant, plant.complete(params), "plant_" + re.sub("[^A-Za-z0-9]+", "_", plant.name).strip("_"))
     archive = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         try:
@@ -92,7 +92,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     return write_bytes(target, archive.getvalue())
 
 
-def _builder(plant: Plant, params: ParameterSet, name: str) -> Any:
+def _builder(plant: Plant, params: CompletedParameters, name: str) -> Any:
     builder = ca.DaeBuilder(name, "", {})
     x = {state: builder.add(state) for state in plant.states}
     u = {source: builder.add(source, "input") for source in plant.inputs}
@@ -105,8 +105,8 @@ def _builder(plant: Plant, params: ParameterSet, name: str) -> Any:
         builder.eq(builder.der(state), rate)
     for symbol, output in zip(y, ca.vertsplit(outputs), strict=True):
         builder.eq(symbol, output)
-    for parameter, value in zip(p, plant.parameter_values(params), strict=True):
-        builder.set_start(parameter, value)
+    for name, parameter in params.items():
+        builder.set_start(name, parameter.value)
     # CasADi writes no unit definitions, without which FMI allows no units: they go into the descriptions.
     units = {**plant.states, **plant.inputs, **{name: plant.parameter_unit(name) for name in p}}
     for signal, unit in units.items():

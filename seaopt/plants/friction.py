@@ -52,8 +52,7 @@ def friction_slopes(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarra
     (0.0, 50000.0)
 
     """
-    values = plant.complete(params)
-    p = SimpleNamespace(**{name: parameter.value for name, parameter in values.items()})
+    p = plant.complete(params).by_attribute
     bounds = [[float(ca.DM(bound)) for bound in bound_slopes(friction, p)] for friction in plant.friction.values()]
     flattest, steepest = np.reshape(np.array(bounds, dtype=float), (-1, 2)).T
     return flattest, steepest

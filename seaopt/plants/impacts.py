@@ -32,16 +32,15 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import PlantError, suggestion
-from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import Plant, evaluate, output_function
+from seaopt.plants.plant import CompletedParameters, Plant, evaluate, output_function
 from seaopt.plants.roles import Port
 
 State = Float[np.ndarray, " n"]
 HeldState = Float[np.ndarray, " m"]
 
 
-def strike(plant: Plant, params: ParameterSet, state: State, output: str, impulse: float) -> State:
+def strike(plant: Plant, params: CompletedParameters, state: State, output: str, impulse: float) -> State:
     """Return the state after a blow along an output, a position such as x_2.
 
     Parameters
@@ -68,19 +67,19 @@ def strike(plant: Plant, params: ParameterSet, state: State, output: str, impuls
     --------
     >>> import numpy as np, seaopt as so
     >>> plant = so.plants.two_link("fixed", "mass")
-    >>> after = strike(plant, plant.defaults, np.zeros(4), "x_2", 1.0)
+    >>> after = strike(plant, plant.complete(plant.defaults), np.zeros(4), "x_2", 1.0)
     >>> round(float(after[3]), 5)  # 10 kg and the 0.646 kg that go along, next to nothing of the screw
     0.09394
 
     """
-    inertia, slope = (np.array(block) for block in _inertia(plant, output)(state, plant.parameter_values(params)))
+    inertia, slope = (np.array(block) for block in _inertia(plant, output)(state, params.vector))
     after = state.copy()
     rates = _pairs(plant)[1]
     after[rates] += np.linalg.solve(inertia, slope.ravel() * impulse)
     return after
 
 
-def catch(plant: Plant, params: ParameterSet, state: State, port: Port) -> tuple[HeldState, float, float]:
+def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -> tuple[HeldState, float, float]:
     """Return the state of the plant with a port held after its link is stopped where it is.
 
     Parameters
@@ -108,7 +107,7 @@ def catch(plant: Plant, params: ParameterSet, state: State, port: Port) -> tuple
 
     """
     motion, coordinate, rate = _moving(plant, port)
-    inertia = np.array(_inertia(plant, motion)(state, plant.parameter_values(params))[0])
+    inertia = np.array(_inertia(plant, motion)(state, params.vector)[0])
     places, rates = _pairs(plant)
     names = list(plant.states)
     link = places.index(names.index(coordinate))
@@ -125,7 +124,7 @@ def catch(plant: Plant, params: ParameterSet, state: State, port: Port) -> tuple
     return moved[[k for k, name in enumerate(names) if name not in (coordinate, rate)]], impulse, loss
 
 
-def release(plant: Plant, params: ParameterSet, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
+def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
     """Return the state of a plant after the link at a port is let go at the position `link`, as the reverse of `catch`.
 
     Parameters
@@ -156,11 +155,11 @@ def release(plant: Plant, params: ParameterSet, port: Port, held: HeldState, lin
     return after - offset(plant, params, after, port)
 
 
-def offset(plant: Plant, params: ParameterSet, state: State, port: Port) -> State:
+def offset(plant: Plant, params: CompletedParameters, state: State, port: Port) -> State:
     """Return what a plant's state has to move by for its spring to stay as it is when the port goes to zero."""
     out = np.zeros(len(plant.states))
     if port.motion is not None and port.drive is not None:
-        ratio = evaluate(plant, port.ratio, params)
+        ratio = evaluate(port.ratio, params)
         out[list(plant.states).index(port.drive)] = ratio * position(plant, params, state, port.motion)
     return out
 
@@ -215,7 +214,7 @@ def _inertia(plant: Plant, output: str) -> Any:
     return ca.Function("inertia", [plant.x, plant.p], results)
 
 
-def position(plant: Plant, params: ParameterSet, state: State, output: str) -> float:
+def position(plant: Plant, params: CompletedParameters, state: State, output: str) -> float:
     """Return an output of a state without inputs."""
-    values = output_function(plant)(0.0, state, np.zeros(len(plant.inputs)), plant.parameter_values(params))
+    values = output_function(plant)(0.0, state, np.zeros(len(plant.inputs)), params.vector)
     return float(np.array(values).ravel()[list(plant.outputs).index(output)])

@@ -8,10 +8,10 @@ mapping from state (output) names to expressions. They are called once, when the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, final
 
 import casadi as ca
 import numpy as np
@@ -151,12 +151,10 @@ class Plant:
         item = self.parameters[name]
         return item.unit if isinstance(item, Parameter) else item
 
-    def parameter_values(self, params: ParameterSet) -> list[float]:
-        """Return the parameter vector p in the plant's units, as `complete` does."""
-        return [item.value for item in self.complete(params).values()]
-
-    def complete(self, params: ParameterSet) -> ParameterSet:
+    def complete(self, params: ParameterSet) -> CompletedParameters:
         """Return the plant's own parameters in its units and order: from `params`, else the defaults.
+
+        Public functions do this once; what is complete for this plant is returned as it is.
 
         Raises
         ------
@@ -166,18 +164,21 @@ class Plant:
             A value's unit has another dimension than the plant's.
 
         """
-        defaults = self.defaults
-        items: list[Parameter] = []
-        for name in self.parameters:
+        if isinstance(params, CompletedParameters):
+            if params.plant is self:
+                return params
+            params = params.given
+        completed: list[Parameter] = []
+        for name, default in self.parameters.items():
             unit = self.parameter_unit(name)
             if name in params:
-                items.append(_in_unit(params[name], unit, self.name))
-            elif name in defaults:
-                items.append(defaults[name])
+                completed.append(_in_unit(params[name], unit, self.name))
+            elif isinstance(default, Parameter):
+                completed.append(default)
             else:
                 what = f"one in{unit_after(unit)}" if unit_after(unit) else "one"
                 raise ParameterError(f'parameter "{name}" of plant {self.name} has no value; give {what}')
-        return ParameterSet(items)
+        return CompletedParameters(self, params, completed)
 
     def derived_values(self) -> dict[str, tuple[Any, str]]:
         """Return the derived figures as {name: (expression of p, unit)}; empty where none are declared."""
@@ -249,16 +250,49 @@ class Plant:
     _repr_html_ = html_text
 
 
-def evaluate(plant: Plant, expression: Expression, params: ParameterSet) -> float:
+@final
+class CompletedParameters(ParameterSet):
+    """A plant's own parameters, all of them, in its units and order, as `Plant.complete` makes them.
+
+    A function that takes these relies on its caller for completion. A change gives a plain `ParameterSet`, which is to
+    be completed again.
+
+    Attributes
+    ----------
+    plant : Plant
+        Whose parameters they are.
+    given : ParameterSet
+        What was completed; it may hold conditions and other plants' parameters too.
+    vector : array, shape (np,)
+        The values.
+
+    """
+
+    __slots__ = ("given", "plant", "vector")
+
+    def __init__(self, plant: Plant, given: ParameterSet, parameters: Iterable[Parameter]) -> None:
+        super().__init__(parameters)
+        self.plant, self.given = plant, given
+        self.vector: Float[np.ndarray, " np"] = np.array([parameter.value for parameter in self.values()], dtype=float)
+
+    def drop_conditions(self) -> CompletedParameters:
+        """Return the same parameters, and nothing else as given."""
+        return self.plant.complete(ParameterSet(self.values()))
+
+    @property
+    def by_attribute(self) -> SimpleNamespace:
+        """The values as attributes, for a role's expression."""
+        return SimpleNamespace(**{name: parameter.value for name, parameter in self.items()})
+
+
+def evaluate(expression: Expression, params: CompletedParameters) -> float:
     """Return the value of a role's expression of the parameters."""
-    values = plant.complete(params)
-    return float(expression(SimpleNamespace(**{name: parameter.value for name, parameter in values.items()})))
+    return float(expression(params.by_attribute))
 
 
-def dry_friction_effort(plant: Plant, params: ParameterSet) -> float:
+def dry_friction_effort(plant: Plant, params: CompletedParameters) -> float:
     """Return the effort at the spring that dry friction takes when everything slides fast."""
-    values = plant.complete(params)
-    p = SimpleNamespace(**{name: parameter.value for name, parameter in values.items()})
+    p = params.by_attribute
     return sum(
         abs(float(friction.effort(p)) * float(friction.force(SLIDING, p))) for friction in plant.friction.values()
     )
@@ -301,10 +335,10 @@ def _deflection_slope(plant: Plant) -> Any:
     return ca.Function("deflection", [plant.x, plant.p], [ca.densify(slope)])
 
 
-def deflection_row(plant: Plant, params: ParameterSet) -> Float[np.ndarray, " nx"]:
+def deflection_row(plant: Plant, params: CompletedParameters) -> Float[np.ndarray, " nx"]:
     """Return the spring's deflection as a row of weights of the states, at zero."""
     zero = np.zeros(len(plant.states))
-    return np.array(_deflection_slope(plant)(zero, plant.parameter_values(params))).ravel()
+    return np.array(_deflection_slope(plant)(zero, params.vector)).ravel()
 
 
 def state_space(
@@ -314,7 +348,7 @@ def state_space(
     u: Mapping[str, float] | None = None,
 ) -> Matrices:
     """Return (A, B, C, D) of a plant at an operating point, as `Plant.linearize` but plain arrays."""
-    at = (fill_vector("state", plant.states, x), fill_vector("input", plant.inputs, u), plant.parameter_values(params))
+    at = (fill_vector("state", plant.states, x), fill_vector("input", plant.inputs, u), plant.complete(params).vector)
     a, b, c, d = (np.array(block) for block in jacobians(plant)(*at))
     return a, b, c, d
 

@@ -125,7 +125,7 @@ class Problem:
         out: dict[str, tuple[Plant, ParameterSet]] = {}
         for name in self.table.controller.robust_to if self.table.controller else []:
             plant = self.plants[name]
-            values = plant.complete(parameters)
+            values = plant.complete(parameters).drop_conditions()
             out[name] = (plant, values)
             for parameter, ends in self.ranges.items():
                 for end in ends:

@@ -113,7 +113,7 @@ def make_model(plant: Plant, params: ParameterSet, free: tuple[str, ...] = (), o
     for name in chosen:
         if name not in plant.outputs:
             raise PlantError(f'plant {plant.name} has no output "{name}"; {suggestion(name, plant.outputs)}')
-    values = dict(zip(plant.parameters, plant.parameter_values(params), strict=True))
+    values = {name: parameter.value for name, parameter in plant.complete(params).items()}
     names = tuple(name for name in free if name in values)
     zero = tuple(name for name in values if name not in names and values[name] == 0.0)
     model = _structure(plant, names, chosen, zero)

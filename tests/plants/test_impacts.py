@@ -24,7 +24,7 @@ KNOWN = [("stribeck", "backlash", "spring_damping", "screw_mode"), ("hardening",
 
 def energy_of(plant, params):
     stored = ca.Function("e", [plant.x, plant.p], [plant.stored_energy()])
-    return lambda x: float(stored(x, plant.parameter_values(params)))
+    return lambda x: float(stored(x, plant.complete(params).vector))
 
 
 @pytest.mark.parametrize("drive", ["unlumped", "lumped"])
@@ -47,7 +47,7 @@ def test_rotary_energy_changes_by_what_goes_in_and_out():
     x, current = np.array([0.3, 2.0, -0.01, 1.0]), 1.5
     f = ca.Function("f", [plant.x, plant.u, plant.p], [plant.dynamics])
     gradient = ca.Function("g", [plant.x, plant.p], [ca.gradient(plant.stored_energy(), plant.x)])
-    values = plant.parameter_values(params)
+    values = plant.complete(params).vector
     change = float(np.array(gradient(x, values)).ravel() @ np.array(f(x, current, values)).ravel())
     twist = x[1] / p["N"] - x[3]
     expected = p["K_tau"] * current * x[1] - p["b_r"] * x[1] ** 2 - p["d_l"] * x[3] ** 2 - p["c_s"] * twist**2
@@ -62,7 +62,7 @@ def test_play_and_hardening_together_declare_no_energy():
 
 def braked(plant, params, x, force, seconds):
     """Integrate with a short external force on link 2, a function of its speed."""
-    p = plant.parameter_values(params)
+    p = plant.complete(params).vector
     f = ca.Function("f", [plant.x, plant.u, plant.p], [plant.dynamics])
     names = list(plant.states)
 
@@ -89,7 +89,7 @@ def moving(link2):
 @pytest.mark.parametrize("spring", ["link1", "link2"])
 def test_a_blow_is_a_strong_short_force(link2, drive, spring):
     plant = so.plants.two_link("fixed", link2, drive=drive, spring=spring)
-    params = plant.defaults
+    params = plant.complete(plant.defaults)
     x = moving(link2)
     after = strike(plant, params, x, "x_2", 0.7)
     np.testing.assert_allclose(after, braked(plant, params, x, lambda v: 0.7e7, 1e-7), rtol=1e-4, atol=1e-6)
@@ -100,7 +100,7 @@ def test_a_blow_is_a_strong_short_force(link2, drive, spring):
 @pytest.mark.parametrize("spring", ["link1", "link2"])
 def test_a_catch_is_a_stiff_brake(link2, drive, spring):
     plant = so.plants.two_link("fixed", link2, drive=drive, spring=spring)
-    params = plant.defaults
+    params = plant.complete(plant.defaults)
     x = moving(link2)
     slow = braked(plant, params, x, lambda v: -1e9 * v, 2e-6)
     assert abs(slow[3]) < 1e-4
@@ -113,7 +113,7 @@ def test_a_catch_is_a_stiff_brake(link2, drive, spring):
 def test_the_unlumped_catch_by_hand(swing, thor):
     """The sprung mass's momentum goes into m_l + M; the torque impulse stops I_p and what m_l loses."""
     x = np.array([2e-4, 0.03, 0.3, 2.0])
-    state, impulse, _ = catch(swing, thor, x, swing.port)
+    state, impulse, _ = catch(swing, swing.complete(thor), x, swing.port)
     big = thor["J"].value / (0.002 / (6 * np.pi)) ** 2
     speed = 0.0725 * np.cos(0.3) * 2.0
     after = 0.03 + 0.646 / (big + 0.646) * speed
@@ -125,10 +125,10 @@ def test_the_unlumped_catch_by_hand(swing, thor):
 
 def test_letting_go_keeps_the_spring(swing, thor):
     held = np.array([1.5e-4, 0.01])
-    x = release(swing, thor, swing.port, held, {"phi": -0.7})
+    x = release(swing, swing.complete(thor), swing.port, held, {"phi": -0.7})
     assert x[0] + 0.0725 * np.sin(-0.7) == pytest.approx(1.5e-4)
     assert (x[1], x[2], x[3]) == (0.01, -0.7, 0.0)
-    again, impulse, loss = catch(swing, thor, x, swing.port)
+    again, impulse, loss = catch(swing, swing.complete(thor), x, swing.port)
     np.testing.assert_allclose(again, held)
     assert abs(impulse) < 1e-3  # what m_l moves with q is taken along
     assert loss == pytest.approx(0.0, abs=1e-12)
@@ -146,7 +146,7 @@ def test_the_port_makes_the_same_actuator_with_its_link_fixed(link2, drive, spri
     x, u = 1e-3 * np.random.default_rng(4).normal(size=len(held.states)), [0.7, 0.0, 0.0]
     for plant_of in ("dynamics", "output"):
         values = [
-            ca.Function("f", [item.x, item.u, item.p], [getattr(item, plant_of)])(x, u, item.parameter_values(params))
+            ca.Function("f", [item.x, item.u, item.p], [getattr(item, plant_of)])(x, u, item.complete(params).vector)
             for item in (held, fixed)
         ]
         np.testing.assert_array_equal(*(np.array(item) for item in values))
@@ -162,10 +162,10 @@ def test_a_held_plant_has_the_states_that_are_left(stand, swing):
 
 def test_bad_blows_and_releases(stand, swing, thor):
     with pytest.raises(PlantError, match="x_3"):
-        strike(swing, thor, np.zeros(4), "x_3", 1.0)
+        strike(swing, swing.complete(thor), np.zeros(4), "x_3", 1.0)
     with pytest.raises(PlantError, match="depends on more than positions"):
-        strike(swing, thor, np.zeros(4), "F2", 1.0)
+        strike(swing, swing.complete(thor), np.zeros(4), "F2", 1.0)
     with pytest.raises(PlantError, match="theta"):
-        release(swing, thor, swing.port, np.zeros(2), {"theta": 0.1})
+        release(swing, swing.complete(thor), swing.port, np.zeros(2), {"theta": 0.1})
     with pytest.raises(PlantError, match="does not move"):
-        catch(stand, thor, np.zeros(2), stand.port)
+        catch(stand, stand.complete(thor), np.zeros(2), stand.port)

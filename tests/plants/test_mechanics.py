@@ -34,7 +34,7 @@ def values_of(plant):
 
 def numbers(plant, params):
     """Return f and h as NumPy functions of (x, u)."""
-    p = plant.parameter_values(params)
+    p = plant.complete(params).vector
     f = ca.Function("f", [plant.x, plant.u, plant.p], [plant.dynamics])
     h = ca.Function("h", [plant.x, plant.u, plant.p], [plant.output])
     return (lambda x, u: np.array(f(x, u, p)).ravel()), (lambda x, u: np.array(h(x, u, p)).ravel())
@@ -219,7 +219,7 @@ def test_rotary_energy_and_frequencies():
     params = plant.defaults.update(b_r=0.0)
     poles = plant.linearize(params).poles()
     figures = ca.Function("d", [plant.p], [v for v, _ in plant.derived_values().values()])(
-        plant.parameter_values(params)
+        plant.complete(params).vector
     )
     antiresonance, resonance = (float(v) for v in figures)
     assert np.max(np.abs(poles.imag)) / 2 / np.pi == pytest.approx(resonance, rel=1e-9)

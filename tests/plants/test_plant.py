@@ -87,3 +87,17 @@ def test_units_of_values_are_converted_or_refused(stand, thor):
 def test_a_misspelt_symbol_is_named():
     with pytest.raises(PlantError, match='f uses "mass"; known: m, c'):
         build(f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.mass})
+
+
+def test_parameters_are_completed_once():
+    """Completing again changes nothing; another plant sees what was given; a change has to be completed again."""
+    stand, swing = so.plants.high_impedance(), so.plants.moving_output()
+    late = so.Parameter(name="delay_s", value=0.2, unit="ms")
+    given = so.plants.thor().with_parameters(so.Parameter(name="l", value=2.0, unit="mm"), late)
+    values = stand.complete(given)
+    assert stand.complete(values) is values
+    assert list(values) == list(stand.parameters)
+    assert values.vector[list(values).index("l")] == pytest.approx(2e-3)
+    assert swing.complete(values).given is given
+    assert "delay_s" not in values.drop_conditions().given
+    assert not isinstance(values.update(J=1e-6), type(values))

@@ -25,7 +25,7 @@ RATE = 400.0
 def reference(plant, params, u, x0, hold):
     """Integrate sample by sample with DOP853, so that the hold's corners fall on step ends."""
     u = np.hstack([u, np.zeros((len(u), len(plant.inputs) - u.shape[1]))])
-    p = plant.parameter_values(params)
+    p = plant.complete(params).vector
     f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
     h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
     x, out = np.array(x0, float), []

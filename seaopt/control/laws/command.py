@@ -65,8 +65,9 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
 
     """
     source, unit = next(iter(plant.inputs.items()))
+    values = plant.complete(params)
     if plant.actuation is not None:
-        effort, effort_unit = evaluate(plant, plant.actuation.effort, params), plant.actuation.unit
+        effort, effort_unit = evaluate(plant.actuation.effort, values), plant.actuation.unit
         if not 0.0 < effort < math.inf:
             raise ControlError(
                 f"plant {plant.name}: one {unit} of {source} makes an effort of {effort:g} {effort_unit}, which must "
@@ -75,7 +76,7 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     else:
         known = plant.sensing.regulated if plant.sensing is not None else ()
         output = measured if measured in known or not known else known[0]
-        effort, effort_unit = abs(static_gain(plant, params, output)), plant.outputs[output]
+        effort, effort_unit = abs(static_gain(plant, values, output)), plant.outputs[output]
         if not (np.isfinite(effort) and effort > 1e-12):
             raise ControlError(
                 f"plant {plant.name} states no actuation, and its static gain from {source} to {output} is "

@@ -40,18 +40,18 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
     True
 
     """
-    if not has_friction(plant, params):
+    values = plant.complete(params)
+    if not has_friction(plant, values):
         return None
     sliding = friction_states(plant)[SLIDING]
-    flattest, steepest = friction_slopes(plant, params)
+    flattest, steepest = friction_slopes(plant, values)
     measured, gain = controller.spec.measured, controller.command.per_effort
-    conditions = conditions_of(plant, params)
+    conditions = conditions_of(plant, values)
     at = {name: np.array([value]) for name, value in conditions.items()}
-    values = np.array(plant.parameter_values(params))
-    a, motor, output, _ = (block[0] for block in linearised(sliding, values[:, None], at, measured, gain))
-    x, u = resting(plant, params)
-    on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, values))
-    sampled = sample(sliding, params, measured, gain, controller.sample_time_s, controller.delay_samples)
+    a, motor, output, _ = (block[0] for block in linearised(sliding, values.vector[:, None], at, measured, gain))
+    x, u = resting(plant, values)
+    on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, values.vector))
+    sampled = sample(sliding, values, measured, gain, controller.sample_time_s, controller.delay_samples)
     loop = Loop(plant=sampled, reference=controller.reference, measurement=controller.measurement)
     if np.max(np.abs(loop.eigenvalues())) >= STABLE:
         zeros = (0.0,) * flattest.size

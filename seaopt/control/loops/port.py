@@ -143,11 +143,12 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
 
     """
     probe = probe_of(plant)
+    values = probe.complete(params)
     if measured not in probe.outputs:
         raise ControlError(
             f'measured = "{measured}" is not an output of {probe.name}; {suggestion(measured, probe.outputs)}'
         )
-    a, b, c, d = state_space(probe, params)
+    a, b, c, d = state_space(probe, values)
     port = bare_port(probe)
     external, row = list(probe.inputs).index(port.effort), list(probe.outputs).index(measured)
     return PortModel(
@@ -156,7 +157,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
         force=b[:, external].copy(),
         feedback=np.concatenate([c[row], [per_effort * d[row, 0], d[row, external]]]),
         speed=list(probe.states).index(port.rate),
-        mass=probe.complete(params)[port.inertia].value,
+        mass=values[port.inertia].value,
         delay_s=conditions_of(plant, params).get(DELAY, 0.0),
     )
 

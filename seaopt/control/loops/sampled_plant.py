@@ -23,7 +23,7 @@ from jaxtyping import Complex, Float, Inexact
 
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant, jacobians
+from seaopt.plants import CompletedParameters, Plant, jacobians
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import dynamics_function
 from seaopt.records import record
@@ -121,17 +121,17 @@ def sample(
         The plant has no such output, or cannot rest where it is to be linearised.
 
     """
-    values = np.array(plant.parameter_values(params))[:, None]
-    given = {name: np.array([value]) for name, value in conditions_of(plant, params).items()}
-    a, b, c, d = linearised(plant, values, given, measured, gain)
-    held = hold(a, b, c, d, sample_time_s, given.get(DELAY, np.zeros(1)))
+    values = plant.complete(params)
+    at = {name: np.array([value]) for name, value in conditions_of(plant, values).items()}
+    a, b, c, d = linearised(plant, values.vector[:, None], at, measured, gain)
+    held = hold(a, b, c, d, sample_time_s, at.get(DELAY, np.zeros(1)))
     return DigitalPlant(
         a=held[0][0], b=held[1][0], c=held[2][0], d=float(held[3][0]), sample_time_s=sample_time_s,
         delay_samples=delay_samples, static_gain=_static(a[0], b[0], c[0], float(d[0])),
     )  # fmt: skip
 
 
-def static_gain(plant: Plant, params: ParameterSet, output: str) -> float:
+def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:
     """Return an output of a constant unit of the first input, linearised at rest; infinite where it integrates.
 
     Raises
@@ -140,9 +140,8 @@ def static_gain(plant: Plant, params: ParameterSet, output: str) -> float:
         The plant has no such output, or cannot rest where it is to be linearised.
 
     """
-    values = np.array(plant.parameter_values(params))[:, None]
     at = {name: np.array([value]) for name, value in conditions_of(plant, params).items()}
-    a, b, c, d = linearised(plant, values, at, output, 1.0)
+    a, b, c, d = linearised(plant, params.vector[:, None], at, output, 1.0)
     return _static(a[0], b[0], c[0], float(d[0]))
 
 
@@ -170,6 +169,8 @@ def conditions_of(plant: Plant, params: ParameterSet) -> dict[str, float]:
     {'delay_s': 0.0002}
 
     """
+    if isinstance(params, CompletedParameters):
+        params = params.given
     found: dict[str, float] = {}
     for name, item in conditions((plant,)).items():
         if name not in params:
@@ -203,7 +204,7 @@ def linearised(
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
 
-def resting(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
+def resting(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
     """Return states and inputs at rest where the conditions among `params` are; zeros without any.
 
     Raises
@@ -215,14 +216,15 @@ def resting(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " nx"
     --------
     >>> import math, seaopt as so
     >>> swing, thor = so.plants.moving_output(), so.plants.thor()
-    >>> x, u = resting(swing, thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad")))
+    >>> raised = thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad"))
+    >>> x, u = resting(swing, swing.complete(raised))
     >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
     >>> print(f"{force:.2f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.2f} N")
     -88.70 N, -88.70 N
 
     """
     at = {name: np.array([value]) for name, value in conditions_of(plant, params).items() if name != DELAY}
-    x, u = _rest(plant, np.array(plant.parameter_values(params))[:, None], at)
+    x, u = _rest(plant, params.vector[:, None], at)
     return x[:, 0], u[:, 0]
 
 

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.mpc.noise import NoiseModel
-from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.plant import deflection_row
 
 
@@ -33,7 +32,7 @@ def augment(
 
 
 def list_estimates(
-    plant: Plant, params: ParameterSet, matrices: tuple[Any, Any, Any, Any],
+    plant: Plant, params: CompletedParameters, matrices: tuple[Any, Any, Any, Any],
     disturbances: list[tuple[int, float, float]],
 ) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:  # fmt: skip
     """Return names, units, G and H of everything that is estimated."""

@@ -30,7 +30,7 @@ from seaopt.estimation.problem.correlation import autocorrelation, ljung_box
 from seaopt.formatting import format_count, format_table, html_text
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, state_space
+from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.plant import dry_friction_effort
 from seaopt.records import record
 from seaopt.simulation.discretisation import expm_with_derivatives
@@ -291,7 +291,7 @@ def estimator(
     (True, 'm/s')
 
     """
-    values = params.parameters if isinstance(params, Fit) else params
+    values = plant.complete(params.parameters if isinstance(params, Fit) else params)
     chosen = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     _check(plant, values, noise, chosen, sample_time_s, delay_samples)
     a, b, c, d = state_space(plant, values)
@@ -318,8 +318,9 @@ def estimator(
 
 
 def _check(
-    plant: Plant, params: ParameterSet, noise: NoiseModel, outputs: tuple[str, ...], sample_time_s: float, delay: int
-) -> None:
+    plant: Plant, params: CompletedParameters, noise: NoiseModel, outputs: tuple[str, ...], sample_time_s: float,
+    delay: int,
+) -> None:  # fmt: skip
     for name in outputs:
         if name not in plant.outputs:
             raise ControlError(f'output "{name}" is not one of {plant.name}; {suggestion(name, plant.outputs)}')

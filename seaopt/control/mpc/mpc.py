@@ -36,7 +36,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, html_text
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, state_space
+from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.records import record
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
@@ -317,11 +317,12 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
 
     """
     values = params.parameters if isinstance(params, Fit) else params
+    completed = plant.complete(values)
     if spec.measured not in plant.outputs:
         raise ControlError(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
         )
-    digital = sample(plant, values, spec.measured, 1.0, spec.sample_time_s, 0)
+    digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
     gain = _static_gain(plant, digital, spec)
     noise = spec.noise or NoiseModel(
         sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={_drive(plant): 1.0},
@@ -332,11 +333,11 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
             f"noise: input_drift must be of {_drive(plant)} alone and above zero, for it takes the force's offset away"
         )
     kalman = estimator(
-        plant, values, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
+        plant, completed, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
         delay_samples=spec.delay_samples,
     )  # fmt: skip
     a, b, c = digital.a, digital.b, digital.c
-    weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, values, spec.measured)
+    weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, completed, spec.measured)
     regulator = tune_regulator(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
     prediction = condense(a, b, weighted, gain, regulator, knots, spec.current_limit_A, spec.slew_per_sample_A)
@@ -347,7 +348,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     )  # fmt: skip
 
 
-def _rate(plant: Plant, params: ParameterSet, measured: str) -> Float[np.ndarray, " nx"]:
+def _rate(plant: Plant, params: CompletedParameters, measured: str) -> Float[np.ndarray, " nx"]:
     """Return the row that gives the measured output's time derivative, without the current's own part."""
     a, _, c, _ = state_space(plant, params)
     return c[list(plant.outputs).index(measured)] @ a

@@ -36,7 +36,7 @@ from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kerne
 from seaopt.control.running.sampled_loop import ENERGY, LoopState, SampledLoop, at_rest, whole_samples
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant, state_space
+from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.records import record
 
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
@@ -160,7 +160,7 @@ def run_loop(
     """
     if not params:
         raise SimulationError("run_loop got no parameters; give one ParameterSet per run")
-    runs = len(params)
+    runs, values = len(params), [loop.plant.complete(each) for each in params]
     wanted = np.atleast_2d(reference).astype(float)
     if wanted.ndim != 2 or wanted.shape[0] not in (1, runs) or not wanted.shape[1]:
         raise SimulationError(f"reference has the shape {reference.shape}; give (n,) or ({runs}, n)")
@@ -169,14 +169,14 @@ def run_loop(
         reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
         noise=_noise(loop, runs, n, seed),
         external=_external(loop.plant, external or {}, n),
-        p=np.array([loop.plant.parameter_values(values) for values in params]).reshape(runs, -1),
-        **_lags(loop, params),
+        p=np.array([each.vector for each in values]).reshape(runs, -1),
+        **_lags(loop, values),
         start=start if start is not None else at_rest(loop, runs),
         start_s=start_s,
     )
     if job.start.x.shape != (runs, len(loop.plant.states)):
         raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state per run")
-    substeps, before, wall_s = _first_guess(loop, params, rtol), None, 0.0
+    substeps, before, wall_s = _first_guess(loop, values, rtol), None, 0.0
     execute = make_kernel(loop)
     while True:
         begin = time.perf_counter()
@@ -261,7 +261,7 @@ def _external(plant: Plant, signals: Mapping[str, Float[np.ndarray, " n"]], n: i
     return np.ascontiguousarray(np.column_stack(columns) if columns else np.zeros((n, 0)), dtype=float)
 
 
-def _lags(loop: SampledLoop, params: Sequence[ParameterSet]) -> dict[str, Any]:
+def _lags(loop: SampledLoop, params: Sequence[CompletedParameters]) -> dict[str, Any]:
     """Return which commands are in force in each run, and from when; `lag` and `late_s` of a job."""
     queue = loop.waiting
     lag, late_s = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
@@ -278,7 +278,7 @@ def _lags(loop: SampledLoop, params: Sequence[ParameterSet]) -> dict[str, Any]:
     return {"lag": lag.reshape(len(params), -1), "late_s": late_s}
 
 
-def _first_guess(loop: SampledLoop, params: Sequence[ParameterSet], rtol: float) -> int:
+def _first_guess(loop: SampledLoop, params: Sequence[CompletedParameters], rtol: float) -> int:
     """Return half the steps that a mode of the first plant, at rest, needs: n (|s| T/n)^5 / 120 = rtol for the 2n."""
     fastest = float(np.max(np.abs(np.linalg.eigvals(state_space(loop.plant, params[0])[0])), initial=0.0))
     steps = ((fastest * loop.law.sample_time_s) ** 5 / (120.0 * rtol)) ** 0.25

@@ -18,8 +18,7 @@ from seaopt.control.laws.realisation import RunnableLaw
 from seaopt.control.loops.sampled_plant import resting
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
-from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
 
@@ -50,15 +49,15 @@ class Equilibrium:
         return "Equilibrium at " + ", ".join(f"{force:.4g} N, {current:.4g} A" for force, current in rows)
 
 
-def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibrium:
+def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
     """Return where a loop rests at the conditions among each run's parameters; at zero without any.
 
     Parameters
     ----------
     loop : SampledLoop
         Plant and law; the current's limit is not looked at.
-    params : sequence of ParameterSet
-        One per run, with a state of the plant (phi) among them where it is to rest elsewhere.
+    params : sequence of CompletedParameters
+        One per run, given with a state of the plant (phi) where it is to rest elsewhere.
 
     Raises
     ------
@@ -73,7 +72,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibriu
     >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     >>> loop = SampledLoop(plant=swing, law=runnable(controller), measured="F1", delay_samples=1)
     >>> raised = thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad"))
-    >>> equilibrium(loop, [raised])
+    >>> equilibrium(loop, [swing.complete(raised)])
     Equilibrium at -88.7 N, -0.3691 A
 
     """
@@ -85,7 +84,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[ParameterSet]) -> Equilibriu
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
         if not (np.any(x) or np.any(u)):
             continue
-        y = np.array(observe(x, u, plant.parameter_values(values))).ravel()
+        y = np.array(observe(x, u, values.vector)).ravel()
         force = float(y[names.index(loop.measured)])
         inner, reference = _law_at_rest(law, force, float(u[0]))
         z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])

@@ -23,7 +23,7 @@ from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import whole_samples
 from seaopt.errors import ControlError, SimulationError, suggestion
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import output_function
 from seaopt.records import record
@@ -138,9 +138,10 @@ def close_loop(
         No number of steps reaches `rtol`.
 
     """
-    extra_delay_s = _check(plant, params, measured, delay_samples)
+    values = plant.complete(params)
+    extra_delay_s = _check(plant, values, measured, delay_samples)
     whole, rest_s = whole_samples(extra_delay_s, sample_time_s)
-    newer, n, p = delay_samples + whole, reference.size, ca.DM(plant.parameter_values(params))
+    newer, n, p = delay_samples + whole, reference.size, ca.DM(values.vector)
     output, integrator = output_function(plant), _Integrator(plant=plant, rtol=rtol)
     row, others = list(plant.outputs).index(measured), [0.0] * (len(plant.inputs) - 1)
     noise = sensor_std * np.random.default_rng(seed).normal(size=n)
@@ -167,7 +168,7 @@ def close_loop(
     )  # fmt: skip
 
 
-def _check(plant: Plant, params: ParameterSet, measured: str, delay_samples: int) -> float:
+def _check(plant: Plant, params: CompletedParameters, measured: str, delay_samples: int) -> float:
     """Return the delay besides the whole samples, s, of arguments that fit together."""
     if measured not in plant.outputs:
         raise ControlError(

@@ -39,7 +39,7 @@ from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNu
 from seaopt.control.tuning.starts import find_starts
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import split_friction
 from seaopt.plants.plant import dry_friction_effort
 
@@ -94,10 +94,11 @@ def tune(
     (True, 30)
 
     """
-    task = make_task(plant, params, spec, robust_to or {}, draws)
+    values = plant.complete(params)
+    task = make_task(plant, values, spec, robust_to or {}, draws)
     check_delay(spec, task.plants[0])
-    command = command_of(plant, params, spec.measured)
-    check_current(spec, task.k_ff, command.per_effort, dry_friction_effort(plant, params))
+    command = command_of(plant, values, spec.measured)
+    check_current(spec, task.k_ff, command.per_effort, dry_friction_effort(plant, values))
     x, loops = solve(task)
     largest = None
     if list_broken(judge_all(spec, loops, task.design_states)):
@@ -120,22 +121,23 @@ def make_task(
         As `tune`.
 
     """
-    gain = command_of(plant, params, spec.measured).per_effort
+    values = plant.complete(params)
+    gain = command_of(plant, values, spec.measured).per_effort
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
-    named = {"design plant": (plant, params)}
-    named |= {str(name): p if isinstance(p, tuple) else (p, params) for name, p in robust_to.items()}
-    varied = {parameter for values in draws for parameter in values}
-    models: dict[str, tuple[Plant, ParameterSet]] = {}
-    for name, (model, values) in named.items():
-        models |= {one: (variant, values) for one, variant in split_friction({name: model}, values, varied).items()}
-    names, pairs = [*models], [*models.values()]
-    design_states = 1 if pairs[0][0] is plant else 2
-    for name, pair in _draw_plants(models, draws):
-        names.append(name)
-        pairs.append(pair)
+    named = {"design plant": (plant, values)}
+    named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in robust_to.items()}
+    varied = {parameter for draw in draws for parameter in draw}
+    models: dict[str, tuple[Plant, CompletedParameters]] = {}
+    for name, (model, given) in named.items():
+        completed = model.complete(given)
+        variants = split_friction({name: model}, completed, varied)
+        models |= {one: (variant, variant.complete(completed)) for one, variant in variants.items()}
+    pairs = [*models.items(), *_draw_plants(models, draws)]
+    design_plant = pairs[0][1][0]
     plants = tuple(
-        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.delay_samples) for model, values in pairs
+        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.delay_samples)
+        for _, (model, values) in pairs
     )
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
@@ -143,36 +145,36 @@ def make_task(
             f"measured = {spec.measured}: the static gain of {plant.name} from motor force is {static:g}, which "
             "feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
+    names = tuple(name for name, _ in pairs)
     for name, sampled in zip(names, plants, strict=True):
         if np.max(np.abs(np.linalg.eigvals(sampled.a))) > GROWING:
             raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
-    port = None if spec.passive_band_hz is None else port_of(pairs[0][0], params, spec.measured, gain)
+    port = None if spec.passive_band_hz is None else port_of(design_plant, values, spec.measured, gain)
     return Task(
-        spec=spec, plants=plants, names=tuple(names), k_ff=1.0 / static, nominal=nominal, port=port,
-        design_states=design_states,
+        spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
+        design_states=1 if design_plant is plant else 2,
     )  # fmt: skip
 
 
 def _draw_plants(
-    models: Mapping[str, tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]]
-) -> list[tuple[str, tuple[Plant, ParameterSet]]]:
+    models: Mapping[str, tuple[Plant, CompletedParameters]], draws: Sequence[Mapping[str, float]]
+) -> list[tuple[str, tuple[Plant, CompletedParameters]]]:
     """Return every plant at every draw, under a name; a draw that changes nothing of a plant is left out."""
-    whole = {name: (model, model.complete(values)) for name, (model, values) in models.items()}
-    known = {name for model, _ in whole.values() for name in model.parameters}
-    out: list[tuple[str, tuple[Plant, ParameterSet]]] = []
+    known = {name for model, _ in models.values() for name in model.parameters}
+    out: list[tuple[str, tuple[Plant, CompletedParameters]]] = []
     for number, values in enumerate(draws, start=1):
         for parameter in values:
             if parameter not in known:
                 raise ControlError(f'draws name "{parameter}", which no plant has; {suggestion(parameter, known)}')
-        for name, (model, nominal) in whole.items():
+        for name, (model, nominal) in models.items():
             used = {key: float(value) for key, value in values.items() if key in model.parameters}
             if not used:
                 continue
             label = (
                 ", ".join(f"{key} = {value:.4g}" for key, value in used.items()) if len(used) < 3 else f"draw {number}"
             )
-            out.append((f"{name}, {label}", (model, nominal.update(**used))))
+            out.append((f"{name}, {label}", (model, model.complete(nominal.update(**used)))))
     return out
 
 

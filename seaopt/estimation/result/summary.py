@@ -257,7 +257,7 @@ def _derive_figures(
     for experiment in experiments:
         plant = experiment.plant
         function, units = _compile_figures(plant)
-        values, slopes = (np.array(array) for array in function(plant.parameter_values(fitted)))
+        values, slopes = (np.array(array) for array in function(plant.complete(fitted).vector))
         names = list(plant.parameters)
         free = [name for name in covariance.names if name in names]
         rows = [covariance.names.index(name) for name in free]

@@ -219,8 +219,8 @@ def _start(
 ) -> _BranchAndBound:  # fmt: skip
     within = build_region(plant, unknown)
     boxes = within.cover(controller.sample_time_s)
-    _check_digits(controller, plant, unknown, within, boxes)
-    hardness = _measure_hardness(controller, plant, unknown, within, boxes)
+    _check_digits(controller, plant, within, boxes)
+    hardness = _measure_hardness(controller, plant, within, boxes)
     while boxes.centre.shape[0] < BOX_BLOCK and np.sum(hardness * boxes.radius[0]) > EASY:
         axis = int(np.argmax(hardness * boxes.radius[0]))
         boxes = within.cut(boxes.halve(np.full(boxes.centre.shape[0], axis)))[0]
@@ -237,13 +237,13 @@ def _start(
     )  # fmt: skip
 
 
-def _check_digits(controller: Controller, plant: Plant, unknown: Uncertainty, within: Region, boxes: Boxes) -> None:
+def _check_digits(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> None:
     """Refuse a loop that loses so many digits that not even one plant can be bounded at single angles."""
     point = Boxes(centre=boxes.centre[:1], radius=np.zeros_like(boxes.radius[:1]))
     theta = 0.5 * (FIRST_EDGES[1:] + FIRST_EDGES[:-1])
     no_bound = np.full(theta.size, np.inf)
     arcs = Arcs(box=np.zeros(theta.size, dtype=int), middle=theta, half=0.0 * theta, s=no_bound, t=no_bound)
-    enclosed = enclose_plant(controller, plant, unknown.nominal, within, point)
+    enclosed = enclose_plant(controller, plant, within, point)
     if not np.all(np.isfinite(bound_arcs(controller, enclosed, point, within.ball, arcs).s)):
         raise ControlError(
             f"{plant.name} cannot be distinguished from a plant with a pole on the unit circle: its "
@@ -251,15 +251,13 @@ def _check_digits(controller: Controller, plant: Plant, unknown: Uncertainty, wi
         )
 
 
-def _measure_hardness(
-    controller: Controller, plant: Plant, unknown: Uncertainty, within: Region, boxes: Boxes
-) -> Float[np.ndarray, " k"]:
+def _measure_hardness(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> Float[np.ndarray, " k"]:
     """Return what each coordinate adds to the root of the models' remainders, which is nearly linear in its width."""
     if not within.size:
         return np.zeros(0)
     width = boxes.radius[0]
     alone = Boxes(centre=np.repeat(boxes.centre[:1], within.size, axis=0), radius=TRIAL * np.diag(width))
-    model = enclose_plant(controller, plant, unknown.nominal, within, alone).denominator
+    model = enclose_plant(controller, plant, within, alone).denominator
     with np.errstate(divide="ignore", invalid="ignore"):
         remainder = np.nan_to_num(model.r / np.abs(model.c), nan=0.0, posinf=1e6)
         return np.max(remainder, axis=1) ** (1.0 / (model.basis.degree + 1)) / np.where(
@@ -277,7 +275,7 @@ def _step(search: _BranchAndBound) -> None:
     boxes, arcs = search.boxes.take(chosen), _take_arcs_of(search.arcs, chosen, worst.size)
     waiting = _take_arcs_of(search.arcs, others, worst.size)
     stable = _measure(search, boxes.centre)
-    sampled = enclose_plant(search.controller, search.plant, search.unknown.nominal, search.within, boxes)
+    sampled = enclose_plant(search.controller, search.plant, search.within, boxes)
     left, blame = _bound_block(search, sampled, boxes, arcs, stable)
     search.count += chosen.size
     search.boxes, search.arcs = search.boxes.take(others), waiting
@@ -366,7 +364,7 @@ def _measure(search: _BranchAndBound, points: Float[np.ndarray, "c k"]) -> Bool[
         return np.ones(0, dtype=bool)
     fixed = {name: np.full(len(points), value) for name, value in within.fixed.items()}
     values = within.evaluate(points) | fixed
-    figures = batch_figures(search.controller, search.plant, search.unknown.nominal, values)
+    figures = batch_figures(search.controller, search.plant, search.within.nominal, values)
     inside = within.contains(points)
     for k, peaks in enumerate((figures.ms, figures.mt)):
         search.lower[k] = max(search.lower[k], np.max(peaks[inside], initial=0.0))

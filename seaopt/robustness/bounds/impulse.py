@@ -15,7 +15,6 @@ from jaxtyping import Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.sampled_plant import DELAY
-from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, jacobians
 from seaopt.records import record
 from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, count_halvings, enclose
@@ -47,9 +46,7 @@ class ImpulseTransfer:
     whole: Int[np.ndarray, " b"]
 
 
-def enclose_plant(
-    controller: Controller, plant: Plant, nominal: ParameterSet, within: Region, boxes: Boxes
-) -> ImpulseTransfer:
+def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> ImpulseTransfer:
     """Return the sampled plant over boxes, from motor force to the measured output.
 
     Raises
@@ -62,8 +59,9 @@ def enclose_plant(
     uncertain = within.enclose(boxes, degree)
     count, over = boxes.centre.shape[0], build_basis(within.size, degree)
     p: list[Entry] = [
-        uncertain.get(name, within.fixed.get(name, value))  # a range of no width is another value, not an uncertainty
-        for name, value in zip(plant.parameters, plant.parameter_values(nominal), strict=True)
+        # A range of no width is another value, not an uncertainty.
+        uncertain.get(name, within.fixed.get(name, parameter.value))
+        for name, parameter in within.nominal.items()
     ]
     conditions: dict[str, Entry] = {
         name: entry for name, entry in (within.fixed | uncertain).items() if name not in plant.parameters

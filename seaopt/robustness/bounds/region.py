@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.control.loops.sampled_plant import DELAY, conditions, conditions_of
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_linear
 from seaopt.robustness.uncertainty.draws import Uncertainty, confidence_radius
@@ -55,6 +55,8 @@ class Region:
         This many coordinates, the first ones, lie in a unit ball, the others between -1 and 1.
     fixed : mapping of name to value
         Conditions that are not uncertain.
+    nominal : CompletedParameters
+        What the plant has where nothing is uncertain.
 
     """
 
@@ -65,6 +67,7 @@ class Region:
     high: Float[np.ndarray, " n"]
     ball: int
     fixed: dict[str, float]
+    nominal: CompletedParameters
 
     @property
     def size(self) -> int:
@@ -153,12 +156,13 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     slopes[:count, :ball] = half_axes
     slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
     middle = [0.5 * (low + high) for low, high in wide.values()]
-    nominal = {name: value for name, value in conditions_of(plant, unknown.nominal).items() if name not in ends}
+    nominal = plant.complete(unknown.nominal)
+    held = {name: value for name, value in conditions_of(plant, nominal).items() if name not in ends}
     return Region(
         names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
         slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),
         high=np.array([*(unknown.nominal[n].max for n in names), *[np.inf] * len(wide)], dtype=float), ball=ball,
-        fixed=pinned | nominal,
+        fixed=pinned | held, nominal=nominal,
     )  # fmt: skip
 
 

@@ -103,7 +103,7 @@ def expand_draws(
 ) -> tuple[Float[np.ndarray, "np n"], dict[str, Float[np.ndarray, " n"]]]:
     """Return a plant's parameters, one column per draw, and its conditions."""
     count = len(next(iter(draws.values()))) if draws else 1
-    values = np.repeat(np.array(plant.parameter_values(nominal))[:, None], count, axis=1)
+    values = np.repeat(plant.complete(nominal).vector[:, None], count, axis=1)
     for row, name in enumerate(plant.parameters):
         if name in draws:
             values[row] = draws[name]

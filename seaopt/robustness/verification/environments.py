@@ -25,7 +25,7 @@ from seaopt.control.loops.port import bare_port, probe_of
 from seaopt.errors import ControlError
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import batch_figures
 
@@ -206,27 +206,28 @@ def coupled_stability(
     """
     _check_grid(masses_kg, stiffnesses_N_per_m, dampings_N_s_per_m, points)
     coupled = attach_environment(plant)
+    values = coupled.complete(parameters).drop_conditions()
     mass, stiffness = (np.geomspace(*ends, points) for ends in (masses_kg, stiffnesses_N_per_m))
     damping = np.array(dampings_N_s_per_m, dtype=float)
     d, m, k = np.meshgrid(damping, mass, stiffness, indexing="ij")
-    radius = _compute_radii(controller, coupled, parameters, m.ravel(), k.ravel(), d.ravel()).reshape(d.shape)
+    radius = _compute_radii(controller, coupled, values, m.ravel(), k.ravel(), d.ravel()).reshape(d.shape)
     at = np.unravel_index(int(np.argmax(radius)), radius.shape)
     return StabilityMap(
         mass=mass, stiffness=stiffness, damping=damping, spectral_radius=radius,
         boundary=tuple(
-            _find_boundary(controller, coupled, parameters, mass, stiffness, float(value), stable)
+            _find_boundary(controller, coupled, values, mass, stiffness, float(value), stable)
             for value, stable in zip(damping, radius <= GROWING, strict=True)
         ),
-        worst=close_on_environment(controller, coupled, parameters, float(m[at]), float(k[at]), float(d[at])),
-        fixed_stable=_is_stable_fixed(controller, coupled, parameters),
+        worst=close_on_environment(controller, coupled, values, float(m[at]), float(k[at]), float(d[at])),
+        fixed_stable=_is_stable_fixed(controller, coupled, values),
     )  # fmt: skip
 
 
 def close_on_environment(
-    controller: Controller, coupled: Plant, parameters: ParameterSet, m_2: float, k_e: float, d_e: float
+    controller: Controller, coupled: Plant, parameters: CompletedParameters, m_2: float, k_e: float, d_e: float
 ) -> Environment:
     """Return the loop against one environment, `coupled` being a plant of `attach_environment`."""
-    values = coupled.complete(parameters).update(**{_inertia(coupled): m_2, "k_e": k_e, "d_e": d_e})
+    values = parameters.update(**{_inertia(coupled): m_2, "k_e": k_e, "d_e": d_e})
     poles = controller.close(coupled, values).eigenvalues()
     largest = poles[int(np.argmax(np.abs(poles)))]
     radius, period = float(abs(largest)), controller.sample_time_s
@@ -255,22 +256,22 @@ def _inertia(coupled: Plant) -> str:
 
 
 def _compute_radii(
-    controller: Controller, coupled: Plant, parameters: ParameterSet, m: Float[np.ndarray, " n"],
+    controller: Controller, coupled: Plant, parameters: CompletedParameters, m: Float[np.ndarray, " n"],
     k: Float[np.ndarray, " n"], d: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:  # fmt: skip
     """Return the spectral radii against n environments."""
     draws = {_inertia(coupled): m, "k_e": k, "d_e": d}
-    return batch_figures(controller, coupled, coupled.complete(parameters), draws, peaks=False).spectral_radius
+    return batch_figures(controller, coupled, parameters, draws, peaks=False).spectral_radius
 
 
-def _is_stable_fixed(controller: Controller, coupled: Plant, parameters: ParameterSet) -> bool:
+def _is_stable_fixed(controller: Controller, coupled: Plant, parameters: CompletedParameters) -> bool:
     """Return whether the loop is stable with the link fixed, for which a mass of 1e9 kg on the ground stands."""
-    values = coupled.complete(parameters).update(**{_inertia(coupled): 1e9, "k_e": 1e12, "d_e": 1e9})
+    values = parameters.update(**{_inertia(coupled): 1e9, "k_e": 1e12, "d_e": 1e9})
     return bool(np.max(np.abs(controller.close(coupled, values).eigenvalues())) <= GROWING)
 
 
 def _find_boundary(
-    controller: Controller, coupled: Plant, parameters: ParameterSet, mass: Float[np.ndarray, " m"],
+    controller: Controller, coupled: Plant, parameters: CompletedParameters, mass: Float[np.ndarray, " m"],
     stiffness: Float[np.ndarray, " k"], damping: float, stable: Bool[np.ndarray, "m k"],
 ) -> Float[np.ndarray, "_ 2"]:  # fmt: skip
     """Return points of the edge between neighbours of the grid, one of them stable, by bisection in logarithms."""

@@ -16,7 +16,7 @@ from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, Sample
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant, Port
+from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.impacts import catch, offset, release, strike
 from seaopt.plants.plant import fill_vector
 from seaopt.records import record
@@ -168,17 +168,19 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
     if not params:
         raise ControlError("params is empty; give one ParameterSet per run")
-    delays = [[drawn[DELAY]] if DELAY in drawn else [] for drawn in params]
-    longest = max(conditions_of(stage.plant, drawn).get(DELAY, 0.0) for drawn in params)
-    values = [stage.plant.complete(drawn).with_parameters(*d) for drawn, d in zip(params, delays, strict=True)]
-    rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), params)
-    now, grip = _start_state(stage, scenario, values, longest) if rest is None else rest.state, None
+    placed = [stage.plant.complete(drawn) for drawn in params]
+    delays = [[drawn.given[DELAY]] if DELAY in drawn.given else [] for drawn in placed]
+    longest = max(conditions_of(stage.plant, drawn).get(DELAY, 0.0) for drawn in placed)
+    carried = [drawn.with_parameters(*delay) for drawn, delay in zip(placed, delays, strict=True)]
+    rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
+    now, grip = _start_state(stage, scenario, placed, longest) if rest is None else rest.state, None
     offset = rest.reference[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
     runs: list[LoopRun] = []
     contacts: list[Contact] = []
     begin_s = 0.0
     for number, phase in enumerate(scenario.phases):
-        values = [apply_load(unloaded, phase.scale) for unloaded in values]
+        carried = [apply_load(unloaded, phase.scale) for unloaded in carried]
+        values = [stage.plant.complete(loaded) for loaded in carried]
         if phase.held and grip is None:
             now, grip, contact = _catch(stage, values, now, begin_s)
             contacts.append(contact)
@@ -196,7 +198,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     return _join_phases(stage, runs, rest, tuple(contacts))
 
 
-def _start_state(stage: Stage, scenario: Scenario, values: Sequence[ParameterSet], longest: float) -> LoopState:
+def _start_state(stage: Stage, scenario: Scenario, values: Sequence[CompletedParameters], longest: float) -> LoopState:
     """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
     plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
     start = at_rest(loop, len(values), fill_vector("state", plant.states, scenario.initial_state))
@@ -229,7 +231,7 @@ def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generato
 
 
 def _catch(
-    stage: Stage, values: Sequence[ParameterSet], now: LoopState, time_s: float
+    stage: Stage, values: Sequence[CompletedParameters], now: LoopState, time_s: float
 ) -> tuple[LoopState, list[dict[str, float]], Contact]:
     """Return the states after the link is caught, where its coordinate stands in each run, and the contact."""
     plant, port = stage.plant, _port(stage.plant)
@@ -243,7 +245,7 @@ def _catch(
 
 
 def _let_go(
-    stage: Stage, values: Sequence[ParameterSet], grip: Sequence[Mapping[str, float]], now: LoopState
+    stage: Stage, values: Sequence[CompletedParameters], grip: Sequence[Mapping[str, float]], now: LoopState
 ) -> LoopState:
     plant, port = stage.plant, _port(stage.plant)
     rows = [release(plant, p, port, row, link) for row, p, link in zip(now.x, values, grip, strict=True)]

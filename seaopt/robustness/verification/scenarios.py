@@ -247,7 +247,7 @@ def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     """Return the blow (N s) on the link after which the measured force peaks at about `force`; play is nonlinear."""
     link = _struck(plant)
     assert link is not None
-    params = plant.complete(_require_design(controller)[1])
+    params = plant.complete(_require_design(controller)[1]).drop_conditions()
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )

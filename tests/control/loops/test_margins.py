@@ -333,7 +333,7 @@ def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
 
     f = ca.Function("f", [swing.x, swing.u, swing.p], [swing.dynamics])
     h = ca.Function("h", [swing.x, swing.u, swing.p], [swing.output])
-    p = swing.parameter_values(thor)
+    p = swing.complete(thor).vector
     names = list(swing.states)
     k = names.index("phi")
     params = thor.with_parameters(Parameter(name="phi", value=0.4, unit="rad"))

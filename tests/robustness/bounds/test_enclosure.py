@@ -99,7 +99,7 @@ def test_matrix_products_hold_their_values():
 def test_jacobians_hold_casadis(plant, thor, request):
     plant = request.getfixturevalue(plant)
     names = ["J", "b_r", "eta", "I_p", "L_a"]
-    nominal = plant.parameter_values(thor)
+    nominal = plant.complete(thor).vector
     over = build_basis(len(names), 4)
     entries = [
         make_linear(np.array([value]), 0.2 * value * (np.array(names) == name)[:, None], over)
@@ -138,7 +138,7 @@ def test_the_sampled_plant_holds_exponentials(parts, ranges, robust_controller, 
     unknown = combine_uncertainty(thor, so.ParameterSet(), ranges, {"swing": plant})
     within = build_region(plant, unknown)
     boxes = Boxes(centre=np.full((1, 2), 0.2), radius=np.full((1, 2), 0.5))
-    enclosed = enclose_plant(controller, plant, unknown.nominal, within, boxes)
+    enclosed = enclose_plant(controller, plant, within, boxes)
     period, gain = controller.sample_time_s, controller.command.per_effort
     for e in np.random.default_rng(5).uniform(-1.0, 1.0, (30, 2)):
         values = {name: float(column[0]) for name, column in within.evaluate(0.2 + 0.5 * e[None]).items()}

@@ -255,7 +255,7 @@ def test_a_law_whose_reference_does_nothing_is_refused(controller, swing, thor):
     loop = Stage(controller=deaf, plant=swing).loop(held=False)
     assert runnable(deaf).integrators
     with pytest.raises(ControlError, match="blocked at 0 Hz"):
-        equilibrium(loop, [at(thor, phi=0.3)])
+        equilibrium(loop, [swing.complete(at(thor, phi=0.3))])
 
 
 def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(controller, swing, thor):
