@@ -74,7 +74,7 @@ def strike(plant: Plant, params: CompletedParameters, state: State, output: str,
     """
     inertia, slope = (np.array(block) for block in _inertia(plant, output)(state, params.vector))
     after = state.copy()
-    rates = _pairs(plant)[1]
+    rates = _find_pairs(plant)[1]
     after[rates] += np.linalg.solve(inertia, slope.ravel() * impulse)
     return after
 
@@ -106,9 +106,9 @@ def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -
         The port does not move, or the plant declares no energy.
 
     """
-    motion, coordinate, rate = _moving(plant, port)
+    motion, coordinate, rate = _read_motion(plant, port)
     inertia = np.array(_inertia(plant, motion)(state, params.vector)[0])
-    places, rates = _pairs(plant)
+    places, rates = _find_pairs(plant)
     names = list(plant.states)
     link = places.index(names.index(coordinate))
     others = [k for k in range(len(places)) if k != link]
@@ -144,14 +144,14 @@ def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldSta
         The port does not move, or `link` names no state of its link.
 
     """
-    _, *own = _moving(plant, port)
+    _, *link_states = _read_motion(plant, port)
     for name in link:
-        if name not in own:
+        if name not in link_states:
             raise PlantError(
-                f'link = {{"{name}": ...}} is not a state of the link of {plant.name}; {suggestion(name, own)}'
+                f'link = {{"{name}": ...}} is not a state of the link of {plant.name}; {suggestion(name, link_states)}'
             )
     rest = iter(held)
-    after = np.array([link.get(name, 0.0) if name in own else next(rest) for name in plant.states], dtype=float)
+    after = np.array([link.get(name, 0.0) if name in link_states else next(rest) for name in plant.states], dtype=float)
     return after - offset(plant, params, after, port)
 
 
@@ -170,7 +170,7 @@ def check_held(plant: Plant, held: Plant) -> None:
     Raises
     ------
     PlantError
-        As said.
+        The states are not the same but for the link's.
 
     """
     port = plant.port
@@ -181,7 +181,7 @@ def check_held(plant: Plant, held: Plant) -> None:
         )
 
 
-def _moving(plant: Plant, port: Port) -> tuple[str, str, str]:
+def _read_motion(plant: Plant, port: Port) -> tuple[str, str, str]:
     if port.motion is None or port.coordinate is None or port.rate is None:
         raise PlantError(
             f"the port of {plant.name} does not move, or does not say how; give motion, coordinate and rate"
@@ -189,7 +189,7 @@ def _moving(plant: Plant, port: Port) -> tuple[str, str, str]:
     return port.motion, port.coordinate, port.rate
 
 
-def _pairs(plant: Plant) -> tuple[list[int], list[int]]:
+def _find_pairs(plant: Plant) -> tuple[list[int], list[int]]:
     """Return where the coordinates and their rates stand in x: pairs, before the states of filters."""
     count = 0
     while 2 * count + 1 < len(plant.states):
@@ -204,7 +204,7 @@ def _inertia(plant: Plant, output: str) -> Any:
     """Return the CasADi function (x, p) -> (H, d output/dy)."""
     if output not in plant.outputs:
         raise PlantError(f'plant {plant.name} has no output "{output}"; {suggestion(output, plant.outputs)}')
-    places, rates = _pairs(plant)
+    places, rates = _find_pairs(plant)
     position = plant.output[list(plant.outputs).index(output)]
     if ca.depends_on(position, ca.vertcat(plant.x[rates], plant.u)):
         raise PlantError(f"output {output} of {plant.name} depends on more than positions; name a position")

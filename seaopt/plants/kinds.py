@@ -52,5 +52,5 @@ def plant_of_kind(kind: str, **options: Any) -> Plant:
 
 def known_parameters() -> dict[str, Parameter]:
     """Return every parameter that some built-in plant has, by name (a problem file may name any of them)."""
-    parts = [item for items in PARTS.values() for item in items]
-    return {item.name: item for item in (*all_parameters(), *rotary_parameters(), *parts)}
+    parts = [parameter for items in PARTS.values() for parameter in items]
+    return {parameter.name: parameter for parameter in (*all_parameters(), *rotary_parameters(), *parts)}

@@ -59,13 +59,13 @@ class Modes:
     def __repr__(self) -> str:
         lines = ["Modes"]
         lines += [
-            f"  resonance {item.frequency_hz:.5g} Hz, damping ratio {item.damping_ratio:.3g} ({', '.join(item.states)})"
-            for item in self.resonances
+            f"  resonance {mode.frequency_hz:.5g} Hz, damping ratio {mode.damping_ratio:.3g} ({', '.join(mode.states)})"
+            for mode in self.resonances
         ]
         lines += [f"  real pole {pole.real:.5g} rad/s" for pole in self.poles if pole.imag == 0.0]
         for (output, source), zeros in self.zeros.items():
-            shown = ", ".join(f"{abs(zero) / 2 / np.pi:.4g}" for zero in zeros if zero.imag >= 0.0) or "none"
-            lines.append(f"  {output}/{source}: static gain {self.dc_gain[output, source]:.5g}, zeros at {shown} Hz")
+            zeros_hz = ", ".join(f"{abs(zero) / 2 / np.pi:.4g}" for zero in zeros if zero.imag >= 0.0) or "none"
+            lines.append(f"  {output}/{source}: static gain {self.dc_gain[output, source]:.5g}, zeros at {zeros_hz} Hz")
         return "\n".join(lines)
 
     _repr_html_ = html_text
@@ -95,8 +95,8 @@ def modes(
 
     """
     a, b, c, d = state_space(plant, params, x, u)
-    found: Any = np.linalg.eig(a)
-    poles, right = found.eigenvalues.astype(complex), found.eigenvectors
+    eigen: Any = np.linalg.eig(a)
+    poles, right = eigen.eigenvalues.astype(complex), eigen.eigenvectors
     left = np.linalg.pinv(right)
     order = np.argsort(np.abs(poles), kind="stable")
     names = list(plant.states)
@@ -116,12 +116,15 @@ def modes(
     return Modes(
         poles=poles[order],
         resonances=tuple(resonances),
-        zeros={(output, source): _zeros(a, b[:, j], c[i], float(d[i, j])) for i, j, output, source in pairs},
-        dc_gain={(output, source): _static(a, b[:, j], c[i], float(d[i, j]), poles) for i, j, output, source in pairs},
+        zeros={(output, source): _find_zeros(a, b[:, j], c[i], float(d[i, j])) for i, j, output, source in pairs},
+        dc_gain={
+            (output, source): _compute_static_gain(a, b[:, j], c[i], float(d[i, j]), poles)
+            for i, j, output, source in pairs
+        },
     )
 
 
-def _static(
+def _compute_static_gain(
     a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float,
     poles: Complex[np.ndarray, " n"],
 ) -> float:  # fmt: skip
@@ -137,7 +140,7 @@ def _static(
     return 0.0 if abs(nearer) < 0.3 * abs(near) or largest == 0.0 else nearer
 
 
-def _zeros(
+def _find_zeros(
     a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
 ) -> Complex[np.ndarray, " m"]:
     """Return the finite generalised eigenvalues of the system pencil [[A, b], [c, d]] - z diag(1, 0).
@@ -158,7 +161,7 @@ def _zeros(
     alpha, beta = pairs
     size = np.hypot(np.abs(alpha), np.abs(beta))
     finite = np.abs(beta) > 1e-10 * np.where(size > 0.0, size, 1.0) / max(1.0, float(np.max(np.abs(a))))
-    found = (alpha[finite] / beta[finite]).astype(complex)
+    zeros = (alpha[finite] / beta[finite]).astype(complex)
     bound = 1e4 * max(1.0, float(np.max(np.abs(np.linalg.eigvals(a)))))
-    found = found[np.abs(found) < bound]
-    return found[np.argsort(np.abs(found), kind="stable")]
+    zeros = zeros[np.abs(zeros) < bound]
+    return zeros[np.argsort(np.abs(zeros), kind="stable")]

@@ -90,7 +90,7 @@ INSIDE = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
 
 def parameters(parts: Sequence[str]) -> list[Parameter]:
     """Return the parameters of the parts that sit inside the actuator."""
-    return [item for part in parts if part in INSIDE for item in PARTS[part]]
+    return [parameter for part in parts if part in INSIDE for parameter in PARTS[part]]
 
 
 def check_parts(parts: Sequence[str]) -> None:
@@ -99,7 +99,7 @@ def check_parts(parts: Sequence[str]) -> None:
     Raises
     ------
     PlantError
-        As said.
+        A part is unknown, or given twice.
 
     """
     if isinstance(parts, str) or not isinstance(parts, Sequence):
@@ -243,8 +243,8 @@ def wrapped(
         else:
             signals = [name for name in outputs if name in plant.outputs]
             if not signals:
-                listed = f"none of the outputs {', '.join(outputs)}" if outputs else "no regulated output"
-                raise PlantError(f"plant {plant.name} has {listed} that {part} reads; name others")
+                reading = f"none of the outputs {', '.join(outputs)}" if outputs else "no regulated output"
+                raise PlantError(f"plant {plant.name} has {reading} that {part} reads; name others")
         plant = _add_filter(plant, part, signals)
     return plant
 
@@ -299,7 +299,7 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         states={**plant.states, **added},
         inputs=plant.inputs,
         outputs=plant.outputs,
-        parameters={**plant.parameters, **{item.name: item for item in PARTS[part]}},
+        parameters={**plant.parameters, **{parameter.name: parameter for parameter in PARTS[part]}},
         f=f,
         h=h,
         derived=plant.derived,

@@ -144,12 +144,12 @@ class Plant:
     @property
     def defaults(self) -> ParameterSet:
         """The parameters that have a default value."""
-        return ParameterSet(item for item in self.parameters.values() if isinstance(item, Parameter))
+        return ParameterSet(default for default in self.parameters.values() if isinstance(default, Parameter))
 
     def parameter_unit(self, name: str) -> str:
         """Return the SI unit of a parameter."""
-        item = self.parameters[name]
-        return item.unit if isinstance(item, Parameter) else item
+        default = self.parameters[name]
+        return default.unit if isinstance(default, Parameter) else default
 
     def complete(self, params: ParameterSet) -> CompletedParameters:
         """Return the plant's own parameters in its units and order: from `params`, else the defaults.
@@ -172,7 +172,7 @@ class Plant:
         for name, default in self.parameters.items():
             unit = self.parameter_unit(name)
             if name in params:
-                completed.append(_in_unit(params[name], unit, self.name))
+                completed.append(_convert_unit(params[name], unit, self.name))
             elif isinstance(default, Parameter):
                 completed.append(default)
             else:
@@ -239,12 +239,12 @@ class Plant:
         )
 
     def __repr__(self) -> str:
-        def listed(items: Mapping[str, Any]) -> str:
-            return ", ".join(f"{name} [{unit if isinstance(unit, str) else unit.unit}]" for name, unit in items.items())
+        def format_names(units: Mapping[str, Any]) -> str:
+            return ", ".join(f"{name} [{unit if isinstance(unit, str) else unit.unit}]" for name, unit in units.items())
 
         return (
-            f"Plant {self.name}\n  states      {listed(self.states)}\n  inputs      {listed(self.inputs)}\n"
-            f"  outputs     {listed(self.outputs)}\n  parameters  {listed(self.parameters)}"
+            f"Plant {self.name}\n  states      {format_names(self.states)}\n  inputs      {format_names(self.inputs)}\n"
+            f"  outputs     {format_names(self.outputs)}\n  parameters  {format_names(self.parameters)}"
         )
 
     _repr_html_ = html_text
@@ -371,17 +371,17 @@ def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float]
     return np.array([float(known.get(name, 0.0)) for name in names])
 
 
-def _in_unit(item: Parameter, unit: str, plant: str) -> Parameter:
+def _convert_unit(parameter: Parameter, unit: str, plant: str) -> Parameter:
     """Return a parameter in another unit of the same dimension."""
-    if item.unit == unit:
-        return item
+    if parameter.unit == unit:
+        return parameter
     try:
-        scale = factor(item.unit, unit)
+        scale = factor(parameter.unit, unit)
     except UnitError as error:
-        raise UnitError(f"parameter {item.name} of plant {plant}: {error}") from error
-    prior, std = (None if value is None else value * scale for value in (item.prior_std, item.std))
-    low, high = item.min * scale, item.max * scale
-    return replace(item, value=item.value * scale, unit=unit, min=low, max=high, prior_std=prior, std=std)
+        raise UnitError(f"parameter {parameter.name} of plant {plant}: {error}") from error
+    prior, std = (None if value is None else value * scale for value in (parameter.prior_std, parameter.std))
+    low, high = parameter.min * scale, parameter.max * scale
+    return replace(parameter, value=parameter.value * scale, unit=unit, min=low, max=high, prior_std=prior, std=std)
 
 
 def _evaluate_equations(plant: Plant, what: str, equations: Equations, *arguments: Any) -> Mapping[str, Any]:
@@ -406,8 +406,8 @@ def _check_names(plant: Plant) -> None:
     for group in ("states", "inputs", "outputs", "parameters"):
         if not isinstance(getattr(plant, group), Mapping):
             raise PlantError(f"plant {plant.name}: {group} is no mapping; give {{name: unit}}")
-        for name, item in getattr(plant, group).items():
-            if not isinstance(item, str | Parameter):
+        for name, declared in getattr(plant, group).items():
+            if not isinstance(declared, str | Parameter):
                 raise PlantError(
                     f'plant {plant.name}: "{name}" in {group} has no unit; give one, "-" for a pure number'
                 )
@@ -419,13 +419,13 @@ def _check_names(plant: Plant) -> None:
             if name in seen:
                 raise PlantError(f'plant {plant.name}: "{name}" is in {seen[name]} and in {group}; rename one')
             seen[name] = group
-    for name, item in plant.parameters.items():
-        unit = item.unit if isinstance(item, Parameter) else item
+    for name, declared in plant.parameters.items():
+        unit = declared.unit if isinstance(declared, Parameter) else declared
         if not unit.strip():
             raise PlantError(f'plant {plant.name}: parameter "{name}" has no unit; give one, "-" for a pure number')
     for group in ("states", "inputs", "outputs", "parameters"):
-        for item in getattr(plant, group).values():
-            unit = item.unit if isinstance(item, Parameter) else item
+        for declared in getattr(plant, group).values():
+            unit = declared.unit if isinstance(declared, Parameter) else declared
             if unit.strip() not in DIMENSIONLESS and unit not in _COMMON_UNITS:
                 si_unit(unit)
     unknown = sorted(plant.optional_inputs - set(plant.inputs))

@@ -30,14 +30,14 @@ GRAVITY = Parameter(name="g", value=9.81, unit="m/s^2", description="gravity")
 
 def all_parameters() -> list[Parameter]:
     """Return every parameter that some `two_link`, `high_impedance` or `moving_output` has."""
-    links = [item for suffix in ("", "1", "2") for item in pendulum(suffix)]
+    links = [parameter for suffix in ("", "1", "2") for parameter in pendulum(suffix)]
     masses = [link_mass(number) for number in (1, 2)]
     return [*ACTUATOR, *links, *masses, GRAVITY]
 
 
 def pendulum(suffix: str) -> list[Parameter]:
     """Return the parameters of a link that swings, their names ending in its number."""
-    return [replace(item, name=f"{item.name}{suffix}") for item in PENDULUM]
+    return [replace(parameter, name=f"{parameter.name}{suffix}") for parameter in PENDULUM]
 
 
 def link_mass(number: int) -> Parameter:

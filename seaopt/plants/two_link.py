@@ -208,14 +208,14 @@ def _as_tuple(parts: Sequence[Part]) -> tuple[Part, ...]:
 
 
 def _check_build(build: _Build) -> _Build:
-    for what, given, known in (
+    for what, choice, known in (
         ("drive", build.drive, ("unlumped", "lumped")),
         ("spring", build.spring, ("link1", "link2")),
         ("link1", build.links[0], ("fixed", "mass", "pendulum")),
         ("link2", build.links[1], ("fixed", "mass", "pendulum")),
     ):
-        if given not in known:
-            raise PlantError(f'{what} = "{given}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
+        if choice not in known:
+            raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
     part_laws.check_parts(build.parts)
     return build
 
@@ -240,7 +240,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         parameters.append(GRAVITY)
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        flat = [item for pair in _motion(x, u, p, build).rates for item in pair]
+        flat = [rate for pair in _motion(x, u, p, build).rates for rate in pair]
         return dict(zip(states, flat, strict=True))
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
@@ -262,7 +262,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
         states=states,
         inputs={"I": "A"} | ({"Fe1": "N", "Fe2": "N"} if external else {}),
         outputs=outputs,
-        parameters={item.name: item for item in parameters},
+        parameters={parameter.name: parameter for parameter in parameters},
         f=f,
         h=h,
         derived=lambda p: derived_figures(p, housing_rides=housing_rides),

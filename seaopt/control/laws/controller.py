@@ -108,8 +108,8 @@ class Controller:
             return ()
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
-        resting = warn_unidentified(values, None if self.robust_to else plant.parameters)
-        return (*resting, *actuation_notes(plant, self.command), *self._noise_notes())
+        vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
+        return (*vague, *actuation_notes(plant, self.command), *self._noise_notes())
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
@@ -224,10 +224,10 @@ class Controller:
                 f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
                 f"delay of {self.delay_samples} sample{'' if self.delay_samples == 1 else 's'}: {verdict}",
                 *self._gain_lines(),
-                f"  bandwidth {_shown(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
+                f"  bandwidth {_format(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
                 f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
-                f"  gain margin {_shown(a.gain_margin_db)} dB, phase margin {_shown(a.phase_margin_deg)} deg, "
-                f"delay margin {_shown(None if a.delay_margin_s is None else 1e3 * a.delay_margin_s)} ms",
+                f"  gain margin {_format(a.gain_margin_db)} dB, phase margin {_format(a.phase_margin_deg)} deg, "
+                f"delay margin {_format(None if a.delay_margin_s is None else 1e3 * a.delay_margin_s)} ms",
                 *self._force_lines(),
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
@@ -266,11 +266,11 @@ class Controller:
             (name, f"{value:.5g} {GAIN_UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
             for name, value in self.gains.items()
         ]
-        told = [] if self.feasible else [self.explanation]
+        explanation = [] if self.feasible else [self.explanation]
         return (
             html_paragraph(head) + html_table(("gain", "", "as current"), gains)
             + html_table(("on the design plant", "achieved", "asked"), self._achieved_rows())
-            + html_list([*told, *(line.strip() for line in self._force_lines())])
+            + html_list([*explanation, *(line.strip() for line in self._force_lines())])
         )  # fmt: skip
 
     def _achieved_rows(self) -> list[tuple[str, str, str]]:
@@ -296,5 +296,5 @@ def _format_allowed(limit: Limit, allowed: float | None) -> str:
     return f"{sense}{allowed:g} {limit.unit}".rstrip()
 
 
-def _shown(value: float | None) -> str:
+def _format(value: float | None) -> str:
     return "none" if value is None else f"{value:.4g}"

@@ -7,7 +7,7 @@ import numpy as np
 from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.absolute_stability import FrictionLoop, FrictionMargin, friction_margin
 from seaopt.control.loops.loop import STABLE, Loop
-from seaopt.control.loops.sampled_plant import DELAY, conditions_of, linearised, resting, sample
+from seaopt.control.loops.sampled_plant import DELAY, find_rest, linearise, read_conditions, sample
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states, has_friction
@@ -46,10 +46,10 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
     sliding = friction_states(plant)[SLIDING]
     flattest, steepest = friction_slopes(plant, values)
     measured, gain = controller.spec.measured, controller.command.per_effort
-    conditions = conditions_of(plant, values)
+    conditions = read_conditions(plant, values)
     at = {name: np.array([value]) for name, value in conditions.items()}
-    a, motor, output, _ = (block[0] for block in linearised(sliding, values.vector[:, None], at, measured, gain))
-    x, u = resting(plant, values)
+    a, motor, output, _ = (block[0] for block in linearise(sliding, values.vector[:, None], at, measured, gain))
+    x, u = find_rest(plant, values)
     on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, values.vector))
     sampled = sample(sliding, values, measured, gain, controller.sample_time_s, controller.delay_samples)
     loop = Loop(plant=sampled, reference=controller.reference, measurement=controller.measurement)

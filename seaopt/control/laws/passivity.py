@@ -46,7 +46,7 @@ from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.loop import GROWING, Loop
-from seaopt.control.loops.port import Frequencies, PortModel, Response, hold_response, port_of, sight
+from seaopt.control.loops.port import Frequencies, PortModel, Response, hold_response, port_of, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant, hold
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -179,10 +179,10 @@ def passivity(
         )
     port = port_of(plant, params, controller.spec.measured, controller.command.per_effort)
     law = controller.measurement
-    impedance, angle = _curves(port, law, ts, controller.delay_samples)
-    f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _grid(port, law, ts, low_hz, high)))
-    stable = held_stable(port, law, ts, controller.delay_samples)
-    bands, violated = _bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
+    impedance, angle = _make_curves(port, law, ts, controller.delay_samples)
+    f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))
+    stable = is_held_stable(port, law, ts, controller.delay_samples)
+    bands, violated = _find_bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
     least = int(np.argmin(np.real(z)))
     return Passivity(
@@ -194,7 +194,7 @@ def passivity(
         least_damping_N_s_per_m=float(np.real(z[least])),
         least_hz=float(f[least]),
         least_cosine=float(np.real(z[least]) / max(abs(z[least]), TINY)),
-        limit_hz=_limit(port, f),
+        limit_hz=_find_limit(port, f),
     )
 
 
@@ -202,11 +202,11 @@ def measure_port(
     port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
 ) -> PortFigures:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, where it is, and whether the held loop is stable."""
-    _, angle = _curves(port, law, sample_time_s, delay_samples)
-    f = add_minima(angle, _grid(port, law, sample_time_s, *band_hz))
+    _, angle = _make_curves(port, law, sample_time_s, delay_samples)
+    f = add_minima(angle, _make_grid(port, law, sample_time_s, *band_hz))
     cosine = angle(f)
     least = int(np.argmin(cosine))
-    stable = held_stable(port, law, sample_time_s, delay_samples)
+    stable = is_held_stable(port, law, sample_time_s, delay_samples)
     return PortFigures(least_cosine=float(cosine[least]), at_hz=float(f[least]), held_stable=stable)
 
 
@@ -245,15 +245,15 @@ def passivity_rows(
 
     """
     port = port_of(plant, params, spec.measured, per_effort)
-    loop, unit = sight(port, spec.sample_time_s, spec.delay_samples, f)
+    loop, unit = weigh_passivity(port, spec.sample_time_s, spec.delay_samples, f)
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 
-def held_stable(port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int) -> bool:
+def is_held_stable(port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
     a, b, c, d = port.link_held()
-    late = np.array([port.delay_s])
-    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), sample_time_s, late)
+    delay_s = np.array([port.delay_s])
+    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), sample_time_s, delay_s)
     plant = DigitalPlant(
         a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=sample_time_s, delay_samples=delay_samples,
         static_gain=np.nan,
@@ -262,7 +262,9 @@ def held_stable(port: PortModel, law: TransferFunction, sample_time_s: float, de
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 
 
-def _curves(port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
+def _make_curves(
+    port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int
+) -> tuple[Curve, Curve]:
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
     def impedance(f: Frequencies) -> Response:
@@ -277,7 +279,9 @@ def _curves(port: PortModel, law: TransferFunction, sample_time_s: float, delay_
     return impedance, angle
 
 
-def _grid(port: PortModel, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
+def _make_grid(
+    port: PortModel, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float
+) -> Frequencies:
     """Return frequencies that resolve the modes of plant and law."""
     roots = np.roots(np.trim_zeros(law.den, "b"))
     poles = np.log(roots.astype(complex)) / sample_time_s
@@ -290,7 +294,7 @@ def _grid(port: PortModel, law: TransferFunction, sample_time_s: float, low_hz: 
     return np.unique(np.concatenate([np.geomspace(low_hz, high_hz, POINTS), inside]))
 
 
-def _bands(
+def _find_bands(
     curve: Callable[[Frequencies], Frequencies], f: Frequencies
 ) -> tuple[tuple[tuple[float, float], ...], float | None]:
     """Return where the curve is not negative, and where it first is."""
@@ -306,10 +310,10 @@ def _bands(
     return tuple(bands), float(edges[bad[0]]) if bad.size else None
 
 
-def _limit(port: PortModel, f: Frequencies) -> float | None:
-    def alike(x: Frequencies) -> Frequencies:
+def _find_limit(port: PortModel, f: Frequencies) -> float | None:
+    def compare_directions(x: Frequencies) -> Frequencies:
         response = port.response(x)
         return np.real(response.motor_to_port * np.conj(response.motor_to_feedback))
 
-    found = find_crossings(alike, f)
-    return float(found[0]) if found.size else None
+    crossings = find_crossings(compare_directions, f)
+    return float(crossings[0]) if crossings.size else None

@@ -269,7 +269,7 @@ def realise(
         gains[: part.chain.size, column] = part.chain
     through = (float(reference.num[0]), float(measurement.num[0]))
     a, b, c = balance(*put_over_one_denominator(parts), max(map(abs, through)))
-    tracking = _tracking(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
+    tracking = _compute_tracking_time(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
     share = sample_time_s / (tracking + sample_time_s) if tracking is not None else 0.0
     b = np.vstack([gains, b])
     law = RunnableLaw(
@@ -286,27 +286,27 @@ def realise(
         per_effort=per_effort,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
     )
-    _check(law, reference, measurement)
+    _check_response(law, reference, measurement)
     return law
 
 
-def _check(law: RunnableLaw, reference: TransferFunction, measurement: TransferFunction) -> None:
+def _check_response(law: RunnableLaw, reference: TransferFunction, measurement: TransferFunction) -> None:
     """Refuse a law whose response is not that of its transfer functions, but for their coefficients' rounding."""
     f = np.geomspace(1e-4, 0.49, 25) / law.sample_time_s
     q = np.exp(-2j * np.pi * f * law.sample_time_s)
-    for found, tf in zip(law.response(f), (reference, measurement), strict=True):
+    for response, tf in zip(law.response(f), (reference, measurement), strict=True):
         bottom = np.polynomial.polynomial.polyval(q, tf.den)
         wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
         rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
         allowed = SAME * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
-        if not np.all(np.abs(found - wanted) <= allowed):
+        if not np.all(np.abs(response - wanted) <= allowed):
             raise ControlError(
                 "the law's slow poles are too close together to tell from integrators in double precision; "
                 "sample more slowly, or make them faster"
             )
 
 
-def _tracking(parts: list[SplitLaw], sample_time_s: float) -> float:
+def _compute_tracking_time(parts: list[SplitLaw], sample_time_s: float) -> float:
     """Return T_s abs(a_1/a_0) of C_r, of C_y where the reference is not integrated; a sample at least."""
     most = max(part.chain.size for part in parts)
     a_0, a_1 = next(part.series for part in parts if part.chain.size == most)[:2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.sampled_plant import DELAY, conditions_of
+from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -158,7 +158,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
         feedback=np.concatenate([c[row], [per_effort * d[row, 0], d[row, external]]]),
         speed=list(probe.states).index(port.rate),
         mass=values[port.inertia].value,
-        delay_s=conditions_of(plant, params).get(DELAY, 0.0),
+        delay_s=read_conditions(plant, params).get(DELAY, 0.0),
     )
 
 
@@ -195,7 +195,9 @@ def hold_response(f: Frequencies, sample_time_s: float, delay_samples: int) -> R
     return np.sinc(f * sample_time_s) * np.exp(-2j * np.pi * f * sample_time_s * (0.5 + delay_samples))
 
 
-def sight(port: PortModel, sample_time_s: float, delay_samples: int, f: Frequencies) -> tuple[Response, Response]:
+def weigh_passivity(
+    port: PortModel, sample_time_s: float, delay_samples: int, f: Frequencies
+) -> tuple[Response, Response]:
     """Return G_11 with delay and hold, and G_22/abs(G_22), with which passivity is affine in the gains.
 
     Raises

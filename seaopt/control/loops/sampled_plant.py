@@ -122,12 +122,12 @@ def sample(
 
     """
     values = plant.complete(params)
-    at = {name: np.array([value]) for name, value in conditions_of(plant, values).items()}
-    a, b, c, d = linearised(plant, values.vector[:, None], at, measured, gain)
-    held = hold(a, b, c, d, sample_time_s, at.get(DELAY, np.zeros(1)))
+    at = {name: np.array([value]) for name, value in read_conditions(plant, values).items()}
+    a, b, c, d = linearise(plant, values.vector[:, None], at, measured, gain)
+    sampled = hold(a, b, c, d, sample_time_s, at.get(DELAY, np.zeros(1)))
     return DigitalPlant(
-        a=held[0][0], b=held[1][0], c=held[2][0], d=float(held[3][0]), sample_time_s=sample_time_s,
-        delay_samples=delay_samples, static_gain=_static(a[0], b[0], c[0], float(d[0])),
+        a=sampled[0][0], b=sampled[1][0], c=sampled[2][0], d=float(sampled[3][0]), sample_time_s=sample_time_s,
+        delay_samples=delay_samples, static_gain=_compute_static_gain(a[0], b[0], c[0], float(d[0])),
     )  # fmt: skip
 
 
@@ -140,20 +140,20 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
         The plant has no such output, or cannot rest where it is to be linearised.
 
     """
-    at = {name: np.array([value]) for name, value in conditions_of(plant, params).items()}
-    a, b, c, d = linearised(plant, params.vector[:, None], at, output, 1.0)
-    return _static(a[0], b[0], c[0], float(d[0]))
+    at = {name: np.array([value]) for name, value in read_conditions(plant, params).items()}
+    a, b, c, d = linearise(plant, params.vector[:, None], at, output, 1.0)
+    return _compute_static_gain(a[0], b[0], c[0], float(d[0]))
 
 
 def conditions(plants: tuple[Plant, ...]) -> dict[str, Parameter]:
     """Return what a plant's `ParameterSet` may hold besides its parameters."""
-    found = {DELAY: Parameter(name=DELAY, value=0.0, unit="s", min=0.0, description="delay besides the controller's")}
+    known = {DELAY: Parameter(name=DELAY, value=0.0, unit="s", min=0.0, description="delay besides the controller's")}
     for plant in plants:
-        found |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
-    return found
+        known |= {name: Parameter(name=name, value=0.0, unit=unit) for name, unit in plant.states.items()}
+    return known
 
 
-def conditions_of(plant: Plant, params: ParameterSet) -> dict[str, float]:
+def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
     """Return the conditions that parameters hold, in SI units, by name.
 
     Raises
@@ -165,26 +165,26 @@ def conditions_of(plant: Plant, params: ParameterSet) -> dict[str, float]:
     --------
     >>> import seaopt as so
     >>> late = so.plants.thor().with_parameters(so.Parameter(name="delay_s", value=0.2, unit="ms"))
-    >>> conditions_of(so.plants.high_impedance(), late)
+    >>> read_conditions(so.plants.high_impedance(), late)
     {'delay_s': 0.0002}
 
     """
     if isinstance(params, CompletedParameters):
         params = params.given
-    found: dict[str, float] = {}
-    for name, item in conditions((plant,)).items():
+    values: dict[str, float] = {}
+    for name, condition in conditions((plant,)).items():
         if name not in params:
             continue
         try:
-            found[name] = params[name].value * factor(params[name].unit, item.unit)
+            values[name] = params[name].value * factor(params[name].unit, condition.unit)
         except UnitError as error:
             raise ControlError(f"{name} = {params[name].value:g} {params[name].unit}: {error}") from error
-        if not (np.isfinite(found[name]) and found[name] >= item.min):
-            raise ControlError(f"{name} = {found[name]:g} {item.unit} is not finite or negative; give another")
-    return found
+        if not (np.isfinite(values[name]) and values[name] >= condition.min):
+            raise ControlError(f"{name} = {values[name]:g} {condition.unit} is not finite or negative; give another")
+    return values
 
 
-def linearised(
+def linearise(
     plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float
 ) -> LinearPlants:
     """Return (a, b, c, d) from motor force to a measured output of k plants, one column of parameters each.
@@ -200,11 +200,11 @@ def linearised(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
     row = list(plant.outputs).index(measured)
-    a, b, c, d = _jacobians(plant, *_rest(plant, p, at), p)
+    a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(plant, p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
 
-def resting(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
+def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
     """Return states and inputs at rest where the conditions among `params` are; zeros without any.
 
     Raises
@@ -217,18 +217,18 @@ def resting(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray
     >>> import math, seaopt as so
     >>> swing, thor = so.plants.moving_output(), so.plants.thor()
     >>> raised = thor.with_parameters(so.Parameter(name="phi", value=0.5, unit="rad"))
-    >>> x, u = resting(swing, swing.complete(raised))
+    >>> x, u = find_rest(swing, swing.complete(raised))
     >>> force = -4.0 * 9.81 * 0.3 * math.tan(0.5) / 0.0725  # -m g L sin(phi) / (L_a cos(phi))
     >>> print(f"{force:.2f} N, {655e3 * (x[0] + 0.0725 * math.sin(0.5)):.2f} N")
     -88.70 N, -88.70 N
 
     """
-    at = {name: np.array([value]) for name, value in conditions_of(plant, params).items() if name != DELAY}
-    x, u = _rest(plant, params.vector[:, None], at)
+    at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name != DELAY}
+    x, u = _solve_rest(plant, params.vector[:, None], at)
     return x[:, 0], u[:, 0]
 
 
-def _rest(
+def _solve_rest(
     plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]]
 ) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
     """Return states and inputs at rest, by Newton's method in the first input and the states that are not given."""
@@ -243,8 +243,8 @@ def _rest(
     if len(fixed) > 1:
         raise ControlError(f"{', '.join(names[i] for i in fixed)} are both given; a plant rests at one of them")
     for _ in range(NEWTON_STEPS):
-        (rates,) = _mapped(plant, dynamics_function, x, u, p)
-        a, b, _, _ = _jacobians(plant, x, u, p)
+        (rates,) = _map_columns(plant, dynamics_function, x, u, p)
+        a, b, _, _ = _evaluate_jacobians(plant, x, u, p)
         try:
             step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), rates.T[:, :, None])[..., 0].T
         except np.linalg.LinAlgError:
@@ -254,52 +254,52 @@ def _rest(
         size = np.max(np.abs(np.concatenate([x[loose], u[:1]])), axis=0)
         if np.all(np.max(np.abs(step), axis=0) <= 1e-12 * np.maximum(size, 1e-6)):
             return x, u
-    given = ", ".join(f"{names[i]} = {at[names[i]][0]:g}" for i in fixed)
-    raise ControlError(f"plant {plant.name} cannot rest at {given}, so it cannot be linearised there; give another")
+    place = ", ".join(f"{names[i]} = {at[names[i]][0]:g}" for i in fixed)
+    raise ControlError(f"plant {plant.name} cannot rest at {place}, so it cannot be linearised there; give another")
 
 
-def linearised_along(
+def differentiate_linearisation(
     plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]],
     dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
-    """Return what `linearised` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
+    """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
     row, names = list(plant.outputs).index(measured), list(plant.states)
-    x, u = _rest(plant, p, at)
-    a, b, c, d = _jacobians(plant, x, u, p)
+    x, u = _solve_rest(plant, p, at)
+    a, b, c, d = _evaluate_jacobians(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)
     fixed = [names.index(name) for name in at if name in names]
     if fixed:  # f(x, u, p) = 0 along the direction: linear in the loose states and the first input
         loose = [i for i in range(len(names)) if i not in fixed]
         for i in fixed:
             dx[i] = dat[names[i]]
-        (drift,) = _mapped(plant, _drift_function, x, u, p, dp)
+        (drift,) = _map_columns(plant, _drift_function, x, u, p, dp)
         moved = drift.T[:, :, None] + a[:, :, fixed] @ dx[fixed].T[:, :, None]
         step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), -moved)[..., 0].T
         dx[loose], du[0] = step[:-1], step[-1]
-    da, db, dc, dd = _blocks(plant, _mapped(plant, _turn_function, x, u, p, dx, du, dp))
+    da, db, dc, dd = _stack_blocks(plant, _map_columns(plant, _turn_function, x, u, p, dx, du, dp))
     return (
         (a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain),
         (da, db[:, :, 0] * gain, dc[:, row], dd[:, row, 0] * gain),
     )
 
 
-def _jacobians(
+def _evaluate_jacobians(
     plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
 ) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return A, B, C and D of k plants."""
-    return _blocks(plant, _mapped(plant, jacobians, x, u, p))
+    return _stack_blocks(plant, _map_columns(plant, jacobians, x, u, p))
 
 
-def _blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:
+def _stack_blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return matrices as CasADi maps them, side by side, as stacks."""
     nx, nu, ny = len(plant.states), len(plant.inputs), len(plant.outputs)
     shapes = ((nx, nx), (nx, nu), (ny, nx), (ny, nu))
     return tuple(
-        item.reshape(rows, -1, width).transpose(1, 0, 2) for item, (rows, width) in zip(columns, shapes, strict=True)
+        block.reshape(rows, -1, width).transpose(1, 0, 2) for block, (rows, width) in zip(columns, shapes, strict=True)
     )
 
 
-def _mapped(
+def _map_columns(
     plant: Plant, make: Callable[[Plant], Any], *arguments: Float[np.ndarray, "_ k"]
 ) -> list[Float[np.ndarray, "_ _"]]:
     """Return a plant's CasADi function at every column, in blocks that CasADi maps over."""
@@ -395,7 +395,9 @@ def _exponential(
     return out[:, :n, :n], out[:, :n, n]
 
 
-def _static(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float) -> float:
+def _compute_static_gain(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
+) -> float:
     with np.errstate(divide="ignore", invalid="ignore"):
         try:
             return float(d - c @ np.linalg.solve(a, b)) if np.linalg.cond(a) < 1e14 else np.inf

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.loops.sampled_plant import DELAY, conditions_of
+from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
 from seaopt.control.running.sampled_loop import ENERGY, LoopState, SampledLoop, at_rest, whole_samples
 from seaopt.errors import SimulationError, suggestion
@@ -266,7 +266,7 @@ def _lags(loop: SampledLoop, params: Sequence[CompletedParameters]) -> dict[str,
     queue = loop.waiting
     lag, late_s = np.zeros((len(params), 2, queue + 1)), np.zeros(len(params))
     for run, values in enumerate(params):
-        delay = conditions_of(loop.plant, values).get(DELAY, 0.0)
+        delay = read_conditions(loop.plant, values).get(DELAY, 0.0)
         if not 0.0 <= delay <= loop.longest_delay_s:
             raise SimulationError(
                 f"{DELAY} = {delay:g} is outside 0 to longest_delay_s = {loop.longest_delay_s:g}; give the loop the "

@@ -1,6 +1,6 @@
 r"""A sampled loop at rest where a run's conditions are, such as an angle, instead of at zero.
 
-The plant rests in the state x and under the current I of `seaopt.control.loops.sampled_plant.resting`, its measured
+The plant rests in the state x and under the current I of `seaopt.control.loops.sampled_plant.find_rest`, its measured
 force being y. The law rests with it where :math:`x_c = A x_c + B_r r - B_y y` and :math:`C x_c + D_r r - D_y y = I/g`:
 one linear equation for its state and for the reference r that keeps the plant there. With an integrator r is y;
 without one it is what makes the law command I. The commands that wait are all I.
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.realisation import RunnableLaw
-from seaopt.control.loops.sampled_plant import resting
+from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
 from seaopt.plants import CompletedParameters, Plant
@@ -78,7 +78,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     """
     law, plant = loop.law, loop.plant
     observe = _observe(plant)
-    names, rows = list(plant.outputs), [resting(plant, values) for values in params]
+    names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
     figures = np.zeros((len(params), 4))
     z = np.zeros((len(params), law.c.size + loop.waiting))
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.loops.sampled_plant import DELAY, conditions_of
+from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
 from seaopt.control.running.sampled_loop import whole_samples
@@ -174,7 +174,7 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
-    conditions = conditions_of(plant, params)
+    conditions = read_conditions(plant, params)
     moved = [name for name, value in conditions.items() if name != DELAY and value]
     if moved:
         raise ControlError(

@@ -28,7 +28,7 @@ from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.port import PortModel, sight
+from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
 
@@ -182,7 +182,7 @@ class Task:
         if self.port is not None and self.spec.passive_band_hz is not None:
             low, high = self.spec.passive_band_hz
             inside = np.flatnonzero((f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9)))
-            port[inside], unit[inside] = sight(
+            port[inside], unit[inside] = weigh_passivity(
                 self.port, self.spec.sample_time_s, self.spec.delay_samples, f[inside]
             )  # fmt: skip
         return Grid(f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from seaopt.control.loops.sampled_plant import DELAY, conditions, conditions_of
+from seaopt.control.loops.sampled_plant import DELAY, conditions, read_conditions
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_linear
@@ -157,7 +157,7 @@ def build_region(plant: Plant, unknown: Uncertainty) -> Region:
     slopes[count:, ball:] = np.diag([0.5 * (high - low) for low, high in wide.values()])
     middle = [0.5 * (low + high) for low, high in wide.values()]
     nominal = plant.complete(unknown.nominal)
-    held = {name: value for name, value in conditions_of(plant, nominal).items() if name not in ends}
+    held = {name: value for name, value in read_conditions(plant, nominal).items() if name not in ends}
     return Region(
         names=(*names, *wide), centre=np.array([*unknown.nominal.values_of(tuple(names)), *middle], dtype=float),
         slopes=slopes, low=np.array([*(unknown.nominal[n].min for n in names), *[-np.inf] * len(wide)], dtype=float),

@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.response import LARGEST_ENTRY, law_state_space
-from seaopt.control.loops.sampled_plant import DELAY, LinearPlants, conditions, conditions_of, hold, linearised
+from seaopt.control.loops.sampled_plant import DELAY, LinearPlants, conditions, hold, linearise, read_conditions
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -82,9 +82,7 @@ def batch_figures(
             at = {name: column[block] for name, column in extra.items()}
             none = np.zeros(block.stop - block.start)
             delays = at.get(DELAY, none) if chain else none
-            continuous = linearised(
-                plant, values[:, block], at, controller.spec.measured, controller.command.per_effort
-            )
+            continuous = linearise(plant, values[:, block], at, controller.spec.measured, controller.command.per_effort)
             pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, none.size, CURVE_BLOCK)]
             parts += pool.map(
                 lambda piece, matrices=continuous, delay=delays: _close_piece(
@@ -107,7 +105,7 @@ def expand_draws(
     for row, name in enumerate(plant.parameters):
         if name in draws:
             values[row] = draws[name]
-    known = conditions_of(plant, nominal)
+    known = read_conditions(plant, nominal)
     extra = {
         name: draws[name] if name in draws else np.full(count, known[name])
         for name in conditions((plant,))

@@ -21,7 +21,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.loops.sampled_plant import DELAY, hold, linearised_along
+from seaopt.control.loops.sampled_plant import DELAY, differentiate_linearisation, hold
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import BatchFigures, Products, compute_products, expand_draws, find_peaks
@@ -107,7 +107,9 @@ def _sample_plants(
     dp = np.stack([slopes.get(name, np.zeros(points.shape)).ravel() for name in plant.parameters])
     dat = {name: slopes.get(name, np.zeros(points.shape)).ravel() for name in at}
     spec, none = controller.spec, np.zeros(count * width)
-    matrices, derivatives = linearised_along(plant, p, at, dp, dat, spec.measured, controller.command.per_effort)
+    matrices, derivatives = differentiate_linearisation(
+        plant, p, at, dp, dat, spec.measured, controller.command.per_effort
+    )
     a, b, c, d = (value + 1j * COMPLEX_STEP * slope for value, slope in zip(matrices, derivatives, strict=True))
     late = at.get(DELAY, none) + 1j * COMPLEX_STEP * dat.get(DELAY, none)
     stepped = hold(a, b, c, d, controller.sample_time_s, late)

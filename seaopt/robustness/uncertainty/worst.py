@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.loops.sampled_plant import conditions, conditions_of
+from seaopt.control.loops.sampled_plant import conditions, read_conditions
 from seaopt.formatting import format_figure, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -144,7 +144,7 @@ def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, a
     values = plant.complete(nominal)
     changed = {name: value for name, value in at.items() if name in values}
     placed = {name: value for name, value in at.items() if name in extra}
-    known = conditions_of(plant, nominal) | placed
+    known = read_conditions(plant, nominal) | placed
     values = values.update(**changed).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
     figures = controller.close(plant, values).figures()
     single = BatchFigures(

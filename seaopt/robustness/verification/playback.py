@@ -11,7 +11,7 @@ from jaxtyping import Float
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
-from seaopt.control.loops.sampled_plant import conditions_of
+from seaopt.control.loops.sampled_plant import read_conditions
 from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.errors import ControlError
@@ -170,7 +170,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         raise ControlError("params is empty; give one ParameterSet per run")
     placed = [stage.plant.complete(drawn) for drawn in params]
     delays = [[drawn.given[DELAY]] if DELAY in drawn.given else [] for drawn in placed]
-    longest = max(conditions_of(stage.plant, drawn).get(DELAY, 0.0) for drawn in placed)
+    longest = max(read_conditions(stage.plant, drawn).get(DELAY, 0.0) for drawn in placed)
     carried = [drawn.with_parameters(*delay) for drawn, delay in zip(placed, delays, strict=True)]
     rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
     now, grip = _start_state(stage, scenario, placed, longest) if rest is None else rest.state, None

@@ -328,7 +328,7 @@ def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
     import casadi as ca
     from scipy.optimize import fsolve
 
-    from seaopt.control.loops.sampled_plant import conditions, linearised
+    from seaopt.control.loops.sampled_plant import conditions, linearise
     from seaopt.parameters import Parameter
 
     f = ca.Function("f", [swing.x, swing.u, swing.p], [swing.dynamics])
@@ -344,7 +344,7 @@ def test_an_angle_is_linearised_where_the_plant_rests(swing, thor):
     x0[k], x0[names.index("q")] = 0.4, q
     current = float(fsolve(lambda i: float(np.array(f(x0, i, p)).ravel()[names.index("qd")]), 0.0)[0])
     assert np.abs(np.array(f(x0, current, p))).max() < 1e-6
-    a, _, c, _ = linearised(swing, np.array(p)[:, None], {"phi": np.array([0.4])}, "F1", 1.0)
+    a, _, c, _ = linearise(swing, np.array(p)[:, None], {"phi": np.array([0.4])}, "F1", 1.0)
     for i in range(len(names)):
         step = np.zeros(len(names))
         step[i] = 1e-6
