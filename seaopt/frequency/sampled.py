@@ -25,7 +25,7 @@ def sampled_response(
     Parameters
     ----------
     model : Model
-        Linear; see `seaopt.simulation.linearised`.
+        Linear; see `seaopt.simulation.linearise`.
     theta : array, shape (np,)
         Its free parameters.
     clock : Clock

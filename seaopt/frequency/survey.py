@@ -30,7 +30,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, SeriesSpring
 from seaopt.plants.plant import evaluate
 from seaopt.records import record
-from seaopt.simulation import Clock, linearised, make_model
+from seaopt.simulation import Clock, linearise, make_model
 
 MIN_SAMPLES = 256  # samples
 SMOOTH = 5  # lines of which the median coherence decides where a band ends
@@ -124,7 +124,7 @@ class Survey:
 
     def model(self, pair: Pair, params: ParameterSet) -> ResponseFunction:
         """Return the plant's response as the sensors see it, linearised at rest, as a function of frequencies in Hz."""
-        model = linearised(make_model(self.plant, params, (), (pair.output,)))
+        model = linearise(make_model(self.plant, params, (), (pair.output,)))
         clock = replace(self.clock, delay_free=False)
         source, gain = list(self.plant.inputs).index(pair.source), self.gain.get(pair.output, 1.0)
 
@@ -292,7 +292,7 @@ def _is_form(plant: Plant, spring: SeriesSpring, values: ParameterSet, pair: Pai
     """Tell whether the plant at rest has two poles, no zero from input to output, and b = k/m_k."""
     if len(plant.states) != 2 or spring.mass is None or spring.stiffness is None:
         return False
-    model = linearised(make_model(plant, values, (), (pair.output,)))
+    model = linearise(make_model(plant, values, (), (pair.output,)))
     g, _ = model.matrices(np.zeros(0))
     a, b, source = g[:2, :2], g[:2, 2 + list(plant.inputs).index(pair.source)], g[2]
     through = source[2 + list(plant.inputs).index(pair.source)]

@@ -31,7 +31,7 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     return np.dtype([
         ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
         ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole),
-        ("start", whole), ("shown", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer),
+        ("start", whole), ("output_rows", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer),
         ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer),
         ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
         ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
@@ -210,7 +210,7 @@ class Program:
         *,
         sums: bool = True,
         outputs: bool = False,
-        shown: int | None = None,
+        output_rows: int | None = None,
         columns: bool = False,
         states: bool = False,
         resume: Float[np.ndarray, " m"] | None = None,
@@ -219,9 +219,9 @@ class Program:
     ) -> Pass:
         """Run the shots between neighbouring `edges`; with `resume`, one stretch that goes on where it stopped.
 
-        Outputs are those of the first samples `shown`, of all if it is left out. Outputs and columns are written into
-        the `room` of a pass that is not needed any more, if there is one. A shot starts so many samples ahead of its
-        edge as `warm` says.
+        Outputs are those of the first `output_rows` samples, of all if it is left out. Outputs and columns are written
+        into the `room` of a pass that is not needed any more, if there is one. A shot starts so many samples ahead of
+        its edge as `warm` says.
         """
         alone = len(edges) == 2 and resume is None and sums and not (outputs or columns or states)
         if alone and self.run_up and edges[1] - edges[0] >= max(PARALLEL, 4 * self.run_up):
@@ -231,7 +231,7 @@ class Program:
             return Pass(gram=gram, loss=loss, count=count, last=parts.last[1:])
         shots, nx, ny, layout = len(edges) - 1, self.model.nx, self.model.ny, self.layout
         n, nc, first = int(edges[-1] - edges[0]), layout.columns, int(edges[0])
-        rows = n if shown is None else min(shown, n)
+        rows = n if output_rows is None else min(output_rows, n)
         if x0.shape != (shots, nx) or first < 0 or edges[-1] > self.segment.n or np.any(np.diff(edges) < 0):
             raise SimulationError(f"{shots} shots of {nx} states over {self.segment.n} samples: x0 or edges do not fit")
         result = Pass(
@@ -243,7 +243,7 @@ class Program:
         )  # fmt: skip
         start = np.ascontiguousarray(x0, dtype=float)
         arguments = np.repeat(self.base, shots)
-        arguments["from"], arguments["to"], arguments["shown"] = edges[:-1] - warm, edges[1:], rows
+        arguments["from"], arguments["to"], arguments["output_rows"] = edges[:-1] - warm, edges[1:], rows
         arguments["start"], arguments["warm"] = edges[:-1] - warm if resume is None else 0, warm
         arguments["x0"] = row_addresses(start)
         sums_of = {"rho": result.loss, "count": result.count, "last": result.last}

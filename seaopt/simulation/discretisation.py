@@ -168,9 +168,9 @@ def _first_order(
     n[nx : nx + nu, nx + nu : nx + 2 * nu] = np.eye(nu)
     whole, dwhole = expm_with_derivatives(n * period, dn * period)
 
-    def arranged(e: Float[np.ndarray, "... m m"]) -> Float[np.ndarray, "... nx v"]:
+    def arrange(e: Float[np.ndarray, "... m m"]) -> Float[np.ndarray, "... nx v"]:
         slope = e[..., :nx, nx + nu : nx + 2 * nu] / period
         start = e[..., :nx, nx : nx + nu] - slope
         return np.concatenate([e[..., :nx, :nx], start, slope, e[..., :nx, -1:]], axis=-1)
 
-    return arranged(whole), arranged(dwhole)
+    return arrange(whole), arrange(dwhole)

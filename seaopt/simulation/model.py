@@ -144,15 +144,15 @@ def depends_on_time(model: Model) -> bool:
     return bool(ca.depends_on(ca.vertcat(model.f, model.h), model.t))
 
 
-def linearised(model: Model) -> Model:
+def linearise(model: Model) -> Model:
     """Return the model linearised at zero state and input."""
     if model.linear:
         return model
-    return replace(_linearise(model), constants=model.constants)
+    return replace(_linearise_equations(model), constants=model.constants)
 
 
 @memo
-def _linearise(model: Model) -> Model:
+def _linearise_equations(model: Model) -> Model:
     point = ca.vertcat(model.x, model.u)
     both = ca.vertcat(model.f, model.h)
     slope, constant = ca.substitute(

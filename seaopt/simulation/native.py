@@ -8,8 +8,9 @@ the hash of their source, flags and compiler. ``SEAOPT_COMPILER`` names a compil
 ``SEAOPT_CACHE_DIR`` names the folder.
 
 Threads write to arrays by address, which nothing but this module keeps alive. An interrupt (Ctrl-C) reaches the main
-thread alone, while the others still write: `Kernel.run` raises it when they have ended, and each thread holds on to the
-arrays of its jobs, so that no memory is freed under it whatever becomes of the caller.
+thread alone, while the others still write: `Kernel.run` raises it when they have ended. Between two instructions of
+Python another one may still end that wait; but each thread holds on to the arrays of its jobs, so that no memory is
+freed under it whatever becomes of the caller.
 """
 
 from __future__ import annotations
@@ -177,7 +178,7 @@ class Kernel:
         Raises
         ------
         KeyboardInterrupt
-            Once no thread works on these jobs any more.
+            Once no thread works on these jobs any more; those that none has begun are left.
 
         """
         inside = threading.current_thread().name.startswith(
@@ -187,28 +188,36 @@ class Kernel:
         bounds, size = np.linspace(0, len(jobs), parts + 1).astype(int), jobs.dtype.itemsize
         spans = [(jobs.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds)]
         owners = (jobs, buffers)
-        others: list[Future[None]] = []
+        futures = [Future[None]() for _ in spans[1:]]  # ahead of their calls: an interrupt may lose what submit returns
+        interrupt: BaseException | None = None
         try:
-            for span in spans[1:]:
-                others.append(threads().submit(_call, self.function, *span, owners))
+            for future, span in zip(futures, spans[1:], strict=True):
+                threads().submit(_call, future, self.function, *span, owners)
             self.function(*spans[0])
-        finally:
-            _join(others)
-        for other in others:
-            other.result()
+        except BaseException as error:
+            interrupt = error
+        _join(futures, interrupt)
 
 
-def _call(function: Any, address: int, count: int, owners: object) -> None:
-    """Call a native function; until it returns, this call holds on to the `owners` of its memory."""
-    function(address, count)
-
-
-def _join(futures: list[Future[None]]) -> None:
-    """Wait for all; interrupts meanwhile are one, raised at the end."""
-    interrupt: KeyboardInterrupt | None = None
-    while not all(future.done() for future in futures):
+def _call(future: Future[None], function: Any, address: int, count: int, owners: object) -> None:
+    """Call a native function unless its future is cancelled; hold on to the `owners` of its memory meanwhile."""
+    if future.set_running_or_notify_cancel():
         try:
-            wait(futures)
+            function(address, count)
+        finally:
+            future.set_result(None)
+
+
+def _join(futures: list[Future[None]], interrupt: BaseException | None) -> None:
+    """Wait for all that have begun, and without an interrupt for all; the last interrupt is raised at the end."""
+    waiting = True
+    while waiting:
+        try:
+            if interrupt is not None:
+                for future in futures:
+                    future.cancel()
+            wait([future for future in futures if not future.done()])
+            waiting = False
         except KeyboardInterrupt as error:
             interrupt = error
     if interrupt is not None:

@@ -22,7 +22,7 @@ typedef struct {
     long lag_a, lag_b;             /* rows of u in force: u[k - lag_a], u[k - lag_b]; clamped to the log */
     long settle;                   /* rows from `start` that are left out while the filter settles */
     long start;                    /* first row of the stretch; later than `from` is not allowed */
-    long shown;                    /* rows from `from` whose outputs are kept */
+    long output_rows;              /* rows from `from` whose outputs are kept */
     double t0;                     /* time of row 0 */
     double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
     const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
@@ -37,7 +37,7 @@ typedef struct {
     double *gram;                  /* NY x NC x NC, added to, or NULL: no sums are made */
     double *rho;                   /* NY: sum of losses, added to; unless gram is NULL */
     double *count;                 /* NY: samples counted, added to; unless gram is NULL */
-    double *outputs;               /* shown x NY or NULL */
+    double *outputs;               /* output_rows x NY or NULL */
     double *columns;               /* (to - from) x NY x NC or NULL */
     double *states;                /* (to - from) x NX or NULL */
     double *last;                  /* NX x NJ: Z one step after the last row, or NULL; without sums, columns and influences
@@ -392,7 +392,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
         observe(q, a, k, q->y, wide);
         if (a->states)
             for (int i = 0; i < NX; i++) a->states[(k - a->from) * NX + i] = q->z[i][0];
-        if (a->outputs && k - a->from < a->shown)
+        if (a->outputs && k - a->from < a->output_rows)
             for (int o = 0; o < NY; o++) a->outputs[(k - a->from) * NY + o] = q->y[o][0];
         double *v[NY];
         for (int o = 0; a->y[0] && o < NY; o++) {

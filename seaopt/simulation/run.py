@@ -26,7 +26,7 @@ def run_passes(
     edges: Int[np.ndarray, " shots1"] | None = None,
     sums: bool = True,
     outputs: bool = False,
-    shown: int | None = None,
+    output_rows: int | None = None,
     columns: bool = False,
     states: bool = False,
 ) -> Pass:
@@ -44,7 +44,7 @@ def run_passes(
         Whether Gram matrices, losses, counts and derivatives are wanted: a simulation alone is several times quicker.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
-    shown : int, optional
+    output_rows : int, optional
         Keep the outputs of so many first samples only; of one shot.
 
     Returns
@@ -57,11 +57,15 @@ def run_passes(
     rows = edges if edges is not None else np.array([0, segment.n])
     program = Program.make(model, segment, point, chosen)
     if program is not None:
-        return program.run(rows, x0, sums=sums, outputs=outputs, shown=shown, columns=columns, states=states)
+        return program.run(
+            rows, x0, sums=sums, outputs=outputs, output_rows=output_rows, columns=columns, states=states
+        )
     result = interpreted_passes(
         model, segment, point, chosen, rows, x0, outputs=outputs, columns=columns, states=states
     )
-    return result if shown is None or result.outputs is None else replace(result, outputs=result.outputs[:shown].copy())
+    if output_rows is None or result.outputs is None:
+        return result
+    return replace(result, outputs=result.outputs[:output_rows].copy())
 
 
 def stream(

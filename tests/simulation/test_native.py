@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import weakref
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -117,13 +118,33 @@ def test_an_interrupt_waits_for_the_threads(slow_jobs, interrupts, monkeypatch):
 
 
 @needs_compiler
+@pytest.mark.parametrize("queued", [True, False])
+def test_an_interrupt_while_jobs_are_handed_out_waits_for_the_threads(slow_jobs, queued, monkeypatch):
+    """For those that have begun: the second thread's work goes to the queue, or is lost."""
+    kernel, jobs, results = slow_jobs
+    jobs["wait_s"] = 0.0, 0.3
+    pool = native.threads()
+
+    def submit(*arguments):
+        if queued:
+            begun = pool.submit(*arguments)
+            while not begun.running():
+                time.sleep(1e-3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(native, "threads", lambda: SimpleNamespace(submit=submit))
+    with pytest.raises(KeyboardInterrupt):
+        kernel.run(jobs, results)
+    np.testing.assert_array_equal(results, [0.0, float(queued)])
+
+
+@needs_compiler
 def test_a_thread_keeps_its_memory(slow_jobs, monkeypatch):
     """Even where nobody waits for it."""
     kernel, jobs, results = slow_jobs
     jobs["wait_s"] = 0.0, 0.3
-    monkeypatch.setattr(native, "_join", lambda futures: None)
     waiting = []
-    monkeypatch.setattr(native.Future, "result", lambda future, timeout=None: waiting.append(future))
+    monkeypatch.setattr(native, "_join", lambda futures, interrupt: waiting.extend(futures))
     kernel.run(jobs, results)
     memory = weakref.ref(results)
     del jobs, results, slow_jobs

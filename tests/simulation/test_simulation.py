@@ -264,7 +264,7 @@ def test_a_simulation_alone_is_that_with_sums(name, corrected, thor):
     for found, expected in ((alone.outputs, whole.outputs), (alone.states, whole.states)):
         scale = np.max(np.abs(expected), axis=0)
         np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-11)
-    first = run_passes(model, segment, point, x0, weights, outputs=True, shown=9).outputs
+    first = run_passes(model, segment, point, x0, weights, outputs=True, output_rows=9).outputs
     np.testing.assert_array_equal(first, whole.outputs[:9])
 
 

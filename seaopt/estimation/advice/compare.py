@@ -407,7 +407,7 @@ def _explain(
         ]
     elif evidence == "undecided":
         sentences = [
-            f"undecided between {first.name} and {second.name}: {counted}; excite or measure what tells them apart"
+            f"undecided between {first.name} and {second.name}: {counted}; excite or measure where they differ"
         ]
     else:
         sentences = [f"{first.name} is preferred, with {evidence} evidence against {second.name}: {counted}"]

@@ -419,7 +419,7 @@ def _advise_on_held_out(output: FitOutput, row: OutputDiagnostics, free: Residua
 
 
 def _advise_on_leverage(leverage: Mapping[str, Leverage]) -> list[str]:
-    """Return which experiment tells nothing, and which parameters only their priors tell."""
+    """Return which experiment adds nothing, and which parameters are known from their priors alone."""
     sentences: list[str] = []
     for name, source in leverage.items():
         if name != PRIORS and len(leverage) > 1 and source.whole < LITTLE:

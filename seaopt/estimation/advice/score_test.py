@@ -11,7 +11,7 @@ coloured residuals. :math:`s^2 / \operatorname{var} s` is chi-square with one de
 Proc. Cambridge Phil. Soc. 44, 1948; for residuals that are not as assumed White, Econometrica 50, 1982). One
 Gauss-Newton step with c free moves it by -s/I, and the cost falls by s^2/(2 I). What would lower it most is
 refitted: one step is not enough where a resonance has to move. Parameters whose refits are as likely are named
-together, for no residual tells which of them is wrong.
+together, for no residual shows which of them is wrong.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from seaopt.units import unit_after
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 REDUNDANT = 1e-7  # of what a parameter does to the outputs: less of it left, and the free ones do the same
 SHARE = 0.3  # of the most that a step lowers the cost: a step is not a refit, and the best may be another
-ALIKE = 3.0  # of log-likelihood: what no residual tells apart
+ALIKE = 3.0  # of log-likelihood: what no residual distinguishes
 EXPLAINED_POWER = 0.1  # of a residual's: a parameter that leaves less is at fault, whatever else may be
 REFIT_ITERATIONS = 25
 MOST_REFITTED = 5  # parameters

@@ -307,7 +307,7 @@ def _design(search: ExcitationSearch, candidate: Candidate, criterion: str) -> D
     for name in names:
         if not np.isfinite(covariance.std(name)):
             raise EstimationError(
-                f"{name} cannot be told from the other unknowns by any excitation that was tried; "
+                f"{name} cannot be distinguished from the other unknowns by any excitation that was tried; "
                 "fix one, give it a prior, or measure another output"
             )
     figures = (replace(bench.params[name], std=covariance.std(name)) for name in names)

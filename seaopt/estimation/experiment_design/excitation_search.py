@@ -118,7 +118,7 @@ class Measure:
     order: float
 
     def __call__(self, covariance: Float[np.ndarray, "p p"]) -> float:
-        """Return the criterion of a covariance; infinite where something cannot be told."""
+        """Return the criterion of a covariance; infinite where something cannot be identified."""
         if not np.all(np.isfinite(covariance)):
             return np.inf
         if self.weight is None:
@@ -154,7 +154,7 @@ def make_measure(bench: Bench, criterion: str) -> Measure:
 
 @record(eq=False)
 class Candidate:
-    """An excitation within the limits, what it tells, and its criterion."""
+    """An excitation within the limits, what it identifies, and its criterion."""
 
     excitation: Excitation
     trial: Trial
@@ -220,7 +220,7 @@ def best_multisine(search: ExcitationSearch, band: tuple[float, float], chosen: 
     Raises
     ------
     EstimationError
-        Nothing in the band tells the free parameters apart, or a setting is out of range.
+        Nothing in the band distinguishes the free parameters, or a setting is out of range.
 
     """
     bench = search.bench

@@ -26,12 +26,12 @@ from seaopt.simulation import Clock, Model, Pass, Point, Segment, make_model, ru
 
 @record(eq=False)
 class Trial:
-    """What a simulated log tells and what it takes.
+    """What a simulated log identifies and what it takes.
 
     Parameters
     ----------
     covariance : array, shape (p, p)
-        Expected of the free parameters; infinite where they cannot be told.
+        Expected of the free parameters; infinite where they cannot be identified.
     rms : float
         Of the input.
     peaks : mapping of signal to float

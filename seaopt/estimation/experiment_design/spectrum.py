@@ -27,7 +27,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import EstimationError
 from seaopt.records import record
-from seaopt.simulation import Clock, Model, linearised, transition
+from seaopt.simulation import Clock, Model, linearise, transition
 
 ORDERS = (2, 8, 32)  # half the orders of the norms that become the peak
 SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of the largest are zero
@@ -35,7 +35,7 @@ SINGULAR = 1e-11  # eigenvalues of the normalised information below this part of
 
 @record(eq=False)
 class Spectrum:
-    """What one ampere squared at each of K frequencies tells, and what it moves.
+    """What one ampere squared at each of K frequencies identifies, and what it moves.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def make_spectrum(
         Limited signals: -1 is the input, then the outputs, then the states.
 
     """
-    linear = linearised(model)
+    linear = linearise(model)
     blocks = transition(linear, theta, clock)
     z = np.exp(2j * np.pi * multiples / n)
     response = np.array([_response(blocks, linear.nx, linear.nu, channel, clock, zk) for zk in z])
@@ -163,7 +163,7 @@ def optimal_powers(
 
     Examples
     --------
-    Of two lines, the one that tells four times as much gets twice the power if sum of variances counts less:
+    Of two lines, the one that informs four times as much gets twice the power if sum of variances counts less:
 
     >>> lines = np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
     >>> optimal_powers(lines, np.ones((1, 2)), weight=np.eye(2)).round(4)

@@ -64,7 +64,7 @@ class FitSegment:
 
     @property
     def has_start(self) -> bool:
-        """Whether the initial state can be told: not where all samples are held out, which then tell nothing."""
+        """Whether the data show the initial state: not where all samples are held out."""
         return not self.samples.keep or bool(np.any(self.samples.keep[0]))
 
 
@@ -192,10 +192,10 @@ class FitExperiment:
     def run_all(self, z: Float[np.ndarray, " n"]) -> tuple[Pass, ...]:
         """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples."""
         point, weights = self.point(z), self.weights
-        shown = 0 if self.model.linear else FIRST_SAMPLES
+        rows = 0 if self.model.linear else FIRST_SAMPLES
         return tuple(
             run_passes(
-                self.model, segment.samples, point, segment.start(z)[None], weights, outputs=shown > 0, shown=shown
+                self.model, segment.samples, point, segment.start(z)[None], weights, outputs=rows > 0, output_rows=rows
             )
             for segment in self.segments
         )  # fmt: skip

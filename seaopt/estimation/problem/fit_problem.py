@@ -38,7 +38,7 @@ from seaopt.estimation.problem.fit_experiment import (
     make_segments,
 )
 from seaopt.estimation.problem.losses import Loss
-from seaopt.estimation.problem.normal_equations import QuadraticModel, solve_seen
+from seaopt.estimation.problem.normal_equations import QuadraticModel, TrustRegionStep, solve_seen
 from seaopt.estimation.problem.unknowns import Unknowns, collect
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
@@ -145,10 +145,9 @@ class FitProblem:
         names = (experiment.name for experiment in self.experiments)
         return self.assemble(PassSet(z=z, by_experiment=dict(zip(names, passes, strict=True))))
 
-    def take_step(self, here: Evaluation, z: Float[np.ndarray, " n"], share: float) -> Evaluation:
-        """Return the evaluation at the end of a step: all unknowns are in z."""
-        del here, share
-        return self.evaluate(z)
+    def take_step(self, step: TrustRegionStep[Evaluation]) -> Evaluation:
+        """Return the evaluation at the end of a step."""
+        return self.evaluate(step.end)
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which callers check
     def assemble(self, passes: PassSet, to: Float[np.ndarray, " n"] | None = None) -> Evaluation:
@@ -190,7 +189,7 @@ class FitProblem:
 
     @property
     def straight(self) -> bool:
-        """Whether a pass tells the weighted residuals nearby: it does for least squares of simulation errors."""
+        """Whether a pass gives the weighted residuals nearby too: it does for least squares of simulation errors."""
         return self.loss.quadratic and not self.predicts
 
     @property

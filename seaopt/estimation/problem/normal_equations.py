@@ -6,6 +6,8 @@ directions that the data do not show: they are left out, as in a pseudo-inverse.
 
 from __future__ import annotations
 
+from typing import Generic, TypeVar
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -18,7 +20,7 @@ RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the lar
 class QuadraticModel:
     """A sum of squares near `z`: half of it (the cost), its gradient and its Gauss-Newton Hessian.
 
-    `linear` tells in which unknowns residuals are affine: a step may change those at will.
+    `linear` marks the unknowns in which residuals are affine: a step may change those at will.
     """
 
     z: Float[np.ndarray, " n"]
@@ -34,6 +36,23 @@ class QuadraticModel:
     def predict_fall(self, step: Float[np.ndarray, " n"]) -> float:
         """Return by how much a step lowers the cost."""
         return -float(self.gradient @ step + 0.5 * step @ self.hessian @ step)
+
+
+M = TypeVar("M", bound=QuadraticModel)
+
+
+@record(eq=False)
+class TrustRegionStep(Generic[M]):
+    """A step from the minimum's model at `start` to `end`; `damping` is its lambda, 0 where the region is no limit."""
+
+    start: M
+    end: Float[np.ndarray, " n"]
+    damping: float
+
+    @property
+    def moved(self) -> Float[np.ndarray, " n"]:
+        """How far the unknowns move."""
+        return self.end - self.start.z
 
 
 def add_gram(

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation import Model, Point, transition
 from seaopt.simulation.discretisation import expm_with_derivatives
@@ -95,20 +96,22 @@ class SteadyStateFilter:
     def _mean_derivatives(
         self, model: Model, theta: Float[np.ndarray, " np"], period: float
     ) -> tuple[Float[np.ndarray, "nx nx"], Float[np.ndarray, "ny nx"]]:
-        key = f"mean derivatives {len(self.places)}"
-        if key not in model.memory:
-            columns = [ca.densify(ca.jacobian(e, model.x)) for e in (model.f, model.h)]
-            one = ca.Function("derivatives", [model.t, model.x, model.u, model.p], columns)
-            model.memory[key] = one.map(len(self.places))
         m, nx = self.places.shape[0], model.nx
         p = np.repeat(model.parameters(theta)[:, None], m, axis=1)
-        f, h = model.memory[key](0.0, self.places[:, :nx].T, self.places[:, nx:].T, p)
+        f, h = _map_derivatives(model, m)(0.0, self.places[:, :nx].T, self.places[:, nx:].T, p)
         rates, limit = np.array(f).reshape(nx, m, nx), RATE_LIMIT / period
         mean = rates.mean(axis=1)
         diagonal = np.clip(rates[np.arange(nx), :, np.arange(nx)], -limit, limit)
         # What is to hold the plant to the log wherever it is must do so where it is damped least.
         mean[np.diag_indices(nx)] = diagonal.mean(axis=1) if self.follows else diagonal.max(axis=1)
         return mean, np.array(h).reshape(model.ny, m, nx).mean(axis=1)
+
+
+@memo
+def _map_derivatives(model: Model, count: int) -> ca.Function:
+    """Return the function that gives the derivatives of f and h by the state at `count` places."""
+    columns = [ca.densify(ca.jacobian(e, model.x)) for e in (model.f, model.h)]
+    return ca.Function("derivatives", [model.t, model.x, model.u, model.p], columns).map(count)
 
 
 def kalman_gain(

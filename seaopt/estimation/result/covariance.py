@@ -8,7 +8,7 @@ residuals is :math:`H^{-1}`. Residuals of a real log are coloured; then
 with R the correlation of the residuals of all outputs, at all lags (Ljung, System Identification, 2nd ed., Sec. 9.5;
 Newey and West 1987). R is estimated from the residuals under a Parzen window, whose spectral matrix is never
 indefinite. A fit takes out of a short log's residuals what its parameters can follow, which leaves them anticorrelated
-and would make B too small: where no lag of a short log can be told from chance, lags may widen the covariance but not
+and would make B too small: where no lag of a short log differs from chance, lags may widen the covariance but not
 narrow it. With a robust loss the residuals in B are what the loss makes of them, and J^T J counts each sample with the
 loss's second derivative; for white residuals B is then E[psi^2] J^T J, psi the loss's derivative (Huber, Robust
 Statistics, 1981, ch. 7).
@@ -39,11 +39,11 @@ from seaopt.estimation.problem.residual_statistics import (
 from seaopt.records import record
 from seaopt.simulation import double_sum
 
-CHANCE_CORRELATION = 2.0  # correlations above this times sqrt(log10(n) / n) are told from chance
+CHANCE_CORRELATION = 2.0  # correlations above this times sqrt(log10(n) / n) differ from chance
 SINGLE_THREADED = 512  # samples of a product that the linear-algebra library does on one thread
 COMPILED_LAGS = 64  # that a compiled pass sums more quickly than transforms do
 SHORT_LOG = 5000  # samples, beyond which what a fit takes out of its own residuals no longer matters
-SHORTEST_WINDOW, WIDER = 8, 3.0  # and a window's reach over the last lag that is told from chance
+SHORTEST_WINDOW, WIDER = 8, 3.0  # and a window's reach over the last lag that differs from chance
 
 
 @record(eq=False)
@@ -202,7 +202,7 @@ class _Form:
 def estimate_correlations(statistics: ResidualStatistics) -> tuple[Float[np.ndarray, "lags1 ny ny"], int]:
     """Return R(k)[a, b] = correlation of r_a(t) with r_b(t - k), k = 0..lags, under a Parzen window, and the last lag.
 
-    The last lag is that at which correlation can be told from chance. The window reaches three times as far (after
+    The last lag is that at which correlation differs from chance. The window reaches three times as far (after
     Politis, J. Nonparametric Statistics 15, 2003): a longer one would let noise in, which makes intervals too narrow.
     """
     count = np.maximum(statistics.count, 1.0)
@@ -213,7 +213,7 @@ def estimate_correlations(statistics: ResidualStatistics) -> tuple[Float[np.ndar
 
 
 def _find_last_lag(r: Float[np.ndarray, "ny ny lags1"], count: float) -> int:
-    """Return the last lag before a run of lags at which no correlation can be told from chance; 0 if there is none."""
+    """Return the last lag before a run of lags at which no correlation differs from chance; 0 if there is none."""
     power = np.sqrt(np.maximum(np.diagonal(r[:, :, 0]), 1e-300))
     size = np.max(np.abs(r) / np.outer(power, power)[:, :, None], axis=(0, 1))[1:]
     seen = np.flatnonzero(size > CHANCE_CORRELATION * np.sqrt(np.log10(max(count, 10.0)) / max(count, 1.0)))

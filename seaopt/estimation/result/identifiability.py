@@ -3,7 +3,7 @@ r"""What the data tell of the parameters, and what they cannot: rank, condition,
 The Hessian of the parameters, everything else an experiment has of its own eliminated, is scaled to a unit diagonal. An
 eigenvalue that is zero to rounding is a direction in which the parameters can change together without any effect on
 any output (a null direction of the sensitivities); a small one is a direction that only the parameters' different
-shares in the noise tell apart. Whether a null direction belongs to the plant or to the log is told by a second look:
+shares in the noise distinguish. Whether a null direction belongs to the plant or to the log follows from a second look:
 the sensitivities to a rich made-up input. What that does not show, no log of these outputs can show.
 """
 
@@ -125,7 +125,8 @@ def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
     names = sorted(direction)
     if len(names) == 1:
         if alone_seen:
-            return f"{names[0]} cannot be told from an experiment's own unknowns (gain, offset, delay, initial state)"
+            kinds = "gain, offset, delay, initial state"
+            return f"{names[0]} cannot be distinguished from an experiment's own unknowns ({kinds})"
         return f"{names[0]} has no effect on any output"
     if len(names) == 2 and abs(abs(direction[names[0]]) - abs(direction[names[1]])) < 1e-2:
         how = "product" if direction[names[0]] * direction[names[1]] < 0.0 else "ratio"

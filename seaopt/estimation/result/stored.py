@@ -1,6 +1,7 @@
-"""What a fit.json holds, as pydantic models, and its way back to the fields of a `Fit`.
+"""What a fit.json holds, as pydantic models, and how the fields of a `Fit` are read from it.
 
-Null stands for what is infinite: the std of a parameter that the data do not tell, and a bound that is not there.
+Null stands for what is infinite: the std of a parameter that the data do not identify, a bound that is not there, and
+the step error of a fit that overflows.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ class StoredExperiment(ResultTable):
 
 
 class StoredIdentifiability(ResultTable):
-    """What the data tell of the free parameters."""
+    """Which of the free parameters the data identify."""
 
     rank: Whole
     free: Whole
@@ -155,8 +156,8 @@ class StoredFit(ResultTable):
     iterations: Whole
     samples: Whole
     wall_s: Number
-    step_error_sigma: NullIsNaN = 0.0
-    step_error_parameter: NullIsNaN = 0.0
+    step_error_sigma: NullIsInfinite = 0.0
+    step_error_parameter: NullIsInfinite = 0.0
     log_likelihood: NullIsNaN = math.nan
     unknowns: Whole = 0
     method: str = "output_error"

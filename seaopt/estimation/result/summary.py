@@ -196,7 +196,7 @@ def _find_status(
             error = f"{step.output:.2g} sigma in an output and {step.parameter:.2g} std in a parameter"
             return "stalled", f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {error}"
         weak = "; ".join(
-            f"{join_names(sorted(direction))} are only weakly told apart (condition {known.condition:.2g}): "
+            f"{join_names(sorted(direction))} are only weakly distinguished (condition {known.condition:.2g}): "
             "each would be known far better if the others were"
             for direction in known.weak
         )

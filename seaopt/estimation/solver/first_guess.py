@@ -19,7 +19,7 @@ from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.records import record
-from seaopt.simulation import Model, linearised
+from seaopt.simulation import Model, linearise
 
 CANDIDATES = 128
 REFINED_CANDIDATES = 8
@@ -102,7 +102,7 @@ def _measure_target(experiment: FitExperiment) -> _Target | None:
     delay = experiment.slots.delay.value + (0.5 * log.period if data.hold == "zero" else 0.0)
     s = 2j * np.pi * estimates[0].frequency_hz[rows]
     gain = np.array([experiment.slots.gain[o].value for o in chosen])
-    model = linearised(experiment.model)
+    model = linearise(experiment.model)
     return _Target(
         model=model,
         index=experiment.theta.tolist(),

@@ -16,17 +16,16 @@ point (to the best linear unknowns, see `fit_problem`); the region does not boun
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.problem.normal_equations import QuadraticModel, solve_seen
+from seaopt.estimation.problem.normal_equations import M, QuadraticModel, TrustRegionStep, solve_seen
 from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
 Callback = Callable[[int, float], None]
-M = TypeVar("M", bound=QuadraticModel)
 
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE_DECREMENT = 1e-12  # of the cost
@@ -44,11 +43,8 @@ class Objective(Protocol[M]):
         """Return the model at z."""
         ...
 
-    def take_step(self, here: M, z: Float[np.ndarray, " n"], share: float) -> M:
-        """Return the model at z, to which a step was made from `here`.
-
-        `share` is 1 for a whole Gauss-Newton step and less for one that the region shortened, 1/(1 + lambda).
-        """
+    def take_step(self, step: TrustRegionStep[M]) -> M:
+        """Return the model at the end of a step."""
         ...
 
 
@@ -118,20 +114,19 @@ def minimise(
             )  # fmt: skip
         if iteration > max_iterations:
             break
-        step, multiplier = _step(here, blocked, scale, radius)
-        trial = np.clip(here.z + step, low, high)
-        moved = trial - here.z
-        length = float(np.linalg.norm(np.where(here.linear, 0.0, scale * moved)))
+        change, damping = _step(here, blocked, scale, radius)
+        step = TrustRegionStep(start=here, end=np.clip(here.z + change, low, high), damping=damping)
+        length = float(np.linalg.norm(np.where(here.linear, 0.0, scale * step.moved)))
         if radius < ROUNDING_RADIUS * max(float(np.linalg.norm(scale * here.z)), 1e-300):
             near = distance < ROUNDING_DECREMENT
             left = f"{np.sqrt(distance):.1g} standard deviations are left" if near else "the gradient is not zero"
             return Solution(
                 z=here.z, evaluation=here, status="converged" if near else "stalled", iterations=iteration,
-                message=f"no smaller step can be told from rounding, and {left}",
+                message=f"a smaller step would be lost in rounding, and {left}",
             )  # fmt: skip
-        whole = multiplier == 0.0 and bool(np.all(trial == here.z + step))
+        whole = damping == 0.0 and bool(np.all(step.end == here.z + change))
         if follow is not None and whole and _is_straight(distance, before, decrement + RELATIVE_DECREMENT * here.cost):
-            there = follow(here, trial)
+            there = follow(here, step.end)
             # A bound that held so far need not hold there.
             remaining = there.distance_squared(~find_blocked(there, low, high))
             if remaining <= decrement + RELATIVE_DECREMENT * there.cost:
@@ -141,12 +136,12 @@ def minimise(
                     z=there.z, evaluation=there, status="converged", iterations=iteration,
                     message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
                 )  # fmt: skip
-        predicted = here.predict_fall(moved)
-        there = objective.take_step(here, trial, 1.0 / (1.0 + multiplier))
+        predicted = here.predict_fall(step.moved)
+        there = objective.take_step(step)
         ratio = (here.cost - there.cost) / predicted if predicted > 0.0 and np.isfinite(there.cost) else -1.0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
-        elif ratio > 0.75 or multiplier == 0.0:
+        elif ratio > 0.75 or damping == 0.0:
             radius = max(radius, 2.0 * length)
         if ratio > 1e-4:
             here, before = there, distance if whole else 0.0

@@ -56,7 +56,7 @@ def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback
     decrement = NOISE_DECREMENT if problem.predicts else DECREMENT
     checks: Checks = {}
     rough, before = problem.straight and not explains_little(problem, here.power), 0.0
-    if rough:  # as good a start tells the sigmas well enough to come near the minimum, and there they are told well
+    if rough:  # so good a start gives sigmas good enough to come near the minimum, and there they are estimated well
         problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
         here = problem.assemble(here.passes)
     for attempt in range(MAX_ROUNDS):

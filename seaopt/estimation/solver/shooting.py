@@ -29,7 +29,7 @@ from seaopt.estimation.problem.experiment import Experiment, check_shots, cut_in
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment, ResidualPower
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Squares
-from seaopt.estimation.problem.normal_equations import QuadraticModel, add_gram
+from seaopt.estimation.problem.normal_equations import QuadraticModel, TrustRegionStep, add_gram
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.solver.least_squares import Callback, minimise
 from seaopt.estimation.solver.methods import Method, find_start
@@ -167,12 +167,14 @@ class Shooting:
         """Return the condensed model at z, with the nodes where the stage starts."""
         return self._condense(z, self.first_shots)
 
-    def take_step(self, here: CondensedModel, z: Float[np.ndarray, " n"], share: float) -> CondensedModel:
-        """Return the condensed model at z, with the nodes moved along."""
-        dz = z - here.z
-        return self._condense(
-            z, {name: tuple(s.move_nodes(dz, share) for s in row) for name, row in here.segments.items()}
-        )
+    def take_step(self, step: TrustRegionStep[CondensedModel]) -> CondensedModel:
+        """Return the condensed model at the end of a step, with the nodes moved along.
+
+        Of the nodes' own step they make the share 1/(1 + lambda), as the region shortens that of the parameters.
+        """
+        share, segments = 1.0 / (1.0 + step.damping), step.start.segments
+        moved = {name: tuple(s.move_nodes(step.moved, share) for s in row) for name, row in segments.items()}
+        return self._condense(step.end, moved)
 
     @np.errstate(all="ignore")
     def _condense(self, z: Float[np.ndarray, " n"], shots: ShotsByExperiment) -> CondensedModel:

@@ -337,7 +337,7 @@ def test_small_swings_hardly_tell_the_lever_arm(swing, thor):
     log = so.virtual_log(swing, truth, PAPER_SWING, duration_s=40, rate_hz=400, seed=1, sensors=sensors)
     fit = so.fit([experiment(swing, log)], truth.free("L_a", "I_p", "m", "d"))
     assert fit.status == "converged"
-    assert "I_p, L_a, d and m are only weakly told apart" in fit.message
+    assert "I_p, L_a, d and m are only weakly distinguished" in fit.message
     assert set(fit.identifiability.weak[0]) == {"I_p", "L_a", "d", "m"}
     known = so.fit([experiment(swing, log)], truth.free("I_p", "m", "d"))
     assert known.identifiability.weak == ()

@@ -126,8 +126,8 @@ def test_a_last_step_is_followed_without_an_evaluation_and_ends_where_scipy_does
             seen.append(z)
             return evaluation(z, z)
 
-        def take_step(self, here, z, share):
-            return self.evaluate(z)
+        def take_step(self, step):
+            return self.evaluate(step.end)
 
     bounds, start = np.full(2, np.inf), np.array([1.95, 0.71])
     all_made = minimise(Exponential(), start, -bounds, bounds)
