@@ -33,7 +33,7 @@ from jaxtyping import Float
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import CompletedParameters, Plant, evaluate, output_function
+from seaopt.plants.plant import CompletedParameters, Plant, dynamics_function, evaluate, output_function
 from seaopt.plants.roles import Port
 
 State = Float[np.ndarray, " n"]
@@ -165,7 +165,9 @@ def offset(plant: Plant, params: CompletedParameters, state: State, port: Port) 
 
 
 def check_held(plant: Plant, held: Plant) -> None:
-    """Refuse a plant that is not another with its first port held, as far as the names of their states tell.
+    """Refuse a plant that is not another with its first port held.
+
+    It is compared with the one that the port makes; where the port makes none, only the names of the states tell.
 
     Raises
     ------
@@ -174,11 +176,36 @@ def check_held(plant: Plant, held: Plant) -> None:
 
     """
     port = plant.port
-    link = (port.coordinate, port.rate) if port is not None else ()
-    if not link or tuple(held.states) != tuple(name for name in plant.states if name not in link):
+    if port is not None and port.held is not None:
+        same = _is_same(port.held(), held)
+    else:
+        link = (port.coordinate, port.rate) if port is not None else ()
+        same = bool(link) and list(held.states) == [name for name in plant.states if name not in link]
+    if not same:
         raise PlantError(
             f"{held.name} is not {plant.name} with a link fixed; give two plants with the same drive, spring and parts"
         )
+
+
+def _is_same(one: Plant, other: Plant) -> bool:
+    """Tell whether two plants have the same names, and f and (of outputs that both have) h agree at a random point."""
+    if list(one.states) != list(other.states) or list(one.inputs) != list(other.inputs):
+        return False
+    if set(one.parameters) != set(other.parameters):
+        return False
+    rng = np.random.default_rng(1)
+    x, u = rng.normal(size=len(one.states)), rng.normal(size=len(one.inputs))
+    p = {name: rng.uniform(0.5, 1.5) for name in one.parameters}
+    rates: list[Float[np.ndarray, " n"]] = []
+    outputs: list[dict[str, float]] = []
+    for plant in (one, other):
+        values = [p[name] for name in plant.parameters]
+        rates.append(np.array(dynamics_function(plant)(x, u, values)).ravel())
+        y = np.array(output_function(plant)(0.0, x, u, values)).ravel()
+        outputs.append(dict(zip(plant.outputs, y, strict=True)))
+    shared = [name for name in outputs[0] if name in outputs[1]]
+    read = [[of_plant[name] for name in shared] for of_plant in outputs]
+    return all(np.allclose(*pair, rtol=1e-9, atol=1e-12, equal_nan=True) for pair in (rates, read))
 
 
 def _read_motion(plant: Plant, port: Port) -> tuple[str, str, str]:

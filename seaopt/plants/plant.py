@@ -28,6 +28,7 @@ from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
+ENERGY = "energy"  # among the outputs of a simulation, what the plant stores (J)
 SLIDING = 1e6  # m/s or rad/s: a speed at which dry friction has its last level
 Matrices = tuple[
     Float[np.ndarray, "nx nx"],
@@ -419,6 +420,11 @@ def _check_names(plant: Plant) -> None:
             if name in seen:
                 raise PlantError(f'plant {plant.name}: "{name}" is in {seen[name]} and in {group}; rename one')
             seen[name] = group
+    if ENERGY in plant.outputs:
+        raise PlantError(
+            f'plant {plant.name}: the output "{ENERGY}" has the name of the simulated energy (J); rename the output, '
+            "and give energy=lambda x, p: ... where it is what the plant stores"
+        )
     for name, declared in plant.parameters.items():
         unit = declared.unit if isinstance(declared, Parameter) else declared
         if not unit.strip():

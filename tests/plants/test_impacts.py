@@ -160,6 +160,14 @@ def test_a_held_plant_has_the_states_that_are_left(stand, swing):
             check_held(plant, held)
 
 
+@pytest.mark.parametrize("options", [{"spring": "link2"}, {"parts": ("hardening",)}, {"parts": ("spring_damping",)}])
+@pytest.mark.parametrize("drive", ["unlumped", "lumped"])
+def test_another_actuator_with_the_same_states_is_not_the_held_plant(drive, options):
+    check_held(so.plants.moving_output(drive, **options), so.plants.high_impedance(drive, **options))
+    with pytest.raises(PlantError, match="with a link fixed"):
+        check_held(so.plants.moving_output(drive), so.plants.high_impedance(drive, **options))
+
+
 def test_bad_blows_and_releases(stand, swing, thor):
     with pytest.raises(PlantError, match="x_3"):
         strike(swing, swing.complete(thor), np.zeros(4), "x_3", 1.0)

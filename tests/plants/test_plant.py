@@ -39,6 +39,7 @@ def test_a_plant_in_a_few_lines():
         ({"f": lambda t, x, u, p: {"x": x.v}}, 'returns nothing for "v"'),
         ({"f": lambda t, x, u, p: {"x": x.v, "v": u.F, "w": 0}}, 'returns "w"'),
         ({"inputs": {"my force": "N"}}, '"my force"'),
+        ({"outputs": {"energy": "J"}}, "rename the output"),
         ({"f": lambda t, x, u, p: {"x": x.v, "v": -p.c * x.v}}, '"v" is driven by nothing'),
         ({"f": lambda t, x, u, p: {"x": ca.vertcat(x.v, u.F), "v": u.F}}, "the shape"),
         ({"f": lambda t, x, u, p: {"x": x.v, "v": u.F if x.v > 0 else 0}}, "ca.if_else"),

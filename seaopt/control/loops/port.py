@@ -125,10 +125,15 @@ def probe_of(plant: Plant) -> Plant:
         The plant states no port, or its port states no probe.
 
     """
-    if plant.port is None or plant.port.probe is None:
+    if plant.port is None:
         raise ControlError(
             f"plant {plant.name} has no port at link 2; use high_impedance, moving_output or two_link, or give "
             "ports = (Port(..., probe=...),)"
+        )
+    if plant.port.probe is None:
+        raise ControlError(
+            f"the port of plant {plant.name} states no probe, by which its impedance is known; give Port(probe=...), "
+            "or use high_impedance, moving_output or two_link"
         )
     return plant.port.probe()
 

@@ -33,10 +33,11 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
-from seaopt.control.running.sampled_loop import ENERGY, LoopState, SampledLoop, at_rest, whole_samples
+from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, whole_samples
 from seaopt.errors import SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
+from seaopt.plants.plant import ENERGY
 from seaopt.records import record
 
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]

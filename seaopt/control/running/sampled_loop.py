@@ -13,9 +13,8 @@ from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
 from seaopt.errors import SimulationError, suggestion
 from seaopt.plants import Plant
+from seaopt.plants.plant import ENERGY
 from seaopt.records import record
-
-ENERGY = "energy"
 
 
 @record(eq=False)

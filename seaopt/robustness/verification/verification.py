@@ -98,9 +98,11 @@ class Verification:
             if band is None:
                 lines.append(f"{name} tracks no reference within 3 dB: a step does not reach its reference")
             elif band[0] > 0.0:
+                moves = self.stages[name].plant.moves
+                below = "the swinging output prevents it" if moves else "the force is not within 3 dB of its reference"
                 lines.append(
                     f"{name} tracks references between {band[0]:.3g} and {band[1]:.3g} Hz (within 3 dB); below "
-                    "that the swinging output prevents it"
+                    f"that {below}"
                 )
         return lines
 

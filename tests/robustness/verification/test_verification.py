@@ -50,6 +50,11 @@ def test_the_tuned_controller_passes(verification):
     assert "passed" in repr(verification)
 
 
+def test_a_swinging_output_is_blamed_only_where_there_is_one(verification):
+    lines = replace(verification, follows_hz={"stand": (2.0, 30.0), "swing": (2.0, 30.0)}).describe_tracking()
+    assert ["swinging" in line for line in lines] == [False, True]
+
+
 def test_it_goes_into_json(verification):
     content = json.loads(json.dumps(verification.to_dict(), allow_nan=False))
     assert content["passed"] is True
