@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table as Grid
 
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import to_json, write_json
+from seaopt.formatting import format_table
 from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, read_table
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
 
-TABLE_WIDTH = 200  # columns: a narrower terminal wraps the table, and cuts nothing off
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
@@ -94,12 +93,11 @@ def _print_report(quality: Quality, written: list[Path]) -> None:
     console.print(f"{quality.source}: {quality.summary}", **plain)
     for note in quality.notes:
         console.print(note, style="dim", **plain)
-    grid = Grid(box=None, pad_edge=False, collapse_padding=True, header_style="dim")
-    for number, title in enumerate(CHANNEL_HEAD):
-        grid.add_column(title, justify="left" if number < 2 else "right", no_wrap=True)
-    for channel in quality.channels.values():
-        grid.add_row(*format_channel(channel))
-    Console(width=max(console.width, TABLE_WIDTH)).print(grid)
+    rows = map(format_channel, quality.channels.values())
+    head, *lines = format_table(rows, CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2))
+    console.print(head, style="dim", **plain)
+    for line in lines:
+        console.print(line, **plain)
     for finding in quality.findings:
         console.print(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ", **plain)
         console.print(finding.sentence, **plain)

@@ -32,7 +32,7 @@ from seaopt.plants.plant import evaluate
 from seaopt.records import record
 from seaopt.simulation import Clock, linearise, make_model
 
-MIN_SAMPLES = 256  # samples
+MIN_RESPONSE_SAMPLES = 256  # samples
 SMOOTH = 5  # lines of which the median coherence decides where a band ends
 NEAR_PEAK = 0.89  # of the peak's height: 1 dB below it
 ResponseFunction = Callable[[Any], Any]
@@ -226,9 +226,10 @@ def _check(log: Log, names: Sequence[str]) -> None:
             f"{log.source}: the log has {len(log.segments)} stretches between gaps and a frequency response takes one; "
             "choose one with slice_s"
         )
-    if len(log) < MIN_SAMPLES:
+    if len(log) < MIN_RESPONSE_SAMPLES:
         raise LogError(
-            f"{log.source}: {len(log)} samples are too few for a frequency response; use a log of {MIN_SAMPLES} or more"
+            f"{log.source}: {len(log)} samples are too few for a frequency response; use a log of "
+            f"{MIN_RESPONSE_SAMPLES} or more"
         )
     for name in names:
         lost = int(np.count_nonzero(~np.isfinite(log[name])))

@@ -13,7 +13,7 @@ from seaopt.problem.schema import ExperimentTable, ProblemTable, SensorsTable
 from seaopt.robustness import check_ranges
 from seaopt.units import unit_after
 
-MAX_DELAY_SAMPLES = 20
+MAX_LINK_DELAY_SAMPLES = 20
 
 
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
@@ -99,11 +99,11 @@ def _check_own_bounds(place: str, ends: tuple[float, float], parameter: Paramete
 
 def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
     """Refuse a delay of many samples: each is a state of every draw's plant, and takes its time."""
-    if longest_s * rate_hz > MAX_DELAY_SAMPLES * (1.0 + 1e-9):
+    if longest_s * rate_hz > MAX_LINK_DELAY_SAMPLES * (1.0 + 1e-9):
         raise ProblemError(
             f"{place} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
-            f"takes at most {MAX_DELAY_SAMPLES} ({MAX_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and whole "
-            "samples that are always there belong in controller.delay_samples"
+            f"takes at most {MAX_LINK_DELAY_SAMPLES} ({MAX_LINK_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and "
+            "whole samples that are always there belong in controller.delay_samples"
         )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.estimation import DerivedFigure, Experiment, Fit
+from seaopt.formatting import join_words
 from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain, survey
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.reporting.bode import Curve, Panel, bode_figure
@@ -114,7 +115,7 @@ def sentence(found: Survey, fit: Fit) -> str:
         parts.append("The model lacks something that the log shows. ")
     odd = [name for name, form, model in zip(names, forms, away, strict=True) if form > FAR * max(model, 1.0)]
     if odd:
-        parts.append(f"{_listed(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
+        parts.append(f"{join_words(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
     spring = found.plant.spring
     if spring is not None and spring.mass is not None and spring.damping is not None:
         derived = fit.derived[spring.mass], fit.derived[spring.damping]
@@ -153,8 +154,4 @@ def _gap(name: str, form: Uncertain, fitted: DerivedFigure) -> str:
 def _each(values: list[float], names: list[str]) -> str:
     if len(values) == 1:
         return f"{values[0]:.3g}"
-    return _listed([f"{value:.3g} ({name})" for value, name in zip(values, names, strict=True)])
-
-
-def _listed(items: list[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
+    return join_words([f"{value:.3g} ({name})" for value, name in zip(values, names, strict=True)])

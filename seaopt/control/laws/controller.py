@@ -17,12 +17,21 @@ from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
-from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
+from seaopt.formatting import (
+    MISSING,
+    format_band,
+    format_count,
+    format_figure,
+    format_number,
+    html_list,
+    html_paragraph,
+    html_table,
+)
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 
-SCHEMA = "seaopt/controller/2"
+CONTROLLER_SCHEMA = "seaopt/controller/2"
 GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
@@ -161,7 +170,7 @@ class Controller:
         """Return the content of controller.json (schema seaopt/controller/2)."""
         achieved = {field.name: getattr(self.achieved, field.name) for field in fields(LoopFigures)}
         return {
-            "schema": SCHEMA,
+            "schema": CONTROLLER_SCHEMA,
             "structure": self.structure,
             "gains": dict(self.gains),
             "sample_time_s": self.sample_time_s,
@@ -216,18 +225,19 @@ class Controller:
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec
         verdict = "every limit met" if self.feasible else "NOT FEASIBLE: " + ", ".join(self.active_constraints)
-        band = (
-            "none" if a.tracking_band_hz is None else f"{a.tracking_band_hz[0]:.3g} to {a.tracking_band_hz[1]:.4g} Hz"
+        gain_margin, phase_margin, delay_margin, bandwidth = (
+            format_number(value, missing="none")
+            for value in (a.gain_margin_db, a.phase_margin_deg, _milliseconds(a.delay_margin_s), a.bandwidth_hz)
         )
         return "\n".join(
             [
                 f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
-                f"delay of {self.delay_samples} sample{'' if self.delay_samples == 1 else 's'}: {verdict}",
+                f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
                 *self._gain_lines(),
-                f"  bandwidth {_format(a.bandwidth_hz)} Hz (asked {s.bandwidth_hz:g}), tracking band {band}",
+                f"  bandwidth {bandwidth} Hz (asked {s.bandwidth_hz:g}), "
+                f"tracking band {format_band(a.tracking_band_hz, 'Hz')}",
                 f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
-                f"  gain margin {_format(a.gain_margin_db)} dB, phase margin {_format(a.phase_margin_deg)} deg, "
-                f"delay margin {_format(None if a.delay_margin_s is None else 1e3 * a.delay_margin_s)} ms",
+                f"  gain margin {gain_margin} dB, phase margin {phase_margin} deg, delay margin {delay_margin} ms",
                 *self._force_lines(),
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
@@ -275,17 +285,16 @@ class Controller:
 
     def _achieved_rows(self) -> list[tuple[str, str, str]]:
         a = self.achieved
-        band, delay = a.tracking_band_hz, a.delay_margin_s
         limited = [
             (limit.label, format_figure(value, limit.unit), _format_allowed(limit, allowed))
             for limit, value, allowed in list_design_figures(self.spec, a)
         ]
         return [
             *limited,
-            ("tracking band", "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", ""),
+            ("tracking band", format_band(a.tracking_band_hz, "Hz", MISSING), ""),
             ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
             ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
-            ("delay margin", format_figure(None if delay is None else 1e3 * delay, "ms"), ""),
+            ("delay margin", format_figure(_milliseconds(a.delay_margin_s), "ms"), ""),
         ]
 
 
@@ -296,5 +305,5 @@ def _format_allowed(limit: Limit, allowed: float | None) -> str:
     return f"{sense}{allowed:g} {limit.unit}".rstrip()
 
 
-def _format(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
+def _milliseconds(time_s: float | None) -> float | None:
+    return None if time_s is None else 1e3 * time_s

@@ -28,7 +28,7 @@ from seaopt.records import record
 EPS = float(np.finfo(float).eps)
 POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coefficients, has a root there
 ZERO_AT_ONE = 4 * EPS  # stricter for a numerator: a weak integral is to be kept, and one of rounding does no harm
-NEGLIGIBLE = 1e-13  # Hankel singular values below this share of the law's gain are rounding
+NEGLIGIBLE_HANKEL = 1e-13  # Hankel singular values below this share of the law's gain are rounding
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
@@ -108,7 +108,7 @@ def balance(
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Return a balanced realisation of least order of two transfer functions over one denominator, each of its input.
 
-    What is below `NEGLIGIBLE` of `gain`, or of the largest Hankel singular value, is rounding.
+    What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the largest Hankel singular value, is rounding.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def balance(
         raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; tune a stable one")
     reach, show = _factor(a, b), _factor(a.T, c[:, None])
     left, hankel, right = np.linalg.svd(show.T @ reach)
-    kept = hankel > NEGLIGIBLE * max(float(hankel[0]), gain)
+    kept = hankel > NEGLIGIBLE_HANKEL * max(float(hankel[0]), gain)
     root = np.sqrt(hankel[kept])
     into, back = reach @ right[kept].T / root, (show @ left[:, kept] / root).T
     return back @ a @ into, back @ b, c @ into

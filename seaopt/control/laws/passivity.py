@@ -55,9 +55,9 @@ from seaopt.plants import Plant
 from seaopt.records import record
 
 Curve = Callable[[Frequencies], Any]
-LOWEST_HZ = 0.01
+LOWEST_PASSIVE_HZ = 0.01
 POINTS = 2000
-ROUNDING = 1e-9  # cosines of the impedance's angle nearer to zero than this are zero
+COSINE_ROUNDING = 1e-9  # cosines of the impedance's angle nearer to zero than this are zero
 TINY = float(np.finfo(float).tiny)
 
 
@@ -137,7 +137,7 @@ def passivity(
     plant: Plant,
     params: ParameterSet,
     *,
-    low_hz: float = LOWEST_HZ,
+    low_hz: float = LOWEST_PASSIVE_HZ,
     high_hz: float | None = None,
 ) -> Passivity:
     """Find where a controlled actuator is passive at link 2.
@@ -182,7 +182,7 @@ def passivity(
     impedance, angle = _make_curves(port, law, ts, controller.delay_samples)
     f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))
     stable = is_held_stable(port, law, ts, controller.delay_samples)
-    bands, violated = _find_bands(lambda x: angle(x) + ROUNDING, f) if stable else ((), low_hz)
+    bands, violated = _find_bands(lambda x: angle(x) + COSINE_ROUNDING, f) if stable else ((), low_hz)
     z = impedance(f)
     least = int(np.argmin(np.real(z)))
     return Passivity(

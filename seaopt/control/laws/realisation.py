@@ -35,14 +35,13 @@ from jaxtyping import Complex, Float
 from scipy.linalg import block_diag
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.minimal import SplitLaw, balance, put_over_one_denominator, split
+from seaopt.control.laws.minimal import EPS, SplitLaw, balance, put_over_one_denominator, split
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.records import record
 
 Vector = Float[np.ndarray, " n"]
-EPS = float(np.finfo(float).eps)
-SAME = 1e-6  # how well the state space must have the response of its transfer functions
+RESPONSE_TOLERANCE = 1e-6  # how well the state space must have the response of its transfer functions
 
 
 @record(eq=False)
@@ -298,7 +297,7 @@ def _check_response(law: RunnableLaw, reference: TransferFunction, measurement: 
         bottom = np.polynomial.polynomial.polyval(q, tf.den)
         wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
         rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
-        allowed = SAME * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
+        allowed = RESPONSE_TOLERANCE * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
         if not np.all(np.abs(response - wanted) <= allowed):
             raise ControlError(
                 "the law's slow poles are too close together to tell from integrators in double precision; "

@@ -19,7 +19,7 @@ from seaopt.files import plain
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_ff")
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
 GAINS_AGREE = 1e-9  # of the largest coefficient
-REMEDY = "tune again"
+TUNE_AGAIN = "tune again"
 
 Finite = Annotated[FiniteFloat, Strict()]
 Coefficients = Annotated[list[Finite], Field(min_length=1)]
@@ -101,7 +101,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         A field is missing or malformed, or two contradict each other: the gains must give the coefficients.
 
     """
-    table = check_table(StoredController, plain(content), "controller.json", remedy=REMEDY)
+    table = check_table(StoredController, plain(content), "controller.json", remedy=TUNE_AGAIN)
     spec, robust_to = _build_spec(table.spec)
     for name, expected in (("structure", spec.structure), ("delay_samples", spec.delay_samples)):
         if getattr(table, name) != expected:
@@ -132,7 +132,7 @@ def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:
             fields["notch"] = Notch(**fields["notch"])
         return ControllerSpec(**fields), tuple(stored.robust_to)
     except (ControlError, TypeError, ValueError) as error:
-        raise FileError(f"controller.json: spec: {error}; {REMEDY}") from error
+        raise FileError(f"controller.json: spec: {error}; {TUNE_AGAIN}") from error
 
 
 def _check_agreement(
@@ -166,4 +166,4 @@ def _check_agreement(
 
 
 def _contradict(name: str, what: str) -> FileError:
-    return FileError(f"controller.json: {name} {what}; {REMEDY}")
+    return FileError(f"controller.json: {name} {what}; {TUNE_AGAIN}")

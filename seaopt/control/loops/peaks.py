@@ -18,7 +18,7 @@ from seaopt.records import record
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PROOF = 1e-7
 COARSE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
-CURVES = 5
+CURVE_COUNT = 5
 SENSITIVITY, TRACKING = 0, 4
 REFINED_PER_CURVE = 3  # local maxima of each curve that are refined before the proof
 MAX_PROOF_ROUNDS = 20
@@ -159,7 +159,7 @@ def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float
     theta = np.unique(np.concatenate([COARSE_ANGLES, modes[modes > 1e-9]]))
     values, slopes = np.abs(system.curves(theta)), system.slopes(theta)
     best = np.argmax(values, axis=1)
-    peaks, at = values[np.arange(CURVES), best], theta[best]
+    peaks, at = values[np.arange(CURVE_COUNT), best], theta[best]
     curve, cell = np.nonzero((slopes[:, :-1] > 0.0) & (slopes[:, 1:] < 0.0))
     height = np.maximum(values[curve, cell], values[curve, cell + 1])
     order = np.lexsort((-height, curve))
@@ -183,7 +183,7 @@ def _climb(
     top = find_zeros(slope, low, high, slope(low, every), slope(high, every), 1e-8)
     value = np.abs(system.curves(top)[curve, every])
     peaks, at = peaks.copy(), at.copy()
-    for k in range(CURVES):
+    for k in range(CURVE_COUNT):
         own = np.flatnonzero(curve == k)
         if own.size and value[own].max() > peaks[k]:
             best = own[np.argmax(value[own])]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Complex, Float
 
-ROUNDING = 1e-17
+from seaopt.records import record
+
+POLE_ROUNDING = 1e-17  # least denominator, over the sum of its coefficients
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class TransferFunction:
     """num(q)/den(q): coefficients in ascending powers of q = z^-1, den[0] = 1."""
 
@@ -21,7 +21,7 @@ class TransferFunction:
         """Return the values at frequencies in Hz; next to a pole on the circle, no more than rounding allows."""
         q = np.exp(-2j * np.pi * f * sample_time_s)
         below = np.polynomial.polynomial.polyval(q, self.den)
-        least = ROUNDING * np.sum(np.abs(self.den))
+        least = POLE_ROUNDING * np.sum(np.abs(self.den))
         return np.polynomial.polynomial.polyval(q, self.num) / np.where(np.abs(below) < least, least, below)
 
     def state_space(

@@ -28,7 +28,7 @@ from seaopt.plants import Plant
 
 DECADES = 8  # of the input's noise below what would explain the whole output
 SETTLING = 10  # the first tenth of the log is left out: the filter starts at rest
-MIN_SAMPLES = 200
+MIN_NOISE_SAMPLES = 200
 UNSEEN_OFFSET = 1e-6  # of what sensors show of their offsets; a part as small as that is the plant's own place
 
 
@@ -61,8 +61,8 @@ def estimate_noise(
         As `estimator` and `Estimator.run`; or the log is too short.
 
     """
-    if len(log) < MIN_SAMPLES:
-        raise ControlError(f"{log.source} has {len(log)} samples; noise takes at least {MIN_SAMPLES}")
+    if len(log) < MIN_NOISE_SAMPLES:
+        raise ControlError(f"{log.source} has {len(log)} samples; noise takes at least {MIN_NOISE_SAMPLES}")
     from scipy.optimize import minimize  # deferred: scipy is slow to load
 
     drive = next(iter(plant.inputs))

@@ -33,8 +33,9 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
-from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, whole_samples
+from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names, whole_samples
 from seaopt.errors import SimulationError, suggestion
+from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.plant import ENERGY
@@ -100,7 +101,7 @@ def describe_runs(
     runs, samples = current.shape
     largest = ", ".join(f"{name} {np.max(value):.4g}" for name, value in peaks.items())
     return (
-        f"{kind} of {runs} run{'' if runs == 1 else 's'} of {samples} samples, {span}: largest magnitudes {largest}, "
+        f"{kind} of {format_count(runs, 'run')} of {samples} samples, {span}: largest magnitudes {largest}, "
         f"current {np.max(np.abs(current)):.4g} A; {more}integration error {error:.1g}"
     )
 
@@ -227,7 +228,7 @@ def _lose_alike(before: LoopArrays, after: LoopArrays) -> Bool[np.ndarray, " run
 
 
 def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, substeps: int, wall_s: float) -> LoopRun:
-    names = loop.watched
+    names = channel_names(loop.plant)
     return LoopRun(
         time=job.start_s + loop.law.sample_time_s * np.arange(job.reference.shape[1]),
         reference=job.reference,

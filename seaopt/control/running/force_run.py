@@ -190,7 +190,7 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
     return extra_delay_s
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)  # remembers the steps and errors of the run so far
 class _Integrator:
     """A plant integrated while its inputs are held, in as many steps as it has needed so far."""
 

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.running.sampled_loop import LoopState, SampledLoop
+from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
@@ -60,36 +60,60 @@ class LoopArrays:
     wall_s: float = 0.0
 
 
-def _sample_function(loop: SampledLoop) -> Any:
+@record
+class _Structure:
+    """What the functions of a loop depend on besides its plant; all else is data."""
+
+    measured: str
+    law_states: int
+    waiting: int
+    rounds_current: bool
+    saturates: bool
+    quantises: bool
+    limits_current: bool
+
+
+def _structure_of(loop: SampledLoop) -> _Structure:
+    sensors, name = loop.sensors, loop.measured
+    return _Structure(
+        measured=name, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
+        saturates=sensors.saturation.get(name) is not None, quantises=bool(sensors.quantisation.get(name)),
+        limits_current=math.isfinite(loop.law.current_limit_A),
+    )  # fmt: skip
+
+
+def _sample_function(plant: Plant, structure: _Structure) -> Any:
     """Return the CasADi function (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y): sensor, law and delay at a sample.
 
     `u` holds the current in force at first, `late` is the one after it.
     """
-    plant, n, queue = loop.plant, loop.law.c.size, loop.waiting
+    n, queue = structure.law_states, structure.waiting
     z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
-    e, c = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("c", _constants(loop).size)
-    observe = _observe(loop)
+    e, c = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("c", n * n + 4 * n + 9)
+    observe = _observe(plant)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
     waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
-    reading = observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)[list(plant.outputs).index(loop.measured)] + w
+    reading = (
+        observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)[list(plant.outputs).index(structure.measured)] + w
+    )
     size = n * n
     a = ca.reshape(c[:size], n, n)
     b_r, b_y, out, windup = (ca.reshape(c[size + i * n : size + (i + 1) * n], n, 1) for i in range(4))
     d_r, d_y, limit, gain, offset, highest, quantum, step, most = ca.vertsplit(c[size + 4 * n :])
     reading = reading + offset
-    if loop.sensors.saturation.get(loop.measured) is not None:
+    if structure.saturates:
         reading = ca.fmin(ca.fmax(reading, -highest), highest)
-    if loop.sensors.quantisation.get(loop.measured):
+    if structure.quantises:
         reading = quantum * ca.floor(reading / quantum + 0.5)
     x = ca.reshape(z[:n], n, 1)
     force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - d_y * reading
-    limited = ca.fmin(ca.fmax(force, -limit), limit) if math.isfinite(loop.law.current_limit_A) else force
+    limited = ca.fmin(ca.fmax(force, -limit), limit) if structure.limits_current else force
     after = ca.mtimes(a, x) + b_r * r - b_y * reading + windup * (limited - force)
     current = gain * limited
-    if loop.current_step_A:
+    if structure.rounds_current:
         current = step * ca.floor(current / step + 0.5)
-        if math.isfinite(loop.law.current_limit_A):
+        if structure.limits_current:
             current = ca.fmin(ca.fmax(current, -most), most)
     moved = ca.vertcat(after, *([current, *(behind[i] for i in range(queue - 1))] if queue else []))
     known = ca.vertcat(current, behind)
@@ -109,8 +133,7 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
 
 
-def _observe(loop: SampledLoop) -> Any:
-    plant = loop.plant
+def _observe(plant: Plant) -> Any:
     rows = [plant.output] + ([plant.stored_energy()] if plant.energy is not None else [])
     return ca.Function("observe", [plant.t, plant.x, plant.u, plant.p], [ca.densify(ca.vertcat(*rows))])
 
@@ -126,50 +149,38 @@ def runge_kutta(plant: Plant) -> Any:
     return ca.Function("step", [t, x, u, p, h], [ca.densify(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))])
 
 
-def _advance_function(loop: SampledLoop) -> Any:
+def _advance_function(plant: Plant) -> Any:
     """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one Runge-Kutta step, and the largest |y|."""
-    plant = loop.plant
     t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
-    peak = ca.SX.sym("peak", len(loop.watched))
+    peak = ca.SX.sym("peak", len(channel_names(plant)))
     after = runge_kutta(plant)(t, x, u, p, h)
-    top = ca.fmax(peak, ca.fabs(_observe(loop)(t + h, after, u, p)))
+    top = ca.fmax(peak, ca.fabs(_observe(plant)(t + h, after, u, p)))
     return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
 
 
 @memo
-def _kernels(plant: Plant) -> dict[tuple[object, ...], tuple[Any, Any, Any, dict[tuple[int, int, bool], Any]]]:
-    """Return the functions, library and chains of every structure of loop around a plant, filled by `kernel`."""
-    return {}
+def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | None]:
+    """Return the functions of one sample and of one step, and their library where there is a compiler."""
+    sample, advance = _sample_function(plant, structure), _advance_function(plant)
+    return sample, advance, load_kernel(_source(plant, structure, sample, advance), "seaopt_loops")
 
 
 def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
     """Return what runs a job: compiled code or, without a compiler, CasADi's virtual machine."""
-    sensors = loop.sensors
-    structure = (
-        loop.measured, loop.law.c.size, loop.waiting, bool(loop.current_step_A),
-        sensors.saturation.get(loop.measured) is None, bool(sensors.quantisation.get(loop.measured)),
-        math.isfinite(loop.law.current_limit_A),
-    )  # fmt: skip
-    kernels = _kernels(loop.plant)
-    if structure not in kernels:
-        sample, advance = _sample_function(loop), _advance_function(loop)
-        native = load_kernel(_source(loop, sample, advance), "seaopt_loops")
-        kernels[structure] = (sample, advance, native, {})
-    sample, advance, native, chains = kernels[structure]
-    constants = _constants(loop)
+    native, constants = _kernel(loop.plant, _structure_of(loop))[2], _constants(loop)
 
     def execute(job: Job, substeps: int) -> LoopArrays:
         if native is not None:
             return _run_compiled(loop, job, substeps, constants, native)
-        return _run_interpreted(loop, job, substeps, constants, sample, advance, chains)
+        return _run_interpreted(loop, job, substeps, constants)
 
     return execute
 
 
-def _source(loop: SampledLoop, sample: ca.Function, advance: ca.Function) -> str:
+def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
-        "NX": len(loop.plant.states), "NU": len(loop.plant.inputs), "NE": len(loop.plant.inputs) - 1,
-        "NY": len(loop.watched), "NZ": loop.law.c.size + loop.waiting,
+        "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1,
+        "NY": len(channel_names(plant)), "NZ": structure.law_states + structure.waiting,
     }  # fmt: skip
     template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
     return "\n".join((define_constants(constants), generate_code(sample, advance), template))
@@ -177,7 +188,7 @@ def _source(loop: SampledLoop, sample: ca.Function, advance: ca.Function) -> str
 
 def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
     runs, n = job.reference.shape
-    nx, ny = len(loop.plant.states), len(loop.watched)
+    nx, ny = len(loop.plant.states), len(channel_names(loop.plant))
     return LoopArrays(
         x=np.array(job.start.x, dtype=float, order="C"), z=np.array(job.start.z, dtype=float, order="C"),
         peak=np.zeros((runs, ny)), error=np.zeros((runs, nx)), size=np.zeros((runs, nx)),
@@ -215,19 +226,13 @@ def _run_compiled(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarra
     return arrays
 
 
-def _run_interpreted(
-    loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"], sample: Any, advance: Any,
-    chains: dict[tuple[int, int, bool], Any],
-) -> LoopArrays:  # fmt: skip
+def _run_interpreted(loop: SampledLoop, job: Job, substeps: int, c: Float[np.ndarray, " m"]) -> LoopArrays:
     """Run in CasADi's virtual machine: the same two functions, chained in a third."""
     arrays = _allocate(loop, job)
     runs, n = job.reference.shape
     chunk = min(n, CHAINED_SAMPLES)
     split = bool(np.any(job.late_s))
-    key = (substeps, chunk, split)
-    if key not in chains:
-        period = _period_function(loop, sample, advance, substeps, split)
-        chains[key] = (period.expand() if substeps <= MAX_EXPANDED_STEPS else period).mapaccum(chunk)
+    chain = _chain(loop.plant, _structure_of(loop), loop.law.sample_time_s, substeps, chunk, split)
     times = job.start_s + loop.law.sample_time_s * np.arange(n)
     for run in range(runs):
         state = np.concatenate([getattr(arrays, name)[run] for name in ("x", "z", "peak", "error", "size")])
@@ -241,7 +246,7 @@ def _run_interpreted(
             piece = signals[:, np.minimum(np.arange(first, first + chunk), n - 1)]  # the last one is filled up
             after, y, applied, states = (
                 np.array(part)[:, :count]
-                for part in chains[key](state, piece[:1], piece[1:-2], piece[-2:-1], piece[-1:], *shared)
+                for part in chain(state, piece[:1], piece[1:-2], piece[-2:-1], piece[-1:], *shared)
             )
             rows = slice(first, first + count)
             arrays.y[run, rows], arrays.applied[run, rows], arrays.states[run, rows] = y.T, applied[0], states.T
@@ -252,16 +257,28 @@ def _run_interpreted(
     return arrays
 
 
-def _period_function(loop: SampledLoop, sample: Any, advance: Any, substeps: int, split: bool) -> Any:
+@memo
+def _chain(
+    plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, chunk: int, split: bool
+) -> Any:  # fmt: skip
+    """Return `_period_function` of `chunk` samples in a row."""
+    period = _period_function(plant, structure, sample_time_s, substeps, split)
+    return (period.expand() if substeps <= MAX_EXPANDED_STEPS else period).mapaccum(chunk)
+
+
+def _period_function(
+    plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, split: bool
+) -> Any:  # fmt: skip
     """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
-    sizes = [len(loop.plant.states), loop.law.c.size + loop.waiting, len(loop.watched)]
+    sample, advance, _ = _kernel(plant, structure)
+    sizes = [len(plant.states), structure.law_states + structure.waiting, len(channel_names(plant))]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
     t, r, w, late_s = (ca.MX.sym(name) for name in ("t", "r", "w", "late_s"))
     e, p, c, lag = (ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("p", 6), ("c", 7), ("lag", 8)))
     x, z, peak, error, size = ca.vertsplit(state, np.cumsum([0, *sizes, sizes[0], sizes[0]]).tolist())
     after, u, late, y = sample(t, x, z, e, r, w, p, c, lag)
-    newer, period = ca.vertcat(late, e), loop.law.sample_time_s
-    pieces = [(u, t, late_s), (newer, t + late_s, period - late_s)] if split else [(newer, t, period)]
+    newer = ca.vertcat(late, e)
+    pieces = [(u, t, late_s), (newer, t + late_s, sample_time_s - late_s)] if split else [(newer, t, sample_time_s)]
     top = ca.fmax(peak, ca.fabs(y))
     ends: list[tuple[Any, Any]] = []
     for steps in (substeps, 2 * substeps):

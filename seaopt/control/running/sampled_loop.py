@@ -90,10 +90,10 @@ class SampledLoop:
         """The largest current: the law's limit, or the last whole step of the amplifier within it."""
         return largest_current(self.law.current_limit_A, self.current_step_A)
 
-    @property
-    def watched(self) -> tuple[str, ...]:
-        """The outputs, and the energy where the plant declares it."""
-        return (*self.plant.outputs, *((ENERGY,) if self.plant.energy is not None else ()))
+
+def channel_names(plant: Plant) -> tuple[str, ...]:
+    """Return the outputs, and the energy where the plant declares it."""
+    return (*plant.outputs, *((ENERGY,) if plant.energy is not None else ()))
 
 
 @record(eq=False)

@@ -39,12 +39,12 @@ from seaopt.records import record
 
 MOST_PROGRAMS = 8
 ROWS_PER_LIMIT = 10  # per kind of limit
-FIRST_RADIUS = 0.4
-SMALLEST_RADIUS = 0.01  # trust region, as a fraction of the gains
+FIRST_GAIN_RADIUS = 0.4  # trust region, as a fraction of the gains
+SMALLEST_GAIN_RADIUS = 0.01
 USAGE_PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of the objective
 
 
-@dataclass(slots=True)
+@dataclass(slots=True)  # filled row by row
 class _LinearLimits:
     """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
 
@@ -81,7 +81,7 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
         Programs solved at most.
 
     """
-    x, radius = start, FIRST_RADIUS
+    x, radius = start, FIRST_GAIN_RADIUS
     scale = np.maximum(np.abs(start[:3]), _choose_least_gains(task, grid))
     merit = _measure_merit(task, grid, x)
     for _ in range(steps):
@@ -100,7 +100,7 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
                 break
         else:
             radius *= 0.35
-            if radius < SMALLEST_RADIUS:
+            if radius < SMALLEST_GAIN_RADIUS:
                 break
     return merit, x
 

@@ -31,10 +31,10 @@ LARGEST_FACTOR = 3.0  # factor by which a number may change in one solution
 WORST_PLANTS = 2  # plants whose objective is followed
 QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
 SLACK_PRICE = 1e3
-NEGLIGIBLE = 1e-12
+SMOOTHING = 1e-12  # keeps magnitudes differentiable at zero
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)  # not a record: the algebra below makes them by position
 class _Complex:
     """A complex CasADi vector; with it, formulas for NumPy arrays make expressions."""
 
@@ -171,7 +171,7 @@ def _build_program(
     names = [name for name in shapes if name.endswith(("_re", "_im"))]
     p, c_y, c_r = law({name: data[name][:n] for name in names})
     open_loop = p * c_y
-    distance = (open_loop + 1.0).square() + NEGLIGIBLE
+    distance = (open_loop + 1.0).square() + SMOOTHING
     slices = {kind: slice(POINTS_PER_LIMIT * i, POINTS_PER_LIMIT * (i + 1)) for i, kind in enumerate(kinds)}
     usage: dict[str, Any] = {}
     for kind, where in slices.items():
@@ -183,7 +183,7 @@ def _build_program(
         curve = CURVES[kind]
         value = curve.numerator(p, c_y, c_r, open_loop)
         top = value.square()[where] if isinstance(value, _Complex) else value
-        size = 0.5 * ca.log((top + NEGLIGIBLE) / distance[where]) - data["ln_level"][where]
+        size = 0.5 * ca.log((top + SMOOTHING) / distance[where]) - data["ln_level"][where]
         usage[kind] = -size if curve.floor else size
     point = {name: data["at"][i] for i, name in enumerate(names)}
     p, c_y, c_r = law(point)
@@ -193,7 +193,7 @@ def _build_program(
         worst = [usage["max_noise_gain"] + data["ln_level"][where] - t]
     else:
         p, c_y, _ = law({name: data[name][n:] for name in names})
-        size = 1 / ca.sqrt((p * c_y + 1.0).square() + NEGLIGIBLE)
+        size = 1 / ca.sqrt((p * c_y + 1.0).square() + SMOOTHING)
         worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST_PLANTS)]
     g = ca.vertcat(
         bandwidth,

@@ -38,6 +38,7 @@ from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, place_frequencies
 from seaopt.control.tuning.starts import find_starts
 from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import split_friction
@@ -171,9 +172,7 @@ def _draw_plants(
             used = {key: float(value) for key, value in values.items() if key in model.parameters}
             if not used:
                 continue
-            label = (
-                ", ".join(f"{key} = {value:.4g}" for key, value in used.items()) if len(used) < 3 else f"draw {number}"
-            )
+            label = format_values(used, missing="") if len(used) < 3 else f"draw {number}"
             out.append((f"{name}, {label}", (model, model.complete(nominal.update(**used)))))
     return out
 

@@ -30,10 +30,10 @@ from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_statistics
 from seaopt.estimation.result.covariance import compute_bread, compute_meat
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.result.identifiability import join_names
 from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.estimation.solver.settle import settle
+from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.simulation import make_model
@@ -142,7 +142,7 @@ class Culprit:
             for name, value in self.values.items()
         ]
         return (
-            f"one of {join_names([*self.values])}, which are held fixed, is wrong ({chi2}): "
+            f"one of {join_words([*self.values])}, which are held fixed, is wrong ({chi2}): "
             f"{', '.join(each[:-1])} or {each[-1]} explain the logs alike; check these values, or free one"
         )
 

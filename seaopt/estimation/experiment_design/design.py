@@ -31,7 +31,7 @@ from seaopt.estimation.experiment_design.excitation_search import (
 )
 from seaopt.estimation.experiment_design.information import Bench, make_bench
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.formatting import html_text
+from seaopt.formatting import format_count, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -147,7 +147,7 @@ def _describe(excitation: Excitation) -> str:
     part = excitation[0]
     if isinstance(part, Multisine):
         f = part.frequencies_hz
-        return f"multisine of {len(f)} line{'s' * (len(f) > 1)}, {f[0]:.3g} to {f[-1]:.3g} Hz"
+        return f"multisine of {format_count(len(f), 'line')}, {f[0]:.3g} to {f[-1]:.3g} Hz"
     assert isinstance(part, Chirp)
     return f"chirp of {part.amplitude:.4g} from {part.f0_hz:.3g} to {part.f1_hz:.3g} Hz"
 

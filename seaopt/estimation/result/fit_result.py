@@ -24,7 +24,7 @@ from seaopt.records import record
 from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
 
-SCHEMA = "seaopt/fit/1"
+FIT_SCHEMA = "seaopt/fit/1"
 
 
 @record(eq=False)
@@ -172,7 +172,7 @@ class Fit:
     def to_dict(self) -> dict[str, Any]:
         """Return the content of fit.json (schema seaopt/fit/1)."""
         return {
-            "schema": SCHEMA,
+            "schema": FIT_SCHEMA,
             "status": self.status,
             "message": self.message,
             "cost": self.cost,

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import RANK, eliminate
+from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.simulation import Segment, run_passes
@@ -132,7 +133,7 @@ def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
         how = "product" if direction[names[0]] * direction[names[1]] < 0.0 else "ratio"
         return f"{names[0]} and {names[1]} enter only together, as their {how}"
     changes = ", ".join(f"{name} {100 * direction[name]:+.3g} %" for name in names)
-    return f"{join_names(names)} enter only together: {changes} change no output"
+    return f"{join_words(names)} enter only together: {changes} change no output"
 
 
 def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
@@ -152,12 +153,7 @@ def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) 
     values = ", ".join(f"{name} = {params[name].value:.4g}{unit_after(params[name].unit)}" for name in names)
     verb = "is" if len(names) == 1 else "are"
     return (
-        f"the fit does not identify {join_names(names)}: {values} {verb} one choice among others that fit as well, "
+        f"the fit does not identify {join_words(names)}: {values} {verb} one choice among others that fit as well, "
         "and what follows at these values holds for no other; excite more, or give a value, a prior, or a range to "
         "certify over",
     )
-
-
-def join_names(names: list[str]) -> str:
-    """Return names as a sentence lists them."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -29,7 +29,7 @@ from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.files import plain
 from seaopt.parameters import Parameter, ParameterSet
 
-REMEDY = "run the fit again"
+FIT_AGAIN = "run the fit again"
 
 
 class StoredParameter(ResultTable):
@@ -80,12 +80,12 @@ class StoredCovariance(ResultTable):
         """
         n = len(self.names)
         if [len(row) for row in self.matrix] != [n] * n:
-            raise FileError(f"fit.json: {place}.matrix is not {n} by {n}, as names is long; {REMEDY}")
+            raise FileError(f"fit.json: {place}.matrix is not {n} by {n}, as names is long; {FIT_AGAIN}")
         matrix = np.array(self.matrix, dtype=float).reshape(n, n)
         finite = np.isfinite(np.diag(matrix))
         least = np.linalg.eigvalsh(matrix[np.ix_(finite, finite)])
         if np.any(least < -1e-9 * np.max(np.diag(matrix)[finite], initial=0.0)):
-            raise FileError(f"fit.json: {place} has a negative variance; {REMEDY}")
+            raise FileError(f"fit.json: {place} has a negative variance; {FIT_AGAIN}")
         return Covariance(names=tuple(self.names), matrix=matrix)
 
 
@@ -173,13 +173,13 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
         A field is missing or malformed, or the covariance is not that of the free parameters.
 
     """
-    stored = check_table(StoredFit, plain(content), "fit.json", remedy=REMEDY)
+    stored = check_table(StoredFit, plain(content), "fit.json", remedy=FIT_AGAIN)
     parameters = ParameterSet(parameter.restore(name) for name, parameter in stored.parameters.items())
     covariance = stored.covariance.restore("covariance")
     if set(covariance.names) != set(parameters.free_names):
         raise FileError(
             f"fit.json: covariance.names = {', '.join(covariance.names)} is not what parameters has free, "
-            f"{', '.join(parameters.free_names)}; {REMEDY}"
+            f"{', '.join(parameters.free_names)}; {FIT_AGAIN}"
         )
     white = covariance if stored.white_covariance is None else stored.white_covariance.restore("white_covariance")
     kept = (

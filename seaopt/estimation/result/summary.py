@@ -32,12 +32,12 @@ from seaopt.estimation.result.identifiability import (
     assess_identifiability,
     compute_structural_rank,
     describe_direction,
-    join_names,
 )
 from seaopt.estimation.solver.least_squares import Solution
 from seaopt.estimation.solver.methods import Method
 from seaopt.estimation.solver.settle import Solved, explains_little
 from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, StepError
+from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.units import unit_after
@@ -86,7 +86,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     bounded = [name for name, parameter in fitted.items() if parameter.free and parameter.at_bound]
     if bounded:
         message = (
-            f"{message}; {join_names(bounded)} {'is at its bound' if len(bounded) == 1 else 'are at their bounds'}"
+            f"{message}; {join_words(bounded)} {'is at its bound' if len(bounded) == 1 else 'are at their bounds'}"
         )
     experiments = tuple(experiment.data for experiment in problem.experiments)
     return Fit(
@@ -196,7 +196,7 @@ def _find_status(
             error = f"{step.output:.2g} sigma in an output and {step.parameter:.2g} std in a parameter"
             return "stalled", f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {error}"
         weak = "; ".join(
-            f"{join_names(sorted(direction))} are only weakly distinguished (condition {known.condition:.2g}): "
+            f"{join_words(sorted(direction))} are only weakly distinguished (condition {known.condition:.2g}): "
             "each would be known far better if the others were"
             for direction in known.weak
         )

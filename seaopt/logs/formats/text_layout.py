@@ -13,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 from seaopt.errors import LogError
+from seaopt.formatting import format_count
 from seaopt.records import record
 from seaopt.units import header_unit, is_unit
 
@@ -205,7 +206,7 @@ def _find_headers(
         header_rows = [(at, row) for at, row in candidates if len(row) == width][-1:]
     skipped = len(candidates) - len(header_rows)
     if skipped:
-        notes.append(f"{skipped} line{'s' if skipped > 1 else ''} above the header passed over")
+        notes.append(f"{format_count(skipped, 'line')} above the header passed over")
     if not header_rows:
         notes.append("no header was found; columns are numbered from 1")
         return [f"column {index + 1}" for index in range(width)], [None] * width, notes

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
-from seaopt.formatting import html_text
+from seaopt.formatting import format_count, html_text
 from seaopt.logs.log import decimation, frames, resampling
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.clock import GAP, JITTER_LIMIT, sample_rate_hz, split_at_gaps
@@ -368,7 +368,7 @@ class Log:
         count = len(self.gaps)
         if count:
             first = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])
-            lines.append(f"  {count} gap{'s' if count > 1 else ''}: {first}{', ...' if count > 3 else ''}")
+            lines.append(f"  {format_count(count, 'gap')}: {first}{', ...' if count > 3 else ''}")
         return "\n".join(lines)
 
     _repr_html_ = html_text

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.formatting import format_count
 from seaopt.logs.log.log import Log
 from seaopt.logs.quality import faults
 
@@ -63,9 +64,8 @@ def _mask(log: Log, name: str, rows: Bool[np.ndarray, " n"], reason: str, remedy
     if not count:
         return log
     signal = log.signal(name)
-    plural = "sample" if count == 1 else "samples"
     note = (
-        f"{name}: {count} {plural} ({100 * count / len(log):.2g} %) {reason} {signal.unit}".rstrip()
+        f"{name}: {format_count(count, 'sample')} ({100 * count / len(log):.2g} %) {reason} {signal.unit}".rstrip()
         + f" masked{remedy}"
     )
     signals = {**log.signals, name: replace(signal, values=np.where(rows, np.nan, signal.values))}

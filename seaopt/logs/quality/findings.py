@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.formatting import format_count, format_figure
 from seaopt.logs.quality.channel import ChannelQuality
 from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality
 from seaopt.logs.quality.excitation import InputExcitation
@@ -68,7 +69,7 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
         ("duplicate", clock.repeated, "the time of the row ahead; keep one row of each"),
     ):
         if rows.size:
-            text = f"{_count(rows.size, 'row')} of {clock.samples} with {what}"
+            text = f"{format_count(rows.size, 'row')} of {clock.samples} with {what}"
             yield Finding(kind=kind, severity="error", count=int(rows.size), where_s=_places(time, rows), sentence=text)
     share = clock.jitter_max / clock.period
     if share > JITTER_LIMIT:
@@ -78,8 +79,8 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
         yield Finding(
             kind="gap", severity="warning", count=int(clock.gaps.size), value=float(total), unit="samples",
             where_s=tuple((float(time[row - 1]), float(time[row])) for row in clock.gaps[:MAX_PLACES]),
-            sentence=f"{_count(clock.gaps.size, 'gap')}, {_count(total, 'sample')} lost, {longest} in the longest; a "
-            "fit starts anew after each (gaps = \"split\")",
+            sentence=f"{format_count(clock.gaps.size, 'gap')}, {format_count(total, 'sample')} lost, {longest} in the "
+            "longest; a fit starts anew after each (gaps = \"split\")",
         )  # fmt: skip
 
 
@@ -104,7 +105,7 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
     if channel.missing.samples == time.size:
         return
     if channel.constant:
-        text = f"{name} is {_format(channel.low, channel.unit)} throughout; check its wiring, or leave it out"
+        text = f"{name} is {format_figure(channel.low, channel.unit)} throughout; check its wiring, or leave it out"
         yield Finding(
             kind="constant", severity="warning", channel=name, value=channel.low, unit=channel.unit, sentence=text
         )
@@ -112,14 +113,16 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
     if len(channel.stuck):
         longest = int(np.max(channel.stuck.lengths))
         text = (
-            f"{name} stands still {_count(len(channel.stuck), 'time')}, up to {longest} samples, where it otherwise "
-            "changes: a sensor or a message that stopped; cut the log there, or set those samples to NaN"
+            f"{name} stands still {format_count(len(channel.stuck), 'time')}, up to {longest} samples, where it "
+            "otherwise changes: a sensor or a message that stopped; cut the log there, or set those samples to NaN"
         )
         yield _runs_finding("stuck", "warning", channel, channel.stuck, time, text)
     yield from _check_rails(channel, time)
     yield from _check_levels(channel)
     if channel.outliers.size:
-        text = f"{_count(channel.outliers.size, 'outlier')} in {name}; fit with loss=so.Huber(), or set them to NaN"
+        text = (
+            f"{format_count(channel.outliers.size, 'outlier')} in {name}; fit with loss=so.Huber(), or set them to NaN"
+        )
         yield Finding(
             kind="outlier", severity="warning", channel=name, count=int(channel.outliers.size), sentence=text,
             where_s=_places(time, channel.outliers),
@@ -136,18 +139,19 @@ def _missing_finding(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> 
         text = f"{name} has no number in any sample; leave it out"
         return _runs_finding("missing", "error", channel, channel.missing, time, text)
     text = (
-        f"{name} lacks {_count(count, 'sample')} of {time.size}; in an output they have no weight, in an input cut the "
-        "log there (log.between)"
+        f"{name} lacks {format_count(count, 'sample')} of {time.size}; in an output they have no weight, in an input "
+        "cut the log there (log.between)"
     )
     return _runs_finding("missing", "warning", channel, channel.missing, time, text)
 
 
 def _counter_finding(name: str, losses: CounterLosses, time: Float[np.ndarray, " n"]) -> Finding:
     total = int(np.sum(losses.lost))
-    held = f", samples_per_count={losses.held}" if losses.held > 1 else ""
+    per_count = f", samples_per_count={losses.held}" if losses.held > 1 else ""
     text = (
-        f"{name} counts, and skips at {_count(losses.rows.size, 'place')}: {_count(total, 'sample')} lost that the "
-        f'clock does not show; read the log with counter=Counter(column="{name}"{held}), which opens the gaps'
+        f"{name} counts, and skips at {format_count(losses.rows.size, 'place')}: {format_count(total, 'sample')} "
+        f'lost that the clock does not show; read the log with counter=Counter(column="{name}"{per_count}), which '
+        "opens the gaps"
     )
     return Finding(
         kind="gap", severity="error", channel=name, count=int(losses.rows.size), value=float(total), unit="samples",
@@ -159,8 +163,8 @@ def _check_rails(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iter
     name = channel.name
     for rail in channel.rails:
         edge = "largest" if rail.side == "high" else "least"
-        count = f"{_count(rail.runs.samples, 'sample')} ({rail.runs.samples / time.size:.2%})"
-        text = f"{name} is flat at its {edge} value, {_format(rail.value, channel.unit)}, for {count}"
+        count = f"{format_count(rail.runs.samples, 'sample')} ({rail.runs.samples / time.size:.2%})"
+        text = f"{name} is flat at its {edge} value, {format_figure(rail.value, channel.unit)}, for {count}"
         text += (
             ": it is clipped; a fit masks these samples of an output"
             if rail.clear
@@ -179,7 +183,8 @@ def _check_levels(channel: ChannelQuality) -> Iterator[Finding]:
         yield Finding(kind="held", severity="note", channel=channel.name, count=channel.held, sentence=text)
     levels = (channel.high - channel.low) / channel.quantum if channel.quantum else np.inf
     if channel.counter is None and levels < FINE_LEVELS:
-        text = f"{channel.name} moves in steps of {_format(channel.quantum, channel.unit)}, {levels:.0f} over its range"
+        step = format_figure(channel.quantum, channel.unit)
+        text = f"{channel.name} moves in steps of {step}, {levels:.0f} over its range"
         text += "; use a finer range, or expect coloured residuals" if levels < COARSE_LEVELS else ""
         yield Finding(
             kind="quantisation", severity="warning" if levels < COARSE_LEVELS else "note", channel=channel.name,
@@ -191,7 +196,7 @@ def _hum_finding(channel: ChannelQuality) -> Finding:
     assert channel.hum is not None
     lines = ", ".join(f"{line:g} Hz" for line in channel.hum.lines_hz)
     text = (
-        f"{channel.name} hums with the mains at {lines}: {_format(channel.hum.rms, channel.unit)} rms, "
+        f"{channel.name} hums with the mains at {lines}: {format_figure(channel.hum.rms, channel.unit)} rms, "
         f"{max(channel.hum.over_floor_db):.0f} dB over the noise; ground and shield, or fit a band without it (band_hz)"
     )
     return Finding(
@@ -241,14 +246,6 @@ def sort_findings(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 def count_findings(findings: Sequence[Finding]) -> Mapping[str, int]:
     """Return how many findings there are of each severity."""
     return {level: sum(finding.severity == level for finding in findings) for level in SEVERITIES}
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}" + ("" if count == 1 else "s")
-
-
-def _format(value: float, unit: str) -> str:
-    return f"{value:.4g} {unit}".rstrip()
 
 
 def _places(time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"]) -> tuple[tuple[float, float], ...]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
+from seaopt.formatting import format_count
 from seaopt.records import record
 
 PROBE_SAMPLES = 1000  # samples that must look like a counter before all are looked at
@@ -64,9 +65,9 @@ class Counter:
         shift[starts] = lost
         first = float(time[starts[np.flatnonzero(lost)[0]]])
         moved = time + np.cumsum(shift) * float(np.median(np.diff(time)))
-        plural = "s" if total > 1 else ""
+        lost_samples = format_count(total, "lost sample")
         return moved, (
-            f'counter "{self.column}" shows {total} lost sample{plural}, the first before t = {first:.6g} s; later '
+            f'counter "{self.column}" shows {lost_samples}, the first before t = {first:.6g} s; later '
             "times were moved to open gaps"
         )
 

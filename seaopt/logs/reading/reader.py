@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.files import write_text
+from seaopt.formatting import format_count
 from seaopt.logs.formats import Window, open_source
 from seaopt.logs.log.alignment import Rule, check_increasing
 from seaopt.logs.log.log import Log
@@ -267,7 +268,7 @@ def _remark_on(signal: Signal) -> list[str]:
     loss = Counter.suspect(signal.values)
     if loss:
         return [
-            f"{signal.name}: looks like a sample counter that misses {loss} sample{'s' if loss > 1 else ''}; to open "
+            f"{signal.name}: looks like a sample counter that misses {format_count(loss, 'sample')}; to open "
             f'gaps there, give counter=Counter(column="{signal.origin.column}", ...)'
         ]
     return []

@@ -124,7 +124,7 @@ def _round_up(value: float) -> str:
     return f"{np.ceil(value / step) * step:.4g}"
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)  # replaced field by field as the search goes on
 class _BranchAndBound:
     """The state of one search: boxes and arcs still open, and what is known so far.
 

@@ -20,7 +20,7 @@ from seaopt.records import record
 from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, enclose
 from seaopt.robustness.bounds.taylor import Basis, Taylor, build_basis, make_constant
 
-NEWTON_STEPS, WIDENINGS = 30, 4
+PROOF_NEWTON_STEPS, WIDENINGS = 30, 4
 JACOBIAN_DEGREE = 2  # of the models in Krawczyk's test
 POINT_BASIS = build_basis(0, 0)
 
@@ -102,7 +102,7 @@ def enclose_equilibrium(
 
 def _solve_centre(equations: _RestEquations, where: str) -> Float[np.ndarray, "b n 1"]:
     y = np.zeros((equations.count, len(equations.x), 1))
-    for _ in range(NEWTON_STEPS):
+    for _ in range(PROOF_NEWTON_STEPS):
         current = make_constant(y, POINT_BASIS)
         try:
             step = np.linalg.solve(equations.jacobian(current).c, equations.rates(current).c)

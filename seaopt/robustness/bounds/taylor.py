@@ -23,12 +23,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from seaopt.records import record
+
 Array = Float[np.ndarray, "..."]
 PRODUCT_ROUNDING = 2e-15  # of a product's size: rounding of the product and of the sums it enters
 SPARSE = 8  # monomials up to which a product goes through them one by one
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@record(eq=False)
 class Basis:
     """The monomials of some coordinates up to a degree, by ascending degree.
 
@@ -80,10 +82,13 @@ def build_basis(size: int, degree: int) -> Basis:
     order = np.argsort(target[first, second], kind="stable")
     first, second = first[order], second[order]
     starts = np.searchsorted(target[first, second], np.arange(degrees.size))
-    return Basis(size, degree, powers, target, until, degrees, (first, second, starts))
+    return Basis(
+        size=size, degree=degree, powers=powers, target=target, until=until, degrees=degrees,
+        pairs=(first, second, starts),
+    )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)  # not a record: the algebra below makes them by position
 class Taylor:
     """Taylor models of several quantities: of many boxes, or of the entries of matrices.
 

@@ -16,7 +16,16 @@ from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import FileError, SeaoptError
 from seaopt.estimation import warn_unidentified
-from seaopt.formatting import format_figure, html_list, html_paragraph, html_table
+from seaopt.formatting import (
+    MISSING,
+    format_band,
+    format_figure,
+    format_number,
+    format_values,
+    html_list,
+    html_paragraph,
+    html_table,
+)
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
@@ -267,7 +276,7 @@ class Certificate:
             A field is missing or malformed.
 
         """
-        from seaopt.robustness.certificate.stored import REMEDY, read_certificate  # deferred: pydantic
+        from seaopt.robustness.certificate.stored import CERTIFY_AGAIN, read_certificate  # deferred: pydantic
 
         stored = read_certificate(content)
         if controller.design is not None:  # certified too where nobody listed it
@@ -283,7 +292,7 @@ class Certificate:
         known = {state: plant for name in models for state, plant in states[name].items()}
         for name in stored.plants:
             if name not in known:
-                raise FileError(f'robustness.json: plants has "{name}", which is not a plant given; {REMEDY}')
+                raise FileError(f'robustness.json: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
         try:
             linear = {name: known[name] for name in stored.plants}
             requirements = tuple(Requirement(**row.model_dump()) for row in stored.requirements)
@@ -311,7 +320,7 @@ class Certificate:
             sensors = Sensors(**played.sensors.model_dump())
             return replace(certificate, simulated=certificate._simulate(sensors, played.current_step_A, played.seed))
         except SeaoptError as error:
-            raise FileError(f"robustness.json: {error}; {REMEDY}") from error
+            raise FileError(f"robustness.json: {error}; {CERTIFY_AGAIN}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/1)."""
@@ -374,23 +383,20 @@ class Certificate:
 
     def _plant_lines(self, name: str) -> list[str]:
         figures, margins, worst = self.plants[name], self.margins[name], self.worst[name]
-        band = figures.tracking_band_hz
-        tracking = "none" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz"
         lines = [
             f"  {name}: {'stable' if figures.stable else 'UNSTABLE'}, Ms {figures.ms:.4g}, Mt {figures.mt:.4g} "
-            f"(worst case {worst.ms:.4g}, {worst.mt:.4g}), tracking band {tracking}"
+            f"(worst case {worst.ms:.4g}, {worst.mt:.4g}), tracking band {format_band(figures.tracking_band_hz, 'Hz')}"
         ]
         if figures.stable:
             up, down = (_format_signed(db) for db in (margins.margins.gain_up_db, margins.margins.gain_down_db))
-            late, phase = margins.sampled_delay_s, _format_number(figures.phase_margin_deg)
+            late, phase = margins.sampled_delay_s, format_number(figures.phase_margin_deg, missing="none")
             lines.append(
                 f"    gain {down} / {up} dB, phase {phase} deg, delay "
                 + (f"{1e3 * late:.4g} ms" if late is not None else f"beyond {1e3 * margins.searched_delay_s:.3g} ms")
                 + f", disk margin {figures.disk_margin:.3g}"
             )
         if worst.parameters:
-            where = ", ".join(f"{key} = {value:.4g}" for key, value in worst.parameters.items())
-            lines.append(f"    worst case at {where}")
+            lines.append(f"    worst case at {format_values(worst.parameters)}")
         if name in self.brackets:
             lines.append(f"    {self.brackets[name].statement}")
         return lines
@@ -421,10 +427,6 @@ def _require_simulations(simulations: Simulated) -> list[Requirement]:
             where = f"{plant}: {len(runs)} runs"
             rows.append(Requirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, where=where))
     return rows
-
-
-def _format_number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
 
 
 def _format_signed(value: float | None) -> str:
@@ -479,14 +481,10 @@ def format_draws(draws: MonteCarlo) -> str:
 
 def _format_plant(certificate: Certificate, name: str) -> tuple[str, ...]:
     figures, worst, margins = certificate.plants[name], certificate.worst[name], certificate.margins[name]
-    band, late = figures.tracking_band_hz, margins.sampled_delay_s
+    late = margins.sampled_delay_s
     return (
         name, "yes" if figures.stable else "NO", *map(format_figure, (figures.ms, figures.mt, worst.ms, worst.mt)),
         format_figure(figures.gain_margin_db, "dB"), format_figure(figures.phase_margin_deg, "deg"),
         format_figure(None if late is None else 1e3 * late, "ms"), format_figure(figures.disk_margin),
-        "–" if band is None else f"{band[0]:.3g} to {band[1]:.4g} Hz", _format_place(worst.parameters),
+        format_band(figures.tracking_band_hz, "Hz", MISSING), format_values(worst.parameters),
     )  # fmt: skip
-
-
-def _format_place(parameters: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {value:.4g}" for name, value in parameters.items()) or "–"

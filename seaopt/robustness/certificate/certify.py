@@ -23,6 +23,7 @@ from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
+from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
@@ -47,7 +48,7 @@ CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, wh
 DrawProgress = Callable[[int, int], None]
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
+@record(eq=False)
 class _Tally:
     """The worst draws of a plant so far, as coordinates."""
 
@@ -55,7 +56,7 @@ class _Tally:
     severity: Float[np.ndarray, " n"]
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)  # counts up, block by block
 class _Failures:
     """Draws that are unstable on some plant; of the others, over Ms on one; of the others, over Mt on one."""
 

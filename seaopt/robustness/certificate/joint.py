@@ -20,7 +20,7 @@ import numpy as np
 from seaopt.control import Controller, ControllerSpec, tune
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
-from seaopt.formatting import format_count, format_table, html_text
+from seaopt.formatting import format_count, format_table, format_values, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -249,7 +249,7 @@ def _is_same(worst: Worst, pair: tuple[Plant, ParameterSet]) -> bool:
 
 
 def _describe_place(worst: Worst) -> str:
-    return ", ".join(f"{name} = {value:.4g}" for name, value in worst.parameters.items()) or "nominal"
+    return format_values(worst.parameters, missing="nominal")
 
 
 def _list_cells(entry: Round) -> tuple[str, str, str, str]:

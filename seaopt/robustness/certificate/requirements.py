@@ -11,6 +11,7 @@ from seaopt.control.laws.limits import LIMIT_ROUNDING, MeasuredLoop, PortFigures
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import Verdict, judge
 from seaopt.control.loops.port import port_of
+from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.certificate.certificate import MonteCarlo, Requirement
@@ -73,7 +74,7 @@ def draw_requirements(
         return bound
     name = max(worst, key=lambda key: worst[key].severity)
     case = worst[name]
-    where = ", ".join(f"{key} = {value:.4g}" for key, value in case.parameters.items())
+    where = format_values(case.parameters, missing="")
     size = f"has Ms {case.ms:.4g}, Mt {case.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
     witness = f"{name}: worst case {size}" + (f" at {where}" if where else "")
     rows = [
@@ -107,7 +108,7 @@ def _require_worst(name: str, case: Worst) -> list[Requirement]:
     """Return how much of the limits the worst case uses: 1 is all of it."""
     if not case.limited and case.severity < UNSTABLE:
         return []
-    where = ", ".join(f"{key} = {value:.4g}" for key, value in case.parameters.items())
+    where = format_values(case.parameters, missing="")
     met = case.severity <= 1.0 + LIMIT_ROUNDING
     used = case.severity if case.severity < UNSTABLE else np.inf
     return [

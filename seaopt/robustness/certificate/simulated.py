@@ -13,7 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
-from seaopt.formatting import html_text
+from seaopt.formatting import format_band, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
@@ -183,7 +183,7 @@ def _format_large(sweep: LargeSignal) -> str:
 def _format_bands(port: Passivity) -> str:
     if not port.held_stable:
         return "nowhere: the loop is UNSTABLE with link 2 held"
-    bands = ", ".join(f"{low:.3g} to {high:.4g} Hz" for low, high in port.bands_hz) or "nowhere"
+    bands = ", ".join(format_band(band, "Hz") for band in port.bands_hz) or "nowhere"
     lost = "" if port.violated_hz is None else f"; {-port.least_damping_N_s_per_m:.3g} N s/m are missing elsewhere"
     return bands + lost
 

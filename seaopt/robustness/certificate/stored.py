@@ -12,7 +12,7 @@ from typing import Any
 from seaopt.documents import Flag, NullIsInfinite, NullIsMinusInfinite, Number, ResultTable, Whole, check_table
 from seaopt.files import plain
 
-REMEDY = "certify again"
+CERTIFY_AGAIN = "certify again"
 
 
 class StoredRequirement(ResultTable):
@@ -109,4 +109,4 @@ def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
         A field is missing or malformed.
 
     """
-    return check_table(StoredCertificate, plain(content), "robustness.json", remedy=REMEDY)
+    return check_table(StoredCertificate, plain(content), "robustness.json", remedy=CERTIFY_AGAIN)

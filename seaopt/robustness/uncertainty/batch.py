@@ -30,7 +30,7 @@ CURVE_BLOCK = 512  # draws whose curves are evaluated at once: bounds the cache
 BASE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 60)])
 FAN = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # about a pole, in distances of it from the circle
 MAXIMA = 3  # local maxima refined
-NEWTON_STEPS = 40
+SPEED_NEWTON_STEPS = 40
 
 NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
 
@@ -248,7 +248,7 @@ def _refine_peaks(
     live = np.arange(x.size)
     low, x, high = low.copy(), x.copy(), high.copy()
     small = 1e-6 * (high - low)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(SPEED_NEWTON_STEPS):
         value, g, slope = _differentiate(loop.take(live), x[live], complement)
         higher = value > best[live]
         best[live[higher]], where[live[higher]] = value[higher], x[live[higher]]

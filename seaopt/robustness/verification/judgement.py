@@ -32,6 +32,7 @@ from jaxtyping import Float
 
 from seaopt.control.running.closed_loop import ENERGY
 from seaopt.control.running.sampled_loop import largest_current
+from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.robustness.verification.linear import LinearView, linearise_last_phase
@@ -175,7 +176,7 @@ def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, fi
     limit = stage.controller.spec.current_limit_A
     if trace.rest is None or limit is None or abs(trace.rest.current_A[run]) <= limit * (1 + 1e-9):
         return
-    where = ", ".join(f"{name} = {drawn[name].value:.4g}" for name in stage.plant.states if name in drawn)
+    where = format_values({name: drawn[name].value for name in stage.plant.states if name in drawn}, missing="")
     findings.faults.append(
         f"to rest at {where} takes {trace.rest.current_A[run]:.4g} A, above the limit of {limit:g} A; narrow its range"
     )

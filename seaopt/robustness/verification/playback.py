@@ -14,6 +14,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.sampled_plant import read_conditions
 from seaopt.control.running.closed_loop import DELAY, LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
+from seaopt.control.running.sampled_loop import channel_names
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
@@ -255,7 +256,7 @@ def _let_go(
 def _join_phases(
     stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]
 ) -> Playback:
-    names = stage.loop(held=False).watched
+    names = channel_names(stage.plant)
     count = runs[0].current.shape[0]
 
     def column(run: LoopRun, name: str) -> RunSamples:
