@@ -48,12 +48,12 @@ checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker
 
-ALWAYS, EVERY = 50, 50
+ALWAYS, EVERY = 3, 50
 check_all_calls, calls = jaxtyping.jaxtyped, Counter[CodeType]()
 
 
 def check_calls(function):
-    """Check a function's first calls, `ALWAYS` of them, then one in `EVERY`; a class's those of its constructor.
+    """Check a function's first calls in each test, `ALWAYS` of them, then one in `EVERY`; a class's constructor's.
 
     Checking each call takes half of the tests' time. What is defined inside a function counts as one function.
     """
@@ -74,6 +74,11 @@ def check_calls(function):
         return checked(*args, **kwargs)
 
     return call
+
+
+def pytest_runtest_setup() -> None:
+    """Count calls anew, so that what a test checks does not depend on the tests before it."""
+    calls.clear()
 
 
 jaxtyping.jaxtyped = lambda typechecker: check_calls

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import (
     FitExperiment,
@@ -239,6 +240,9 @@ def pose_problem(
     noise: bool = False,
 ) -> FitProblem:
     """Return the problem of fitting the free ones of `params` to experiments; with `noise`, their process noise too."""
+    names = [experiment.name for experiment in experiments]
+    if len(set(names)) < len(names):
+        raise EstimationError(f"experiments are named {', '.join(names)}; give each a name of its own")
     unknowns, modelled = collect(experiments, params, noise=noise, band_hz=band_hz)
     posed = tuple(
         make_fit_experiment(data, model, slots, unknowns.names, loss=loss, band_hz=band_hz, holdout=holdout)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -303,6 +304,10 @@ def test_fit_json_round_trip(stand, short_log, thor, tmp_path):
     np.testing.assert_allclose(again.covariance.matrix, fit.covariance.matrix)
     np.testing.assert_allclose(again.predict(bench).model["F1"], fit.predict(bench).model["F1"])
     assert repr(again) == repr(fit)
+    overflown = replace(fit, step_error_sigma=np.inf, step_error_parameter=np.inf)
+    write_json(path, overflown.to_dict())
+    stored = so.Fit.from_dict(read_json(path, "seaopt/fit/1"))
+    assert stored.step_error_sigma == stored.step_error_parameter == np.inf
     path.write_text(path.read_text().replace('"covariance"', '"covarience"'))
     with pytest.raises(FileError, match="covariance"):
         so.Fit.from_dict(read_json(path, "seaopt/fit/1"))
