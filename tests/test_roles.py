@@ -15,8 +15,9 @@ from seaopt.control import MPCSpec, command_of, export, force_mpc, passivity
 from seaopt.control.loops.loop import LoopFigures
 from seaopt.errors import ControlError, PlantError
 from seaopt.plants import Actuation, Friction, Port, Sensing, wrapped
+from seaopt.plants.friction import find_dry_friction
 from seaopt.plants.impacts import catch, release
-from seaopt.plants.plant import deflection_row, dry_friction_effort
+from seaopt.plants.plant import deflection_row
 from seaopt.robustness.verification.environments import coupled_stability
 from seaopt.robustness.verification.verification import verify
 
@@ -227,15 +228,20 @@ def test_friction_enters_by_its_role(thor):
             for values in (params, params.update(f_c=0.0, f_s=0.0))
         )
         assert m_k * (without - with_it) == pytest.approx(float(friction.force(speed, p)), rel=1e-9)
-    assert dry_friction_effort(plant, plant.complete(params)) == 20.0
+    for f_c in (20.0, 0.0):
+        dry = find_dry_friction(plant, plant.complete(params.update(f_c=f_c)))
+        level = max(
+            float(friction.force(v, SimpleNamespace(**vars(p) | {"f_c": f_c}))) for v in np.geomspace(1e-5, 1, 999)
+        )
+        assert dry == {"F_f": pytest.approx(level, rel=0.01)} and 25.0 < level < 35.0
 
 
 def mass_on_a_spring(**roles):
     return so.Plant(
         name="own", states={"x": "m", "v": "m/s"}, inputs={"U": "V"}, outputs={"F": "N", "y": "m"},
         parameters={"m": "kg", "k": "N/m", "c": "N s/m", "K": "N/V"},
-        f=lambda t, x, u, p: {"x": x.v, "v": (p.K * u.U - p.k * x.x - p.c * x.v) / p.m},
-        h=lambda t, x, u, p: {"F": p.k * x.x, "y": x.x}, **roles,
+        h=lambda t, x, u, p: {"F": p.k * x.x, "y": x.x},
+        **{"f": lambda t, x, u, p: {"x": x.v, "v": (p.K * u.U - p.k * x.x - p.c * x.v) / p.m}, **roles},
     )  # fmt: skip
 
 
@@ -258,6 +264,32 @@ def test_without_a_static_gain_the_role_is_named():
     free = replace(floating, f=lambda t, x, u, p: {"x": x.v, "v": (p.K * u.U - p.c * x.v) / p.m})
     with pytest.raises(ControlError, match=r"actuation = Actuation\(input, effort\)"):
         command_of(free, OWN, "F")
+
+
+def test_an_effort_without_the_right_sign_is_refused():
+    reverse = OWN.update(K=-12.5)
+    with pytest.raises(ControlError, match=r"negative, -12\.5; reverse the input"):
+        command_of(mass_on_a_spring(), reverse, "F")
+    stated = mass_on_a_spring(actuation=Actuation(input="U", effort=lambda p: p.K))
+    with pytest.raises(ControlError, match=r"check K = -12\.5 N/V"):
+        command_of(stated, reverse, "F")
+
+
+def test_viscous_friction_as_a_role_is_not_dry():
+    """The damper c as a role: the same controller, and predictive control is not refused."""
+    damper = Friction(velocity=lambda x, p: x.v, force=lambda v, p: p.c * v)
+    plant = mass_on_a_spring(
+        f=lambda t, x, u, p: {"x": x.v, "v": (p.K * u.U - p.k * x.x - u.damper) / p.m}, friction={"damper": damper}
+    )
+    assert find_dry_friction(plant, plant.complete(OWN)) == {}
+    spec = so.ControllerSpec(measured="F", bandwidth_hz=20, bandwidth_range_hz=(1.0, 60.0), current_limit_A=10.0)
+    assert so.tune(plant, OWN, spec).gains == pytest.approx(so.tune(mass_on_a_spring(), OWN, spec).gains, rel=1e-9)
+    assert force_mpc(plant, OWN, MPCSpec(current_limit_A=10.0, measured="F")).kalman.gain.size
+    dry = replace(damper, force=lambda v, p: p.c * v + 200.0 * ca.tanh(1e3 * v))
+    sticking = replace(plant, friction={"damper": dry})
+    assert find_dry_friction(sticking, sticking.complete(OWN)) == {"damper": pytest.approx(200.0)}
+    with pytest.raises(ControlError, match="the friction damper of 200 N"):
+        so.tune(sticking, OWN, spec)
 
 
 @pytest.mark.parametrize(

@@ -19,13 +19,14 @@ from jaxtyping import Float
 
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import Plant
+from seaopt.plants.plant import CompletedParameters, Plant
 from seaopt.plants.roles import Friction, PlantMaker, Port
 
 SLIDING, STUCK = "sliding", "stuck"
 STATES = (SLIDING, STUCK)
 # Speeds at which a curve that does not state its slopes is looked at, m/s or rad/s.
 SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
+LOW_SPEED = 1.0  # m/s or rad/s: up to here a curve shows its dry friction
 
 
 def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
@@ -56,6 +57,31 @@ def friction_slopes(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarra
     bounds = [[float(ca.DM(bound)) for bound in bound_slopes(friction, p)] for friction in plant.friction.values()]
     flattest, steepest = np.reshape(np.array(bounds, dtype=float), (-1, 2)).T
     return flattest, steepest
+
+
+def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, float]:
+    """Return the effort at the spring that each dry friction takes, by name; what is linear in its velocity is not dry.
+
+    It is the largest force at speeds up to `LOW_SPEED`, less viscous friction of the flattest slope.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> plant = so.plants.high_impedance()
+    >>> find_dry_friction(plant, plant.complete(so.plants.thor().update(f_c=50.0)))
+    {'F_f': 50.0}
+
+    """
+    p = params.by_attribute
+    speeds = [sign * float(speed) for speed in SAMPLED_SPEEDS[SAMPLED_SPEEDS <= LOW_SPEED] for sign in (1.0, -1.0)]
+    efforts: dict[str, float] = {}
+    slopes = zip(*friction_slopes(plant, params), strict=True)
+    for (name, friction), (flattest, steepest) in zip(plant.friction.items(), slopes, strict=True):
+        if flattest != steepest:
+            viscous = max(float(flattest), 0.0)
+            level = max(abs(float(friction.force(speed, p)) - viscous * speed) for speed in speeds)
+            efforts[name] = abs(float(friction.effort(p))) * level
+    return efforts
 
 
 @memo

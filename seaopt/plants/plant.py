@@ -29,7 +29,6 @@ Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
 Derived = Callable[[Any], Mapping[str, tuple[Any, str]]]
 Energy = Callable[[Any, Any], Any]
 ENERGY = "energy"  # among the outputs of a simulation, what the plant stores (J)
-SLIDING = 1e6  # m/s or rad/s: a speed at which dry friction has its last level
 Matrices = tuple[
     Float[np.ndarray, "nx nx"],
     Float[np.ndarray, "nx nu"],
@@ -291,12 +290,12 @@ def evaluate(expression: Expression, params: CompletedParameters) -> float:
     return float(expression(params.by_attribute))
 
 
-def dry_friction_effort(plant: Plant, params: CompletedParameters) -> float:
-    """Return the effort at the spring that dry friction takes when everything slides fast."""
-    p = params.by_attribute
-    return sum(
-        abs(float(friction.effort(p)) * float(friction.force(SLIDING, p))) for friction in plant.friction.values()
-    )
+def describe_parameters(expression: Expression, params: CompletedParameters) -> str:
+    """Return the parameters that a role's expression depends on, with their values."""
+    symbols = dict(zip(params, ca.vertsplit(params.plant.p), strict=True))
+    value = ca.SX(expression(SimpleNamespace(**symbols)))
+    used = [parameter for name, parameter in params.items() if ca.depends_on(value, symbols[name])]
+    return ", ".join(f"{parameter.name} = {parameter.value:g}{unit_after(parameter.unit)}" for parameter in used)
 
 
 @memo

@@ -10,7 +10,7 @@ from seaopt.control.loops.sampled_plant import static_gain
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.plant import evaluate
+from seaopt.plants.plant import describe_parameters, evaluate
 from seaopt.records import record
 
 
@@ -54,7 +54,8 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     Raises
     ------
     ControlError
-        The effort of one unit is not positive, or the plant states no actuation and has no static gain.
+        The effort of one unit is not positive, or the plant states no actuation and has no static gain or a
+        negative one.
 
     Examples
     --------
@@ -69,14 +70,20 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     if plant.actuation is not None:
         effort, effort_unit = evaluate(plant.actuation.effort, values), plant.actuation.unit
         if not 0.0 < effort < math.inf:
+            known = describe_parameters(plant.actuation.effort, values)
             raise ControlError(
                 f"plant {plant.name}: one {unit} of {source} makes an effort of {effort:g} {effort_unit}, which must "
-                "be positive; check the parameters of its actuation"
+                f"be positive; check {known or 'its actuation'}"
             )
     else:
         known = plant.sensing.regulated if plant.sensing is not None else ()
         output = measured if measured in known or not known else known[0]
-        effort, effort_unit = abs(static_gain(plant, values, output)), plant.outputs[output]
+        effort, effort_unit = static_gain(plant, values, output), plant.outputs[output]
+        if -math.inf < effort < -1e-12:
+            raise ControlError(
+                f"plant {plant.name} states no actuation, and its static gain from {source} to {output} is negative, "
+                f"{effort:g}; reverse the input or the output, or give it actuation = Actuation(input, effort)"
+            )
         if not (np.isfinite(effort) and effort > 1e-12):
             raise ControlError(
                 f"plant {plant.name} states no actuation, and its static gain from {source} to {output} is "

@@ -31,7 +31,7 @@ from seaopt.formatting import format_count, format_table, html_text
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
-from seaopt.plants.plant import dry_friction_effort
+from seaopt.plants.friction import find_dry_friction
 from seaopt.records import record
 from seaopt.simulation.discretisation import expm_with_derivatives
 from seaopt.simulation.simulate import input_samples
@@ -330,11 +330,10 @@ def _check(
         raise ControlError(f"sample_time_s = {sample_time_s!r} is not a time; give seconds above zero")
     if isinstance(delay, bool) or not isinstance(delay, int) or delay < 0:
         raise ControlError(f"delay_samples = {delay!r} is not a whole number of samples; give 0, 1, ...")
-    friction = dry_friction_effort(plant, params)
-    if friction != 0.0:
+    for name, effort in find_dry_friction(plant, params).items():
         raise ControlError(
-            f"friction of {friction:g}: dry friction at rest has no linear model; set it to zero and let input_noise "
-            "or input_drift stand for it"
+            f"friction {name} takes an effort of {effort:g}: dry friction at rest has no linear model; set it to zero "
+            "and let input_noise or input_drift stand for it"
         )
     if not isinstance(noise, NoiseModel):
         raise ControlError(f"noise is a {type(noise).__name__}; give a NoiseModel")

@@ -17,9 +17,12 @@ k = 1 that is Bode's integral.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError
@@ -96,7 +99,7 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
     )
 
 
-def check_current(spec: ControllerSpec, k_ff: float, per_effort: float, friction: float) -> None:
+def check_current(spec: ControllerSpec, k_ff: float, command: Command, friction: Mapping[str, float]) -> None:
     """Refuse a current limit that does not hold the step, or does not overcome dry friction.
 
     Raises
@@ -105,13 +108,14 @@ def check_current(spec: ControllerSpec, k_ff: float, per_effort: float, friction
         As said.
 
     """
-    limit = spec.current_limit_A
+    limit, per_effort, unit = spec.current_limit_A, command.per_effort, command.effort_unit
     if limit is None:
         return
-    if limit <= per_effort * friction:
+    if limit <= per_effort * sum(friction.values()):
+        levels = " and ".join(f"{name} of {effort:.4g} {unit}" for name, effort in friction.items())
         raise ControlError(
-            f"current_limit_A = {limit:g} makes {limit / per_effort:.4g} N, no more than the friction of "
-            f"{friction:g} N: nothing moves; raise it"
+            f"current_limit_A = {limit:g} makes {limit / per_effort:.4g} {unit}, no more than the friction {levels}: "
+            "nothing moves; raise it"
         )
     held = limit / (per_effort * abs(k_ff))
     if spec.step_N is not None and spec.step_N > held:

@@ -41,8 +41,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.friction import split_friction
-from seaopt.plants.plant import dry_friction_effort
+from seaopt.plants.friction import find_dry_friction, split_friction
 
 STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
 STARTS_REFINED = 2  # one more with an observer, all with a notch
@@ -99,7 +98,7 @@ def tune(
     task = make_task(plant, values, spec, robust_to or {}, draws)
     check_delay(spec, task.plants[0])
     command = command_of(plant, values, spec.measured)
-    check_current(spec, task.k_ff, command.per_effort, dry_friction_effort(plant, values))
+    check_current(spec, task.k_ff, command, find_dry_friction(plant, values))
     x, loops = solve(task)
     largest = None
     if list_broken(judge_all(spec, loops, task.design_states)):
