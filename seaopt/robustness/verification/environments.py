@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,13 +29,15 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import batch_figures
 
+Value = TypeVar("Value", float, Float[np.ndarray, " n"])
+
 MASSES_KG = (0.1, 1000.0)
 STIFFNESSES_N_PER_M = (1e1, 1e8)
 DAMPINGS_N_S_PER_M = (0.0, 10.0, 100.0, 1000.0)
 MAP_POINTS = 25
 EDGE_BISECTIONS = 30
-SPRING = Parameter(name="k_e", value=0.0, unit="N/m", min=0.0, description="stiffness of the environment")
-DAMPER = Parameter(name="d_e", value=0.0, unit="N s/m", min=0.0, description="damping of the environment")
+SPRING = Parameter(name="environment_stiffness", value=0.0, unit="N/m", min=0.0, description="k_e")
+DAMPER = Parameter(name="environment_damping", value=0.0, unit="N s/m", min=0.0, description="d_e")
 
 
 @record
@@ -131,7 +133,9 @@ class StabilityMap:
 
 
 def attach_environment(plant: Plant) -> Plant:
-    """Return a plant's probe with an environment on its inertia: parameters k_e and d_e besides its own.
+    """Return a plant's probe with an environment on its inertia; its last two parameters are k_e and d_e.
+
+    Their names are `SPRING`'s and `DAMPER`'s, with underscores as long as the probe has the same name.
 
     Raises
     ------
@@ -142,9 +146,12 @@ def attach_environment(plant: Plant) -> Plant:
     probe = probe_of(plant)
     port = bare_port(probe)
     command, unit = next(iter(probe.inputs.items()))
+    taken = {*probe.states, *probe.inputs, *probe.parameters, *probe.friction}
+    spring, damper = (_rename(parameter, taken) for parameter in (SPRING, DAMPER))
 
     def pull(x: Any, u: Any, p: Any) -> Any:
-        force = -p.k_e * getattr(x, port.coordinate) - p.d_e * getattr(x, port.rate)
+        force = -getattr(p, spring.name) * getattr(x, port.coordinate)
+        force -= getattr(p, damper.name) * getattr(x, port.rate)
         return SimpleNamespace(**(dict.fromkeys(probe.inputs, 0.0) | vars(u) | {port.effort: force}))
 
     return Plant(
@@ -152,12 +159,19 @@ def attach_environment(plant: Plant) -> Plant:
         states=probe.states,
         inputs={command: unit},
         outputs=probe.outputs,
-        parameters={**probe.parameters, "k_e": SPRING, "d_e": DAMPER},
+        parameters={**probe.parameters, spring.name: spring, damper.name: damper},
         f=lambda t, x, u, p: probe.f(t, x, pull(x, u, p), p),
         h=lambda t, x, u, p: probe.h(t, x, pull(x, u, p), p),
         friction=probe.friction,
         ports=(replace(probe.ports[0], effort=None),),
     )
+
+
+def _rename(parameter: Parameter, taken: set[str]) -> Parameter:
+    """Return a parameter under a name that is not taken."""
+    while parameter.name in taken:
+        parameter = replace(parameter, name=f"{parameter.name}_")
+    return parameter
 
 
 def coupled_stability(
@@ -227,7 +241,7 @@ def close_on_environment(
     controller: Controller, coupled: Plant, parameters: CompletedParameters, m_2: float, k_e: float, d_e: float
 ) -> Environment:
     """Return the loop against one environment, `coupled` being a plant of `attach_environment`."""
-    values = parameters.update(**{_inertia(coupled): m_2, "k_e": k_e, "d_e": d_e})
+    values = parameters.update(**_name_values(coupled, m_2, k_e, d_e))
     poles = controller.close(coupled, values).eigenvalues()
     largest = poles[int(np.argmax(np.abs(poles)))]
     radius, period = float(abs(largest)), controller.sample_time_s
@@ -250,9 +264,10 @@ def _check_grid(
         raise ControlError(f"points = {points} is too few for a grid; give 2 or more")
 
 
-def _inertia(coupled: Plant) -> str:
-    """Return the name of the parameter that is the inertia on the port."""
-    return coupled.ports[0].payload[0]
+def _name_values(coupled: Plant, mass: Value, stiffness: Value, damping: Value) -> dict[str, Value]:
+    """Return an environment's values under the names of the plant's parameters."""
+    *_, spring, damper = coupled.parameters
+    return {coupled.ports[0].payload[0]: mass, spring: stiffness, damper: damping}
 
 
 def _compute_radii(
@@ -260,13 +275,13 @@ def _compute_radii(
     k: Float[np.ndarray, " n"], d: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:  # fmt: skip
     """Return the spectral radii against n environments."""
-    draws = {_inertia(coupled): m, "k_e": k, "d_e": d}
+    draws = _name_values(coupled, m, k, d)
     return batch_figures(controller, coupled, parameters, draws, peaks=False).spectral_radius
 
 
 def _is_stable_fixed(controller: Controller, coupled: Plant, parameters: CompletedParameters) -> bool:
     """Return whether the loop is stable with the link fixed, for which a mass of 1e9 kg on the ground stands."""
-    values = parameters.update(**{_inertia(coupled): 1e9, "k_e": 1e12, "d_e": 1e9})
+    values = parameters.update(**_name_values(coupled, 1e9, 1e12, 1e9))
     return bool(np.max(np.abs(controller.close(coupled, values).eigenvalues())) <= GROWING)
 
 

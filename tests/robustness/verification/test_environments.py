@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,12 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control.laws.passivity import passivity
 from seaopt.errors import ControlError
-from seaopt.robustness.verification.environments import attach_environment, close_on_environment, coupled_stability
+from seaopt.robustness.verification.environments import (
+    SPRING,
+    attach_environment,
+    close_on_environment,
+    coupled_stability,
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,16 +63,41 @@ def by_hand(controller, thor, m_2, k_e, d_e):
 def test_the_map_is_the_calculation_by_hand(controller, stand, thor, case):
     expected = by_hand(controller, thor, *case)
     largest = expected[np.argmax(np.abs(expected))]
-    one = close_on_environment(controller, attach_environment(stand), thor, *case)
+    coupled = attach_environment(stand)
+    one = close_on_environment(controller, coupled, coupled.complete(thor), *case)
     assert one.spectral_radius == pytest.approx(np.abs(largest), abs=1e-8)
     if one.spectral_radius > 1 + 1e-6:
         assert one.frequency_hz == pytest.approx(abs(np.angle(largest)) / (2e-3 * np.pi), rel=1e-6)
 
 
+def test_an_actuators_own_k_e_stays_its_own(controller, stand, thor):
+    """The back EMF of a probe may well be called k_e (V s/rad), and another of its parameters d_e."""
+    probe = stand.port.probe()
+    own = {"k_e": so.Parameter(name="k_e", value=0.5, unit="V s/rad"), "d_e": "m", SPRING.name: "rad"}
+
+    def f(t, x, u, p):  # on top of the probe's: 300 N s/m times k_e = 0.5, by a screw of 1/(2 pi N_p) m
+        rates = dict(probe.f(t, x, u, p))
+        return rates | {"qd": rates["qd"] - 300.0 * p.k_e * x.qd + 0.0 * p.d_e * getattr(p, SPRING.name)}
+
+    def make(k_e):
+        changed = replace(probe, parameters={**probe.parameters, **own}, f=f)
+        plant = replace(stand, ports=(replace(stand.port, probe=lambda: changed),))
+        params = thor.with_parameters(*so.ParameterSet.of(k_e=(k_e, "V s/rad"), d_e=(1.0, "m")).values())
+        params = params.with_parameters(so.Parameter(name=SPRING.name, value=1.0, unit="rad"))
+        coupled = attach_environment(plant)
+        return close_on_environment(controller, coupled, coupled.complete(params), 5.0, 3e5, 10.0).spectral_radius
+
+    without = attach_environment(stand)
+    expected = close_on_environment(controller, without, without.complete(thor), 5.0, 3e5, 10.0).spectral_radius
+    assert make(0.0) == pytest.approx(expected, rel=1e-12)
+    assert abs(make(0.5) - expected) > 1e-6
+
+
 def test_every_point_of_the_map_is_its_own_loop(controller, stand, thor, found):
     coupled = attach_environment(stand)
+    values = coupled.complete(thor)
     for d, m, k in ((0, 3, 4), (1, 7, 12), (3, 14, 0)):
-        one = close_on_environment(controller, coupled, thor, found.mass[m], found.stiffness[k], found.damping[d])
+        one = close_on_environment(controller, coupled, values, found.mass[m], found.stiffness[k], found.damping[d])
         assert found.spectral_radius[d, m, k] == pytest.approx(one.spectral_radius, abs=1e-9)
 
 
@@ -83,7 +114,7 @@ def test_what_grows_swings_where_the_port_is_not_passive(controller, stand, thor
     coupled = attach_environment(stand)
     seen = []
     for m_2, k_e in [(m, k) for m in found.mass[::2] for k in found.stiffness[::2]]:
-        one = close_on_environment(controller, coupled, thor, float(m_2), float(k_e), 0.0)
+        one = close_on_environment(controller, coupled, coupled.complete(thor), float(m_2), float(k_e), 0.0)
         if one.doubling_s is not None:
             seen.append(one.frequency_hz)
     assert len(seen) > 5
@@ -93,8 +124,6 @@ def test_what_grows_swings_where_the_port_is_not_passive(controller, stand, thor
 
 def test_a_passive_loop_is_stable_against_everything(controller, stand, thor):
     """k_p alone, without delay's reach: 20 times slower sampling makes it passive nowhere; gains of zero everywhere."""
-    from dataclasses import replace
-
     from seaopt.control import TransferFunction
 
     silent = replace(controller, measurement=TransferFunction(num=np.zeros(1), den=np.ones(1)))
@@ -137,5 +166,5 @@ def test_bad_input(controller, stand, thor, options, words):
 
 
 def test_a_plant_without_port(controller):
-    with pytest.raises(ControlError, match="no port"):
+    with pytest.raises(ControlError, match="states no probe"):
         coupled_stability(controller, so.plants.rotary(), so.plants.rotary().defaults)
