@@ -73,7 +73,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
         raise PlantError(f"plant {plant.name} depends on time explicitly, which the export leaves out")
     target = Path(path)
     if include is not None and not Path(include).is_dir():
-        raise PlantError(f"include = {include} is no folder; give the one with the FMI 3.0 headers")
+        raise PlantError(f"include = {include} is not a folder; give the one with the FMI 3.0 headers")
     builder = _builder(plant, plant.complete(params), "plant_" + re.sub("[^A-Za-z0-9]+", "_", plant.name).strip("_"))
     archive = io.BytesIO()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

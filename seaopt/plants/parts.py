@@ -94,7 +94,7 @@ def parameters(parts: Sequence[str]) -> list[Parameter]:
 
 
 def check_parts(parts: Sequence[str]) -> None:
-    """Refuse what is no part, and a part given twice.
+    """Refuse an unknown part, and a part given twice.
 
     Raises
     ------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
@@ -11,6 +12,7 @@ from typing import Any
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, Notch
 from seaopt.control import draw as draw_values
+from seaopt.documents import check_table
 from seaopt.errors import ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
@@ -27,8 +29,7 @@ from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
 from seaopt.problem.columns import list_log_files, make_column, make_rule
-from seaopt.problem.ranges import range_remarks
-from seaopt.problem.references import check_references
+from seaopt.problem.references import check_references, range_remarks
 from seaopt.problem.schema import (
     ColumnTable,
     ExperimentTable,
@@ -40,9 +41,10 @@ from seaopt.problem.schema import (
     UnknownTable,
     VirtualTable,
 )
-from seaopt.problem.validation import read_table
 from seaopt.records import record
 from seaopt.robustness import place_value
+
+MAX_BYTES = 4 << 20
 
 
 @record(eq=False)
@@ -275,7 +277,7 @@ def read_problem(path: Path | str) -> Problem:
 
     """
     source = Path(path)
-    table = read_table(source)
+    table = _read_table(source)
     try:
         plants = {name: _make_plant(name, plant.kind, plant.model_extra or {}) for name, plant in table.plant.items()}
         parameters = _make_parameters(table.parameters, plants)
@@ -332,3 +334,30 @@ def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     notch = table.controller.notch
     tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
     return ControllerSpec(**fields, notch=tuned)
+
+
+def _read_table(source: Path) -> ProblemTable:
+    """Return a problem file's table.
+
+    Raises
+    ------
+    ProblemError
+        The file is missing or not TOML, a key is unknown or missing, or a value is out of range.
+
+    """
+    return check_table(ProblemTable, _read_toml(source), str(source), error=ProblemError)
+
+
+def _read_toml(source: Path) -> dict[str, Any]:
+    try:
+        if source.is_dir():
+            raise ProblemError(f"{source}: is a folder; give a problem file (TOML)")
+        if source.stat().st_size > MAX_BYTES:
+            raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
+        return tomllib.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ProblemError(f"{source}: no such file; check the path") from error
+    except OSError as error:
+        raise ProblemError(f"{source}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ProblemError(f"{source}: is not valid TOML ({error}); correct that place") from error

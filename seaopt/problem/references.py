@@ -1,7 +1,8 @@
-"""What a problem file says of its own plants: every name must be one of theirs."""
+"""Checks of a problem file against its own plants: names must be theirs, and ranges that are odd get a remark."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from seaopt.control.loops.sampled_plant import DELAY
@@ -10,7 +11,8 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.columns import check_inside
 from seaopt.problem.schema import ExperimentTable, ProblemTable, SensorsTable
-from seaopt.robustness import check_ranges
+from seaopt.robustness import check_ranges, place_value
+from seaopt.robustness.uncertainty.draws import find_modes
 from seaopt.units import unit_after
 
 MAX_LINK_DELAY_SAMPLES = 20
@@ -22,7 +24,7 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
     Raises
     ------
     ProblemError
-        As said; the message names the key.
+        The message names the key.
 
     """
     places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
@@ -123,3 +125,42 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
         for name in names:
             if name not in known:
                 raise ProblemError(f'{place}.{kind} names "{name}"; {suggestion(name, known)}')
+
+
+def range_remarks(
+    ranges: Mapping[str, tuple[float, float]], plants: Mapping[str, Plant], nominal: ParameterSet
+) -> list[str]:
+    """Return a sentence for a range that turns an angle past a right one, or leaves out a nominal mode.
+
+    A nominal value outside its range is among the notes of the certificate.
+
+    Parameters
+    ----------
+    ranges : mapping of name to (low, high)
+        Good ones: `seaopt.robustness.check_ranges`.
+    plants : mapping of name to Plant
+        What is certified.
+    nominal : ParameterSet
+        Its values.
+
+    """
+    remarks: list[str] = []
+    modes = find_modes(plants)
+    angles = {name for plant in plants.values() for name, unit in plant.states.items() if unit == "rad"}
+    for name, (low, high) in ranges.items():
+        place = f"robustness.parameters.{name} = [{low:g}, {high:g}]"
+        if name in modes and _mode_outside(name, (low, high), plants, nominal):
+            remarks.append(f"{place} Hz leaves out the nominal mode, so that no draw is like the nominal plant")
+        if name in angles and max(-low, high) > 0.5 * math.pi:
+            ends = f"{math.degrees(low):.4g} to {math.degrees(high):.4g}"
+            remarks.append(f"{place} is in rad: {ends} degrees, beyond a right angle; keep it if that is meant")
+    return remarks
+
+
+def _mode_outside(name: str, ends_hz: tuple[float, float], plants: Mapping[str, Plant], nominal: ParameterSet) -> bool:
+    """Tell whether the nominal value is none of those that put a mode into the range."""
+    plant = find_modes(plants)[name]
+    assert plant.mode is not None
+    placements = (place_value(plant, nominal, name, end, plants) for end in ends_hz)
+    values = [each[plant.mode.parameter].value for each in placements if each is not None]
+    return not min(values) <= plant.complete(nominal)[plant.mode.parameter].value <= max(values)

@@ -45,25 +45,25 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
     free = isinstance(delay, Parameter) and delay.free and own is None
     known = own.delay_s if own is not None else _value(delay)
     clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known, delay_free=free)
-    gain = own.gain if own is not None else {name: _value(item) for name, item in experiment.gain.items()}
+    gain = own.gain if own is not None else {name: _value(gain) for name, gain in experiment.gain.items()}
     return survey(
         experiment.plant, experiment.log, outputs=experiment.outputs, clock=clock, gain=gain, stretch_s=stretch_s
     )
 
 
-def _value(item: float | Parameter) -> float:
-    return item.value if isinstance(item, Parameter) else item
+def _value(number: float | Parameter) -> float:
+    return number.value if isinstance(number, Parameter) else number
 
 
 def fit_surveys(fit: Fit) -> dict[str, Survey]:
     """Return the frequency responses of a fit's experiments, without those whose log does not allow one."""
-    found: dict[str, Survey] = {}
+    surveys: dict[str, Survey] = {}
     for experiment in fit.experiments:
         try:
-            found[experiment.name] = experiment_survey(experiment, fit)
+            surveys[experiment.name] = experiment_survey(experiment, fit)
         except LogError:
             continue
-    return found
+    return surveys
 
 
 def survey_figure(
@@ -84,14 +84,14 @@ def survey_figure(
 
     """
     panels: list[Panel] = []
-    for name, found in surveys.items():
-        for pair in found.pairs:
+    for name, measured in surveys.items():
+        for pair in measured.pairs:
             curves: list[Curve] = []
             if fitted is not None and name in fitted:
                 own, fit = fitted[name]
                 curves.append(Curve(label="model, fitted", response=own.model(pair, fit.parameters), colour=FITTED))
             if given is not None:
-                model = found.model(pair, given)
+                model = measured.model(pair, given)
                 curves.append(Curve(label="model, the file's values", response=model, colour=GIVEN, style="-."))
             if pair.second_order is not None:
                 form = pair.second_order.response
@@ -101,12 +101,12 @@ def survey_figure(
     return bode_figure(panels)
 
 
-def sentence(found: Survey, fit: Fit) -> str:
+def sentence(measured: Survey, fit: Fit) -> str:
     """Say in plain words how the frequency responses of one experiment compare with the fit."""
-    usable = [pair for pair in found.pairs if pair.second_order is not None]
+    usable = [pair for pair in measured.pairs if pair.second_order is not None]
     if not usable:
         return "The log is not coherent enough for a comparison in frequency."
-    away = [pair.misfit(found.model(pair, fit.parameters)) for pair in usable]
+    away = [pair.misfit(measured.model(pair, fit.parameters)) for pair in usable]
     names = [pair.name for pair in usable]
     parts = [f"The fitted model lies {_each(away, names)} standard deviations from H1 (rms over its coherent lines)"]
     forms = [pair.second_order.misfit for pair in usable if pair.second_order is not None]
@@ -116,15 +116,15 @@ def sentence(found: Survey, fit: Fit) -> str:
     odd = [name for name, form, model in zip(names, forms, away, strict=True) if form > FAR * max(model, 1.0)]
     if odd:
         parts.append(f"{join_words(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
-    spring = found.plant.spring
+    spring = measured.plant.spring
     if spring is not None and spring.mass is not None and spring.damping is not None:
         derived = fit.derived[spring.mass], fit.derived[spring.damping]
-        parts += [_reading(pair, drive, *derived) for pair, drive in _drives(found, fit)[:1]]
+        parts += [_reading(pair, drive, *derived) for pair, drive in _drives(measured, fit)[:1]]
     return "".join(parts).strip()
 
 
-def _drives(found: Survey, fit: Fit) -> list[tuple[Pair, DriveEstimate]]:
-    pairs = [(pair, found.drive(pair, fit.parameters)) for pair in found.pairs]
+def _drives(measured: Survey, fit: Fit) -> list[tuple[Pair, DriveEstimate]]:
+    pairs = [(pair, measured.drive(pair, fit.parameters)) for pair in measured.pairs]
     return [(pair, drive) for pair, drive in pairs if drive is not None]
 
 

@@ -130,9 +130,9 @@ def all_figures(
         units = {name: experiment.plant.outputs[name] for name in experiment.outputs}
         out[f"time_{experiment.name}"] = time_figure(fit.predict(experiment), units)
         if experiment.name in surveys:
-            found = surveys[experiment.name]
+            measured = surveys[experiment.name]
             out[f"response_{experiment.name}"] = survey_figure(
-                {experiment.name: found}, fitted={experiment.name: (found, fit)}
+                {experiment.name: measured}, fitted={experiment.name: (measured, fit)}
             )
     if controller is not None and plants:
         out["loop"] = loop_figure(controller, plants)

@@ -18,21 +18,21 @@ BAND = "#f2d9c4"  # of what chance allows
 ROW = 2.3  # inches
 
 
-def residual_figure(fit: Fit, found: Diagnostics, name: str) -> Figure:
+def residual_figure(fit: Fit, diagnostics: Diagnostics, name: str) -> Figure:
     """Draw, for each output of an experiment, the residual, its autocorrelation and its correlation with each input."""
     experiment = next(experiment for experiment in fit.experiments if experiment.name == name)
-    outputs = found.outputs[name]
+    outputs = diagnostics.outputs[name]
     figure, axes = panels(len(outputs), 3, ROW * len(outputs), sharex="col", width_ratios=(1.2, 0.8, 1.0))
-    for (output, item), (left, middle, right) in zip(outputs.items(), axes, strict=True):
-        _residual(left, experiment, found, output)
+    for (output, statistics), (left, middle, right) in zip(outputs.items(), axes, strict=True):
+        _residual(left, experiment, diagnostics, output)
         left.set_ylabel(f"{output} [sigma]")
-        lags = np.arange(item.autocorrelation.size)
-        _band(middle, item.autocorrelation_bound)
-        middle.vlines(lags[1:], 0.0, item.autocorrelation[1:], color=MEASURED, linewidth=1.6)
-        _reach(middle, [item.autocorrelation[1:]], item.autocorrelation_bound)
-        for (label, cross), colour in zip(item.inputs.items(), PLANT_COLOURS * 9, strict=False):
+        lags = np.arange(statistics.autocorrelation.size)
+        _band(middle, statistics.autocorrelation_bound)
+        middle.vlines(lags[1:], 0.0, statistics.autocorrelation[1:], color=MEASURED, linewidth=1.6)
+        _reach(middle, [statistics.autocorrelation[1:]], statistics.autocorrelation_bound)
+        for (label, cross), colour in zip(statistics.inputs.items(), PLANT_COLOURS * 9, strict=False):
             _cross(right, label, cross, colour)
-        _reach(right, [cross.values for cross in item.inputs.values()], 0.0)
+        _reach(right, [cross.values for cross in statistics.inputs.values()], 0.0)
     for axis, title in zip(
         axes[0],
         ("samples used: range of the residual", "correlation with itself", "correlation with inputs"),
@@ -46,10 +46,10 @@ def residual_figure(fit: Fit, found: Diagnostics, name: str) -> Figure:
     return figure
 
 
-def _residual(axis: Axes, experiment: Experiment, found: Diagnostics, output: str) -> None:
+def _residual(axis: Axes, experiment: Experiment, diagnostics: Diagnostics, output: str) -> None:
     log = experiment.log
     time = np.concatenate([log.time[piece] for piece in experiment.pieces]) - log.time[0]
-    values = np.concatenate(found.residuals[experiment.name].weighted_of(output))
+    values = np.concatenate(diagnostics.residuals[experiment.name].weighted_of(output))
     low, high, at = envelope(np.where(values == 0.0, np.nan, values), time)
     axis.fill_between(at, low, high, color=MEASURED, linewidth=0.0)
 

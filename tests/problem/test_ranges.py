@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import seaopt as so
-from seaopt.problem.ranges import range_remarks
+from seaopt.problem.references import range_remarks
 
 
 @pytest.mark.parametrize(

@@ -97,17 +97,17 @@ def export(
     if Path(folder).exists() and not Path(folder).is_dir():
         raise FileError(f"{folder}: is a file; give a folder")
     if isinstance(controller, Controller):
-        given = {field.name: getattr(controller, field.name) for field in fields(Controller)}
+        stored = {field.name: getattr(controller, field.name) for field in fields(Controller)}
         figures = _figures(controller)
     else:
         from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
-        given, figures = read_controller(controller), _stated(controller)
-    if not given["feasible"] and not allow_infeasible:
-        missed = ", ".join(given["active_constraints"])
+        stored, figures = read_controller(controller), _stated(controller)
+    if not stored["feasible"] and not allow_infeasible:
+        missed = ", ".join(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
-    law = _law(given, current_limit_A, tracking_time_s)
-    context = _describe(given, law) | {
+    law = _law(stored, current_limit_A, tracking_time_s)
+    context = _describe(stored, law) | {
         "achieved": figures,
         "precision": precision,
         "name": prefix,
@@ -115,7 +115,7 @@ def export(
     }
     numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
     texts = {
-        pattern.format(prefix): _render(template, context | _numbers(given, law, numbers[pattern[-2:]], precision))
+        pattern.format(prefix): _render(template, context | _numbers(stored, law, numbers[pattern[-2:]], precision))
         for pattern, template in TEMPLATES.items()
     }
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
@@ -162,26 +162,26 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
     return [f"{whence}: {', '.join(parts) or 'nothing that was measured'}."]
 
 
-def _law(given: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
+def _law(stored: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
     return realise(
-        given["reference"],
-        given["measurement"],
-        sample_time_s=given["sample_time_s"],
-        per_effort=given["command"].per_effort,
-        current_limit_A=given["spec"].current_limit_A if current_limit_A is None else current_limit_A,
+        stored["reference"],
+        stored["measurement"],
+        sample_time_s=stored["sample_time_s"],
+        per_effort=stored["command"].per_effort,
+        current_limit_A=stored["spec"].current_limit_A if current_limit_A is None else current_limit_A,
         tracking_time_s=tracking_time_s,
     )
 
 
-def _describe(given: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
+def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     """Return what the files say in words."""
     return {
-        "structure": _strip_markup(given["structure"]),
-        "measured": _strip_markup(given["spec"].measured),
+        "structure": _strip_markup(stored["structure"]),
+        "measured": _strip_markup(stored["spec"].measured),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
-        "delay_samples": given["delay_samples"],
-        "feasible": given["feasible"],
-        "blocking": _strip_markup(", ".join(given["active_constraints"])),
+        "delay_samples": stored["delay_samples"],
+        "feasible": stored["feasible"],
+        "blocking": _strip_markup(", ".join(stored["active_constraints"])),
         "limited": math.isfinite(law.current_limit_A),
         "order": law.c.size,
         "storage": max(law.c.size, 1),
@@ -207,7 +207,7 @@ def _literal(precision: Precision) -> Callable[[float], str]:
 
 
 def _numbers(
-    given: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
+    stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str], precision: Precision
 ) -> dict[str, Any]:
     """Return the numbers as text; a law without states is given one that stays zero."""
 
@@ -229,15 +229,15 @@ def _numbers(
         "force_limit_N": number(min(law.force_limit_N, largest)),
         "current_limit_A": number(min(law.current_limit_A, largest)),
         "per_effort": number(law.per_effort),
-        "per_effort_unit": given["command"].per_effort_unit,
+        "per_effort_unit": stored["command"].per_effort_unit,
         "sample_time_s": number(law.sample_time_s),
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
             {"name": _identifier(key), "value": number(float(value)), "unit": GAIN_UNITS.get(key, "")}
-            for key, value in given["gains"].items()
+            for key, value in stored["gains"].items()
         ],
         "transfer_functions": [
-            {"name": key, "num": row(given[key].num), "den": row(given[key].den)}
+            {"name": key, "num": row(stored[key].num), "den": row(stored[key].den)}
             for key in ("reference", "measurement")
         ],
     }

@@ -18,11 +18,11 @@ Every matrix is public: a step is two products of small matrices, as easily writ
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.mpc.estimates import augment, disturbances_of, list_estimates
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
@@ -32,6 +32,7 @@ from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import find_dry_friction
+from seaopt.plants.plant import deflection_row
 from seaopt.records import record
 from seaopt.simulation.discretisation import expm_with_derivatives
 from seaopt.simulation.simulate import input_samples
@@ -299,8 +300,8 @@ def estimator(
     block = np.zeros((nx + nu, nx + nu))
     block[:nx, :nx], block[:nx, nx:] = a, b
     whole, _ = expm_with_derivatives(block * sample_time_s, np.zeros((0, nx + nu, nx + nu)))
-    disturbances = disturbances_of(plant, noise, sample_time_s)
-    A, B, Q = augment(whole[:nx, :nx], whole[:nx, nx:], disturbances)
+    disturbances = _disturbances_of(plant, noise, sample_time_s)
+    A, B, Q = _augment(whole[:nx, :nx], whole[:nx, nx:], disturbances)
     columns = [column for column, _, _ in disturbances]
     rows = [list(plant.outputs).index(name) for name in chosen]
     C, D = np.hstack([c, d[:, columns]])[rows], d[rows]
@@ -309,7 +310,7 @@ def estimator(
     S = C @ P @ C.T + R
     gain = np.linalg.solve(S, C @ P).T
     keep = np.eye(len(A)) - gain @ C
-    names, units, G, H = list_estimates(plant, values, (a, b, c, d), disturbances)
+    names, units, G, H = _list_estimates(plant, values, (a, b, c, d), disturbances)
     return Estimator(
         plant=plant, outputs=chosen, sample_time_s=sample_time_s, delay_samples=delay_samples, noise=noise,
         A=A, B=B, C=C, D=D, gain=gain, covariance=keep @ P @ keep.T + gain @ R @ gain.T, innovation_covariance=S,
@@ -374,3 +375,50 @@ def run_recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> F
         x = np.vstack([x[:reach], x[reach:] + x[:-reach] @ power.T])
         power, reach = power @ power, 2 * reach
     return x
+
+
+def _disturbances_of(plant: Plant, noise: NoiseModel, sample_time_s: float) -> list[tuple[int, float, float]]:
+    """Return (input, pole, variance over one sample) of each disturbance: white ones have pole 0, walks pole 1."""
+    inputs, root = list(plant.inputs), np.sqrt(sample_time_s)
+    white = [(inputs.index(name), 0.0, (s / root) ** 2) for name, s in noise.input_noise.items() if s > 0.0]
+    return white + [(inputs.index(name), 1.0, (s * root) ** 2) for name, s in noise.input_drift.items() if s > 0.0]
+
+
+def _augment(
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, "nx nu"], disturbances: list[tuple[int, float, float]]
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n nu"], Float[np.ndarray, "n n"]]:
+    """Return A, B and Q of the plant with its disturbances as states."""
+    nx, count = len(a), len(disturbances)
+    A, Q = np.zeros((nx + count, nx + count)), np.zeros((nx + count, nx + count))
+    A[:nx, :nx] = a
+    for i, (column, pole, variance) in enumerate(disturbances, start=nx):
+        A[:nx, i], A[i, i], Q[i, i] = b[:, column], pole, variance
+    return A, np.vstack([b, np.zeros((count, b.shape[1]))]), Q
+
+
+def _list_estimates(
+    plant: Plant, params: CompletedParameters, matrices: tuple[Any, Any, Any, Any],
+    disturbances: list[tuple[int, float, float]],
+) -> tuple[tuple[str, ...], tuple[str, ...], Float[np.ndarray, "nz n"], Float[np.ndarray, "nz nu"]]:  # fmt: skip
+    """Return names, units, G and H of everything that is estimated."""
+    a, b, c, d = matrices
+    nx, nu = b.shape
+    columns = [column for column, _, _ in disturbances]
+    units = dict(plant.outputs)
+    rows = {name: (c[i], d[i]) for i, name in enumerate(plant.outputs)}
+    for i, (name, unit) in enumerate(plant.states.items()):
+        if name not in rows:
+            rows[name], units[name] = (np.eye(nx)[i], np.zeros(nu)), unit
+    if plant.spring is not None:
+        row, unit = deflection_row(plant, params), plant.spring.unit
+        rows |= {"spring_deflection": (row, np.zeros(nu)), "spring_rate": (row @ a, row @ b)}
+        units |= {"spring_deflection": unit, "spring_rate": f"{unit}/s"}
+    count = len(disturbances)
+    wide = {name: (np.concatenate([x, u[columns]]), u) for name, (x, u) in rows.items()}
+    for i, (column, pole, _) in enumerate(disturbances, start=nx):
+        if pole == 1.0:
+            name = list(plant.inputs)[column]
+            wide[f"{name}_drift"] = (np.eye(nx + count)[i], np.zeros(nu))
+            units[f"{name}_drift"] = plant.inputs[name]
+    G, H = (np.array([pair[k] for pair in wide.values()]) for k in (0, 1))
+    return tuple(wide), tuple(units[name] for name in wide), G, H

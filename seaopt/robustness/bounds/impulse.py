@@ -18,8 +18,8 @@ from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.plants import Plant, jacobians
 from seaopt.records import record
 from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, count_halvings, enclose
-from seaopt.robustness.bounds.equilibrium import enclose_equilibrium
 from seaopt.robustness.bounds.region import Boxes, Region
+from seaopt.robustness.bounds.rest_enclosure import enclose_equilibrium
 from seaopt.robustness.bounds.taylor import Taylor, build_basis, make_constant, mask_models, stack_models
 
 REACH, DEGREE = 0.25, 12  # of the series: 0.25^13 / 14! = 2e-19, which is enclosed too
