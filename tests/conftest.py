@@ -48,7 +48,7 @@ checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker
 
-ALWAYS, EVERY = 3, 50
+ALWAYS, EVERY = 3, 200
 check_all_calls, calls = jaxtyping.jaxtyped, Counter[CodeType]()
 
 

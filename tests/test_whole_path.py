@@ -9,6 +9,9 @@ import sys
 import numpy as np
 import pytest
 
+import seaopt as so
+from seaopt.bench import PAPER_STAND
+
 CODE = """
 import json, seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING
@@ -32,6 +35,22 @@ def run(**environment):
         [sys.executable, "-c", CODE], capture_output=True, text=True, check=True, env={**os.environ, **environment}
     )
     return json.loads(out.stdout)
+
+
+def test_a_compiler_changes_no_fit(stand, thor, monkeypatch):
+    """A small part of the next one, in this process."""
+    from seaopt.simulation import compiled
+
+    noise = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
+    log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=1, rate_hz=400, seed=1, sensors=noise)
+    bench = so.Experiment(plant=stand, log=log, outputs=("F1", "F2"))
+    free = thor.update(J=3e-6).free("J", "b_r")
+    fast = so.fit([bench], free, method=so.OutputError(search=False))
+    monkeypatch.setattr(compiled.Program, "make", lambda *_: None)
+    slow = so.fit([bench], free, method=so.OutputError(search=False))
+    for name in ("J", "b_r"):
+        assert fast.parameters[name].value == pytest.approx(slow.parameters[name].value, rel=1e-6)
+        assert fast.parameters[name].std == pytest.approx(slow.parameters[name].std, rel=1e-6)
 
 
 @pytest.mark.slow

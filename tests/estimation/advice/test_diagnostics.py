@@ -92,6 +92,15 @@ def test_a_delay_is_found_with_its_size(stand, thor, log, samples):
     assert found.outputs["stand"]["F1"].inputs["I"].worst_lag > 0
 
 
+def test_a_delay_is_tried_in_the_band_of_the_fit(stand, thor, log):
+    """A drift outside the band is no part of the power that a delay leaves."""
+    slow = 60.0 * np.sin(2 * np.pi * 0.2 * log.time)
+    late = shifted(log.__class__.from_arrays(**log.to_arrays() | {"F1": log["F1"] + slow}), 2)
+    found = diagnose(fitted(stand, late, thor, band_hz=(5.0, 50.0)))
+    (said,) = [sentence for sentence in found.sentences if sentence.startswith("stand.F1") and "delay of" in sentence]
+    assert float(said.split("with a delay of ")[1].split(" ms")[0]) == pytest.approx(5.0, rel=0.02)
+
+
 def test_an_input_that_is_stamped_late_is_no_delay(stand, thor, log):
     said = diagnose(fitted(stand, shifted(log, -1), thor)).sentences[0]
     assert "or an input that is stamped late" in said
