@@ -105,7 +105,7 @@ class Controller:
         if self.largest_bandwidth_hz is None:
             return f"{asked:g} Hz is blocked by {blocked}"
         if self.largest_bandwidth_hz == 0.0:
-            remedy = f"no bandwidth from {low:g} Hz up was found that keeps these limits"
+            remedy = f"none is known down to {low:g} Hz; above was not tried: look with `seaopt tune --sweep`"
         else:
             remedy = f"with these limits {self.largest_bandwidth_hz:.4g} Hz is possible"
         return f"{asked:g} Hz is blocked by {blocked}; {remedy}"
