@@ -40,12 +40,12 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
         The log does not allow an estimate.
 
     """
-    own = fit.nuisance.get(experiment.name) if fit is not None else None
+    nuisance = fit.nuisance.get(experiment.name) if fit is not None else None
     delay = experiment.delay_s
-    free = isinstance(delay, Parameter) and delay.free and own is None
-    known = own.delay_s if own is not None else _value(delay)
+    free = isinstance(delay, Parameter) and delay.free and nuisance is None
+    known = nuisance.delay_s if nuisance is not None else _value(delay)
     clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known, delay_free=free)
-    gain = own.gain if own is not None else {name: _value(gain) for name, gain in experiment.gain.items()}
+    gain = nuisance.gain if nuisance is not None else {name: _value(gain) for name, gain in experiment.gain.items()}
     return survey(
         experiment.plant, experiment.log, outputs=experiment.outputs, clock=clock, gain=gain, stretch_s=stretch_s
     )
@@ -88,8 +88,10 @@ def survey_figure(
         for pair in measured.pairs:
             curves: list[Curve] = []
             if fitted is not None and name in fitted:
-                own, fit = fitted[name]
-                curves.append(Curve(label="model, fitted", response=own.model(pair, fit.parameters), colour=FITTED))
+                fitted_survey, fit = fitted[name]
+                curves.append(
+                    Curve(label="model, fitted", response=fitted_survey.model(pair, fit.parameters), colour=FITTED)
+                )
             if given is not None:
                 model = measured.model(pair, given)
                 curves.append(Curve(label="model, the file's values", response=model, colour=GIVEN, style="-."))
