@@ -112,6 +112,11 @@ def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Co
     return split
 
 
+def take_sliding(plant: Plant, params: ParameterSet) -> Plant:
+    """Return the sliding plant where there is friction, else the plant itself."""
+    return next(iter(split_friction({"": plant}, params).values()))
+
+
 def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = ()) -> bool:
     """Tell whether a plant's friction differs between sticking and sliding."""
     if not plant.friction:

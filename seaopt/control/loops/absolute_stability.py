@@ -292,8 +292,8 @@ def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
         return lambda s: 1.0 - share * rate / (rate + s)
 
     for rate in rates:
+        yield f"Popov, {1.0 / rate:.3g} s", popov(1.0 / rate)  # a negative time needs a bounded slope
         for sign in (1.0, -1.0):
-            yield f"Popov, {sign / rate:.3g} s", popov(sign / rate)
             for share in ZAMES_FALB_AREAS:
                 name = f"Zames-Falb, {share:g} at {sign * rate / (2 * np.pi):.3g} Hz"
                 # A negative rate is the anticausal one: -rate / (-rate + s) = rate / (rate - s).

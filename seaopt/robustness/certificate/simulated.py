@@ -16,7 +16,7 @@ from seaopt.errors import ControlError, SeaoptError
 from seaopt.formatting import format_band, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
@@ -130,7 +130,7 @@ def run_simulations(
         )
     check_plants(plants, draws or {}, {})
     plant, values = controller.design
-    sliding = next(iter(split_friction({"": plant}, values).values()))  # stuck, friction only adds damping
+    sliding = take_sliding(plant, values)  # stuck, friction only adds damping
     device = sensors or Sensors()
     left_out: dict[str, str] = {}
 
