@@ -53,7 +53,7 @@ def draw(rng: np.random.Generator) -> Case:
         sample_rate_hz=float(rng.choice([500.0, 1e3, 1e3, 2e3])), max_sensitivity=float(rng.uniform(1.45, 2.2)),
         max_complementary=maybe(0.6, 1.15, 1.6), max_reference_peak=maybe(0.6, 1.05, 1.5), max_noise_gain=noise,
         min_disk_margin=maybe(0.2, 0.6, 1.1), objective=str(rng.choice(["disturbance", "disturbance", "noise"])),
-        derivative=str(rng.choice(["error", "error", "measurement"])),
+        reference_weights=str(rng.choice(["error", "error", "measurement"])),
         notch=Notch() if structure == "pid" and rng.random() < 0.2 else None,
     )  # fmt: skip
     return Case(spec=spec, params=params, swing=bool(rng.random() < 0.5))
@@ -119,7 +119,7 @@ class Judge:
             damping = 2 * numbers["w"] * w * s
             series = series * (s**2 + numbers["g"] * damping + w**2) / (s**2 + damping + w**2)
         both = numbers["p"] + numbers["i"] * ts / 2 * (1 + q) / (1 - q)
-        forward = numbers["d"] * rate if self.spec.derivative == "error" else 0.0
+        forward = numbers["d"] * rate if self.spec.reference_weights == "error" else 0.0
         return series * (both + numbers["d"] * rate + more), series * (both + forward + self.k_ff)
 
     def proportional(self, numbers):
@@ -225,7 +225,7 @@ def stable(case: Case, controller: so.Controller, numbers) -> bool:
     one = {name: float(value[0, 0]) for name, value in numbers.items()}
     observer = controller.observer
     gains = Gains(
-        k_p=one["p"], k_i=one["i"], k_d=one["d"], T_f=one["T"], k_ff=1.0, derivative=case.spec.derivative,
+        k_p=one["p"], k_i=one["i"], k_d=one["d"], T_f=one["T"], k_r=1.0 + one["p"],
         observer=None if observer is None else replace(observer, T_q=one["Q"]),
         notch=Notch(frequency_hz=one["f"], width=one["w"], depth=one["g"]) if "f" in one else None,
     )  # fmt: skip

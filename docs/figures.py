@@ -163,7 +163,7 @@ def verification() -> None:
     save(stability_figure(coupled_stability(controller, stand, params)), "environments")
 
 
-GAINS = Gains(k_p=3.18, k_i=1.31, k_d=0.0328, T_f=1.01e-3, k_ff=1.0)  # 30 Hz on the stand
+GAINS = Gains(k_p=3.18, k_i=1.31, k_d=0.0328, T_f=1.01e-3, k_r=4.18)  # 30 Hz on the stand
 
 
 def anti_windup() -> None:
@@ -175,7 +175,7 @@ def anti_windup() -> None:
     time = np.arange(4000) * 1e-3
     figure, axes = new(["force", "current"], "F1 over what 9 A hold", "time [s]")
     axes[1].set_ylabel("current [A]")
-    roots = {"(k_ff + k_p)/k_i = 3.2 s": None, "sqrt(T_i T_d) = 0.16 s": 0.158, "none": 1e9}
+    roots = {"k_r/k_i = 3.2 s": None, "sqrt(T_i T_d) = 0.16 s": 0.158, "none": 1e9}
     for (label, tracking), colour in zip(roots.items(), ("#0072b2", "#d55e00", "#777777"), strict=True):
         law = realise(*pair, sample_time_s=1e-3, per_effort=gain, current_limit_A=9.0, tracking_time_s=tracking)
         x, state, forces, currents = np.zeros(b.size), law.reset(), [], []

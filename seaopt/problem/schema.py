@@ -228,7 +228,7 @@ class ControllerTable(_Strict):
     measured: str = "F1"
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
-    derivative: Literal["error", "measurement"] = "error"
+    reference_weights: Literal["tuned", "error", "measurement"] = "tuned"
     bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
     sample_rate_hz: Number = 1000.0

@@ -32,7 +32,7 @@ from seaopt.plants import Plant
 from seaopt.records import record
 
 CONTROLLER_SCHEMA = "seaopt/controller/2"
-GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_ff": "N/N", "T_q": "s"}
+GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_r": "N/N", "c": "", "T_q": "s"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
@@ -135,7 +135,7 @@ class Controller:
         """The gains as a drive is set, values and units: the command per force error, its integral and its rate."""
         unit, effort = self.command.unit, self.command.effort_unit
         ratio = self.command.per_effort_unit
-        units = {"k_p": ratio, "k_i": f"{unit}/({effort} s)", "k_d": ratio.replace("/", " s/"), "k_ff": ratio}
+        units = {"k_p": ratio, "k_i": f"{unit}/({effort} s)", "k_d": ratio.replace("/", " s/"), "k_r": ratio}
         scale = self.command.per_effort
         return {name: (scale * value, units[name]) for name, value in self.gains.items() if name in units}
 
@@ -249,7 +249,7 @@ class Controller:
     def _gain_lines(self) -> list[str]:
         law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
         lines = [
-            "  " + ", ".join(f"{name} = {value:.5g} {GAIN_UNITS[name]}" for name, value in law.items()),
+            "  " + ", ".join(f"{name} = {value:.5g} {GAIN_UNITS[name]}".rstrip() for name, value in law.items()),
             "  as current: " + ", ".join(
                 f"{name} = {value:.5g} {unit}" for name, (value, unit) in self.engineering.items()
             ),

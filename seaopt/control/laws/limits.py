@@ -245,7 +245,7 @@ LIMITS = (
         sense="at most", scope="design plant", above=1.0, stuck_too=True,
         curve=LimitCurve(of="P C_r"),
         meaning="peak of |F/F_ref| over its static value",
-        remedy="use a pid_dob or derivative = \"measurement\", or lower the bandwidth",
+        remedy="use a pid_dob, leave reference_weights tuned, or lower the bandwidth",
     ),
     Limit(
         name="max_noise_gain", label="noise gain", figure=lambda loop: loop.figures.noise_gain, sense="at most",

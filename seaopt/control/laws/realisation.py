@@ -9,11 +9,12 @@ the poles of the m integrators go from 1 to :math:`\lambda = T_t/(T_t + T_s)`, a
 with the tracking time constant T_t (Astrom, Hagglund, PID Controllers, 2nd ed., ISA 1995, integrator windup). Theirs
 is T_i for a PI, and :math:`\sqrt{T_i T_d}` with a derivative. The feedforward of these laws makes another one right.
 At rest at the limit, with a reference that is out of reach by e,
-:math:`u - \mathrm{sat}(u) = (k_\mathrm{ff} + k_p) e + x_I` and :math:`\dot x_I = k_i e - (u - \mathrm{sat}(u))/T_t`,
-so that the integrator rests at zero, and the law returns from saturation as if it had been given the reference that
-is in reach (Hanus, Kinnaert, Henrotte, Automatica 23(6), 1987), for
+:math:`u - \mathrm{sat}(u) = k_r e + x_I - x_I^*` and :math:`\dot x_I = k_i e - (u - \mathrm{sat}(u))/T_t`, with
+:math:`x_I^* = (1/P(0) + k_p - k_r) F` the integral that the force in reach needs (zero where k_r is not weighted), so
+that the integrator rests there, and the law returns from saturation as if it had been given the reference that is in
+reach (Hanus, Kinnaert, Henrotte, Automatica 23(6), 1987), for
 
-.. math:: T_t = \frac{k_\mathrm{ff} + k_p}{k_i}, \qquad \text{in general } T_s \frac{a_1}{a_0} \text{ of }
+.. math:: T_t = \frac{k_r}{k_i}, \qquad \text{in general } T_s \frac{a_1}{a_0} \text{ of }
           C_r = a_0 \delta^{-m} + a_1 \delta^{1-m} + \dots
 
 the default (a sample at least), which is T_i where there is no feedforward.

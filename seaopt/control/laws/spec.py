@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 from typing import Any, Literal
 
 from seaopt.control.laws.limits import BY_NAME, FIELDS, Limit
-from seaopt.control.laws.structures import STRUCTURES, Derivative, Notch, Structure
+from seaopt.control.laws.structures import REFERENCE_WEIGHTS, STRUCTURES, Notch, ReferenceWeights, Structure
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
 
@@ -30,12 +30,12 @@ class ControllerSpec:
     bandwidth_range_hz : (low, high)
         Allowed range of bandwidth_hz; 15 to 60 if left out.
     structure : {"pd", "pid", "pid_dob"}
-        Each with feedforward of the reference; a pid_dob has a disturbance observer whose nominal plant is the design
-        plant.
+        A pid_dob has a disturbance observer whose nominal plant is the design plant.
     notch : Notch, optional
         A notch in series; fields that are None are tuned.
-    derivative : {"error", "measurement"}
-        What is differentiated.
+    reference_weights : {"tuned", "error", "measurement"}
+        k_r and c of `seaopt.control.laws.structures`: tuned with the gains; feedforward and feedback of the error,
+        k_r = 1/P(0) + k_p and c = 1; or the derivative on the measurement alone, c = 0, with k_r tuned.
     sample_rate_hz : float
         Of the controller.
     delay_samples : int
@@ -75,7 +75,7 @@ class ControllerSpec:
     bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
     structure: Structure = "pid"
     notch: Notch | None = None
-    derivative: Derivative = "error"
+    reference_weights: ReferenceWeights = "tuned"
     sample_rate_hz: float = 1000.0
     delay_samples: int = 1
     max_sensitivity: float | None = BY_NAME["max_sensitivity"].default
@@ -104,8 +104,11 @@ class ControllerSpec:
             raise ControlError(
                 f'structure = "{self.structure}" is not known; {suggestion(str(self.structure), STRUCTURES)}'
             )
-        if self.derivative not in ("error", "measurement"):
-            raise ControlError(f'derivative = "{self.derivative}" is not known; use "error" or "measurement"')
+        if self.reference_weights not in REFERENCE_WEIGHTS:
+            raise ControlError(
+                f'reference_weights = "{self.reference_weights}" is not known; '
+                f"{suggestion(str(self.reference_weights), REFERENCE_WEIGHTS)}"
+            )
         if self.objective not in ("disturbance", "noise"):
             raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
         if not 0 <= self.delay_samples <= MAX_DELAY_SAMPLES:

@@ -10,13 +10,12 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal, Notch
+from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
 from seaopt.files import plain
 
-LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_ff")
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
 GAINS_AGREE = 1e-9  # of the largest coefficient
 TUNE_AGAIN = "tune again"
@@ -152,9 +151,7 @@ def _check_agreement(
     notch = (
         Notch(**{name.removeprefix("notch_"): gains[name] for name in NOTCH_GAINS}) if "notch_depth" in gains else None
     )
-    law_gains = Gains(
-        **{name: gains[name] for name in LAW_GAINS}, derivative=spec.derivative, observer=observer, notch=notch
-    )
+    law_gains = Gains(**{name: gains[name] for name in LAW_GAINS}, observer=observer, notch=notch)
     made_of_gains = law_gains.transfer_functions(spec.structure, spec.sample_time_s)
     for name, made in zip(("reference", "measurement"), made_of_gains, strict=True):
         for part in ("num", "den"):

@@ -2,12 +2,19 @@ r"""The control law: two transfer functions in q = z^-1.
 
 .. math:: F_m = C_r(q) F_\mathrm{ref} - C_y(q) F_\mathrm{meas}
 
-Every structure is written as these two. With :math:`e = F_\mathrm{ref} - F_\mathrm{meas}` and :math:`v = e`, or
-:math:`v = -F_\mathrm{meas}` for the derivative on the measurement,
+Every structure is written as these two,
 
 .. math::
-    F_m &= k_\mathrm{ff} F_\mathrm{ref} + k_p e + k_i \frac{T_s}{2} \frac{1+q}{1-q} e + k_d D(q) v, \\
-    D(q) &= \frac{1}{T_f + T_s}\, \frac{1 - q}{1 - q\, T_f/(T_f + T_s)}, \qquad k_\mathrm{ff} = 1/P(0) .
+    F_m &= k_r F_\mathrm{ref} - k_p F_\mathrm{meas}
+           + k_i \frac{T_s}{2} \frac{1+q}{1-q} (F_\mathrm{ref} - F_\mathrm{meas})
+           + k_d D(q) (c F_\mathrm{ref} - F_\mathrm{meas}), \\
+    D(q) &= \frac{1}{T_f + T_s}\, \frac{1 - q}{1 - q\, T_f/(T_f + T_s)} .
+
+**Weights of the reference.** :math:`k_r = 1/P(0) + k_p` with :math:`c = 1` is feedforward and feedback of the error;
+less of either weakens the zeros that the reference's path puts in front of the loop, and leaves the loop as it is
+(Astrom, Hagglund, Advanced PID Control, ISA 2006, setpoint weighting). Where nothing integrates the error (`pd`, and a
+`pid_dob` whose k_i is 0) the static gain is :math:`P(0) k_r/(1 + P(0) k_p)`, the observer's :math:`Q/P_n` being
+:math:`1/P(0)` there: :math:`k_r = 1/P(0) + k_p` is then fixed, so that it is 1.
 
 **Disturbance observer** (`pid_dob`; K. Ohnishi's, reviewed by Sariyildiz, Oboe, Ohnishi, IEEE TIE 67(3), 2020).
 The motor force v of the law above is corrected by the disturbance that the nominal plant :math:`P_n` would need to
@@ -28,7 +35,7 @@ inverse rings. Delay and :math:`B_u` stay in Q, so that the inverse is exact, st
 **Notch**, in series with all of it: a biquad :math:`(s^2 + 2 g \zeta \omega s + \omega^2)/(s^2 + 2 \zeta \omega s +
 \omega^2)` by Tustin's rule, prewarped to be exact at :math:`\omega`; :math:`\zeta` is its width, g its depth.
 
-At fixed T_f, T_q and notch, C_r and C_y are affine in (k_p, k_i, k_d).
+At fixed T_f, T_q and notch, C_r and C_y are affine in (k_p, k_i, k_d, k_r, c k_d).
 """
 
 from __future__ import annotations
@@ -45,9 +52,11 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 Structure = Literal["pd", "pid", "pid_dob"]
-Derivative = Literal["error", "measurement"]
+ReferenceWeights = Literal["tuned", "error", "measurement"]
+REFERENCE_WEIGHTS: tuple[ReferenceWeights, ...] = ("tuned", "error", "measurement")
 STRUCTURES: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
+LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
 HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal lags are 3 dB down
 
 
@@ -158,10 +167,10 @@ class Gains:
         s.
     T_f : float
         Seconds: time constant of the derivative's filter.
-    k_ff : float
-        N/N: feedforward of the reference.
-    derivative : {"error", "measurement"}
-        What is differentiated.
+    k_r : float
+        N/N: weight of the reference.
+    c : float
+        Weight of the reference in what is differentiated.
     observer : DisturbanceObserver, optional
         Of a pid_dob.
     notch : Notch, optional
@@ -173,14 +182,14 @@ class Gains:
     k_i: float
     k_d: float
     T_f: float
-    k_ff: float
-    derivative: Derivative = "error"
+    k_r: float
+    c: float = 1.0
     observer: DisturbanceObserver | None = None
     notch: Notch | None = None
 
     def by_name(self) -> dict[str, float]:
         """Return the numbers by name, those of observer and notch too."""
-        out = {name: getattr(self, name) for name in ("k_p", "k_i", "k_d", "T_f", "k_ff")}
+        out = {name: getattr(self, name) for name in LAW_GAINS}
         if self.observer is not None:
             out["T_q"] = self.observer.T_q
         if self.notch is not None:
@@ -205,7 +214,7 @@ class Gains:
         )  # fmt: skip
         whole = self.k_i * sample_time_s / 2 * np.convolve([1.0, 1.0], lag) if integrates else np.zeros(1)
         measurement = _add(self.k_p * unit, rate, whole)
-        reference = _add((self.k_ff + self.k_p) * unit, rate if self.derivative == "error" else np.zeros(1), whole)
+        reference = _add(self.k_r * unit, self.c * rate, whole)
         if self.observer is not None:
             q, inverse = self.observer.filters(sample_time_s)
             through = inverse.den  # holds the lags of Q

@@ -129,7 +129,7 @@ def _linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     c_r, c_y = task.law(grid, x)
     by_y = series * np.array([np.ones_like(grid.q), integral, rate])
     by_r = by_y.copy()
-    if task.spec.derivative == "measurement":
+    if task.spec.reference_weights == "measurement":
         by_r[2] = 0.0
     return _Affine(c_y=c_y, c_r=c_r, by_y=by_y, by_r=by_r)
 

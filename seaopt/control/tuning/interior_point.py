@@ -244,7 +244,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         weights.size,
         task.nominal is not None,
         spec.notch is not None,
-        spec.derivative == "measurement",
+        spec.reference_weights == "measurement",
         noise,
         passive,
     )

@@ -155,8 +155,8 @@ class Task:
         if self.spec.notch is not None:
             notch = Notch(frequency_hz=float(np.arctan(x[5]) / (np.pi * ts)), width=float(x[6]), depth=float(x[7]))
         return Gains(
-            k_p=float(x[0]), k_i=float(x[1]), k_d=float(x[2]), T_f=float(x[3]), k_ff=self.k_ff,
-            derivative=self.spec.derivative, notch=notch,
+            k_p=float(x[0]), k_i=float(x[1]), k_d=float(x[2]), T_f=float(x[3]), k_r=self.k_ff + float(x[0]),
+            c=float(self.spec.reference_weights != "measurement"), notch=notch,
             observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[4])),
         )  # fmt: skip
 
@@ -198,7 +198,7 @@ class Task:
         series, integral, rate, observer = self.terms(grid, x)
         both = x[0] + x[1] * integral
         c_y = series * (both + x[2] * rate + observer)
-        on_reference = x[2] * rate if self.spec.derivative == "error" else 0.0
+        on_reference = x[2] * rate if self.spec.reference_weights != "measurement" else 0.0
         return series * (both + on_reference + self.k_ff), c_y
 
     def usage(self, grid: Grid, x: LawNumbers) -> dict[str, Float[np.ndarray, "k m"]]:

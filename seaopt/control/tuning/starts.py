@@ -143,7 +143,7 @@ def _rank_shape(
     series, integral, rate, more = task.terms(grid, np.array([0.0, 0.0, 0.0, *shape]))
     series, more = (np.broadcast_to(term, grid.f.shape) for term in (series, more))
     k_d, k_i = (v.ravel() for v in np.meshgrid(*_list_gains(task, grid, at, abs(rate[at]))))
-    on_reference = rate if spec.derivative == "error" else 0.0 * rate
+    on_reference = rate if spec.reference_weights != "measurement" else 0.0 * rate
     slope = k_i[:, None] * integral + task.k_ff + k_d[:, None] * on_reference
     back = k_i[:, None] * integral + k_d[:, None] * rate + more
     k_p = _solve_bandwidth(grid.p[0, at] * series[at], slope[:, at], back[:, at])

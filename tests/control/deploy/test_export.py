@@ -303,7 +303,7 @@ EDITS = [
     (("measurement", "num", 0), 99.0, "measurement.num is not what gains, observer and spec give"),
     (("reference", "den", 1), -1.9, "reference.den is not what"),
     (("gains", "k_p"), 1.0, "num is not what"),
-    (("gains", "k_x"), 1.0, "gains has T_f, k_d, k_ff, k_i, k_p, k_x where"),
+    (("gains", "k_x"), 1.0, "gains has T_f, c, k_d, k_i, k_p, k_r, k_x where"),
     (("delay_samples",), 2.5, "delay_samples = 2.5"),
     (("sample_time_s",), 0.002, "sample_time_s is 0.002, which is not 1/spec.sample_rate_hz"),
     (("sample_time_s",), "x", "sample_time_s = 'x'"),
@@ -354,7 +354,7 @@ def test_a_target_that_is_a_file_is_told(tuned, tmp_path):
 
 def test_a_pid_whose_integral_is_slow_is_coarse_in_float(compiler, tuned, tmp_path):
     """At 1 kN an increment under 3e-5 N is lost: an error of 0.02 N stands with k_i = 1.3, and double takes it up."""
-    slow = Gains(k_p=3.2, k_i=1.3, k_d=0.0, T_f=1e-3, k_ff=1.0).transfer_functions("pid", TS)
+    slow = Gains(k_p=3.2, k_i=1.3, k_d=0.0, T_f=1e-3, k_r=4.2).transfer_functions("pid", TS)
     errors = []
     for precision in ("double", "float"):
         folder = tmp_path / precision

@@ -33,7 +33,7 @@ def tuned():
 
 
 def controller_of(sample_time_s=TS, delay_samples=1, **gains):
-    law = Gains(**{"k_p": 3.0, "k_i": 1.0, "k_d": 0.03, "T_f": sample_time_s, "k_ff": 1.0, **gains})
+    law = Gains(**{"k_p": 3.0, "k_i": 1.0, "k_d": 0.03, "T_f": sample_time_s, "k_r": 4.0, **gains})
     reference, measurement = law.transfer_functions("pid", sample_time_s)
     return replace(
         tuned(), reference=reference, measurement=measurement, sample_time_s=sample_time_s, delay_samples=delay_samples

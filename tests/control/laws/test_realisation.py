@@ -17,7 +17,7 @@ from seaopt.control.laws.realisation import realise, runnable
 from seaopt.errors import ControlError
 
 TS = 1e-3
-GAINS = {"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_ff": 1.0}
+GAINS = {"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_r": 4.2}
 
 
 def product(*factors):
@@ -31,8 +31,8 @@ def tf(num, den):
     return TransferFunction(num=np.asarray(num, dtype=float), den=np.asarray(den, dtype=float))
 
 
-def law_of(structure="pid", derivative="error", limit=None, **gains):
-    pair = Gains(**GAINS | gains, derivative=derivative).transfer_functions(structure, TS)
+def law_of(structure="pid", limit=None, **gains):
+    pair = Gains(**GAINS | gains).transfer_functions(structure, TS)
     return realise(*pair, sample_time_s=TS, current_limit_A=limit)
 
 
@@ -50,10 +50,10 @@ def tuned():
 
 
 @pytest.mark.parametrize("structure", ["pd", "pid"])
-@pytest.mark.parametrize("derivative", ["error", "measurement"])
-def test_without_saturation_it_is_scipys_filter(structure, derivative, signals):
+@pytest.mark.parametrize("weights", [{}, {"c": 0.0}, {"k_r": 1.7, "c": 0.4}])
+def test_without_saturation_it_is_scipys_filter(structure, weights, signals):
     r, y = signals
-    c_r, c_y = Gains(**GAINS, derivative=derivative).transfer_functions(structure, TS)
+    c_r, c_y = Gains(**GAINS | weights).transfer_functions(structure, TS)
     expected = lfilter(c_r.num, c_r.den, r) - lfilter(c_y.num, c_y.den, y)
     found, _ = realise(c_r, c_y, sample_time_s=TS).run(r, y)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
@@ -158,7 +158,7 @@ def test_a_state_takes_single_precision():
 @given(st.floats(0.2, 50.0), st.floats(0.0, 1e3), st.floats(1e-4, 0.2), st.floats(1e-4, 1e-2), st.integers(0, 99))
 def test_any_pid_is_scipys_filter(k_p, k_i, k_d, t_f, seed):
     r, y = np.random.default_rng(seed).normal(size=(2, 300))
-    c_r, c_y = Gains(k_p=k_p, k_i=k_i, k_d=k_d, T_f=t_f, k_ff=1.0).transfer_functions("pid", TS)
+    c_r, c_y = Gains(k_p=k_p, k_i=k_i, k_d=k_d, T_f=t_f, k_r=1.0 + k_p).transfer_functions("pid", TS)
     expected = lfilter(c_r.num, c_r.den, r) - lfilter(c_y.num, c_y.den, y)
     found, _ = realise(c_r, c_y, sample_time_s=TS).run(r, y)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
@@ -178,7 +178,7 @@ def test_back_calculation_is_the_written_one(signals):
         e = ref - meas
         rate = (GAINS["T_f"] * rate + (e - before)) / (GAINS["T_f"] + TS)
         integral += GAINS["k_i"] * TS / 2 * (e + before)
-        u = GAINS["k_ff"] * ref + GAINS["k_p"] * e + integral + GAINS["k_d"] * rate
+        u = GAINS["k_r"] * ref - GAINS["k_p"] * meas + integral + GAINS["k_d"] * rate
         sat = np.clip(u, -20.0, 20.0)
         integral += TS / (law.tracking_time_s + TS) * (sat - u)
         out.append(sat)
@@ -251,7 +251,7 @@ def test_after_an_unreachable_reference_the_force_returns_at_once(tuned):
 
 @pytest.mark.parametrize("k_i", [40.0, 160.0])
 def test_a_saturating_step_overshoots_less_with_anti_windup(k_i, tuned):
-    gains = Gains(k_p=1.7, k_i=k_i, k_d=0.05, T_f=8e-4, k_ff=1.0)
+    gains = Gains(k_p=1.7, k_i=k_i, k_d=0.05, T_f=8e-4, k_r=2.7)
     reference, measurement = gains.transfer_functions("pid", TS)
     controller = replace(tuned, reference=reference, measurement=measurement)
     law = runnable(controller)

@@ -32,7 +32,7 @@ def test_the_observer_is_the_written_one(stand, thor):
         k_i=5.0,
         k_d=0.03,
         T_f=2e-3,
-        k_ff=1.0,
+        k_r=3.0,
         observer=DisturbanceObserver(nominal=Nominal.of(plant), T_q=5e-3),
     )
     q, q_over_p = gains.observer.filters(TS)

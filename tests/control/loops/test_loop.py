@@ -16,7 +16,7 @@ from seaopt.control.loops.response import find_zeros
 
 def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains):
     plant, params = plant or so.plants.high_impedance(), params or so.plants.thor()
-    law = Gains(**{"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_ff": 1.0, **gains})
+    law = Gains(**{"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_r": 1.0 + gains.get("k_p", 3.2), **gains})
     reference, measurement = law.transfer_functions(structure, ts)
     digital = sample(plant, params, "F1", command_of(plant, params, "F1").per_effort, ts, delay)
     return Loop(plant=digital, reference=reference, measurement=measurement)
@@ -35,19 +35,19 @@ def test_the_sampled_plant_is_scipys_zero_order_hold(swing, thor):
 
 
 def test_the_law_is_the_written_one():
-    """Run the definition sample by sample: trapezoidal integral, filtered difference, feedforward."""
-    ts, law = 1e-3, Gains(k_p=3.0, k_i=20.0, k_d=0.03, T_f=2e-3, k_ff=0.9)
+    """Run the definition sample by sample: trapezoidal integral, filtered difference, weights of the reference."""
+    ts = 1e-3
     rng = np.random.default_rng(0)
     ref, meas = rng.normal(size=(2, 200))
-    for derivative in ("error", "measurement"):
-        law = Gains(k_p=3.0, k_i=20.0, k_d=0.03, T_f=2e-3, k_ff=0.9, derivative=derivative)
+    for k_r, c in ((3.9, 1.0), (3.9, 0.0), (1.7, 0.4)):
+        law = Gains(k_p=3.0, k_i=20.0, k_d=0.03, T_f=2e-3, k_r=k_r, c=c)
         e, integral, rate, out = ref - meas, 0.0, 0.0, []
-        v = e if derivative == "error" else -meas
+        v = c * ref - meas
         for k in range(200):
             before_e, before_v = (e[k - 1], v[k - 1]) if k else (0.0, 0.0)
             integral += 20.0 * ts / 2 * (e[k] + before_e)
             rate = (2e-3 * rate + (v[k] - before_v)) / (2e-3 + ts)
-            out.append(0.9 * ref[k] + 3.0 * e[k] + integral + 0.03 * rate)
+            out.append(k_r * ref[k] - 3.0 * meas[k] + integral + 0.03 * rate)
         from scipy.signal import lfilter
 
         c_r, c_y = law.transfer_functions("pid", ts)
@@ -167,7 +167,7 @@ def test_stability_is_what_a_simulation_shows(name, request, thor):
 def test_margins_scale_as_they_must(factor, extra):
     """A loop gain of x takes x off the gain margin; a sample of delay takes a sample off the delay margin."""
     base = loop_of("pd")
-    scaled = loop_of("pd", k_p=3.2 * factor, k_d=0.033 * factor, k_ff=1.0)
+    scaled = loop_of("pd", k_p=3.2 * factor, k_d=0.033 * factor)
     assert scaled.figures().gain_margin_db == pytest.approx(
         abs(base.figures().gain_margin_db - 20 * np.log10(factor)), abs=1e-3
     )

@@ -98,7 +98,7 @@ def test_noise_objective_is_quieter(stand, swing, thor):
 
 def test_derivative_on_the_measurement(stand, swing, thor):
     controller = tuned(
-        stand, swing, thor, bandwidth_hz=30, derivative="measurement", max_noise_gain=200, max_complementary=None
+        stand, swing, thor, bandwidth_hz=30, reference_weights="measurement", max_noise_gain=200, max_complementary=None
     )
     assert controller.feasible
     assert controller.achieved.bandwidth_hz == pytest.approx(30, rel=0.005)

@@ -33,7 +33,7 @@ def controller(limited_controller):
 @pytest.fixture(scope="module")
 def proportional(controller):
     """Return the controller with a law that does not integrate: it rests at a reference other than the force."""
-    law = Gains(k_p=3.0, k_i=0.0, k_d=0.03, T_f=1e-3, k_ff=1.0)
+    law = Gains(k_p=3.0, k_i=0.0, k_d=0.03, T_f=1e-3, k_r=4.0)
     reference, measurement = law.transfer_functions("pd", TS)
     return replace(controller, reference=reference, measurement=measurement)
 
@@ -261,7 +261,7 @@ def test_a_law_whose_reference_does_nothing_is_refused(controller, swing, thor):
 def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(controller, swing, thor):
     """1 + N(A) L = 0 with L of the drawn angle and delay, N(A) = 2/pi (asin s + s sqrt(1 - s^2)), s = limit/A."""
     drawn = at(thor, phi=0.7, delay_s=0.4e-3)
-    law = Gains(k_p=27.0, k_i=0.0, k_d=0.27, T_f=1e-3, k_ff=1.0)
+    law = Gains(k_p=27.0, k_i=0.0, k_d=0.27, T_f=1e-3, k_r=28.0)
     reference, measurement = law.transfer_functions("pd", TS)
     wild = replace(controller, reference=reference, measurement=measurement)
     loop = wild.close(swing, drawn)

@@ -36,7 +36,7 @@ def verification(controller, stand, swing, thor):
 
 def with_law(controller, **gains):
     """Return the controller with another pd law, as if somebody had typed it in."""
-    law = Gains(**{"k_i": 0.0, "T_f": 1e-3, "k_ff": 1.0, **gains})
+    law = Gains(**{"k_i": 0.0, "T_f": 1e-3, "k_r": 1.0 + gains["k_p"], **gains})
     reference, measurement = law.transfer_functions("pd", controller.sample_time_s)
     return replace(controller, reference=reference, measurement=measurement)
 
