@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,8 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, digest_sources
 from seaopt.cli.responses import estimate_responses
-from seaopt.control import Controller, sweep, tune
+from seaopt.control import Controller, ControllerSpec, sweep, tune
+from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, fit, warn_unidentified
 from seaopt.files import read_json, to_json, write_json
@@ -158,11 +159,23 @@ class Session:
     def _design_values(self, *plants: Plant) -> ParameterSet:
         """Return the values to design with; those that the fit cannot tell, of these plants, are named on stderr."""
         values = self.values()
-        for note in warn_unidentified(values, {name for plant in plants for name in plant.parameters}):
+        self._warn(warn_unidentified(values, {name for plant in plants for name in plant.parameters}))
+        return values
+
+    def _spec(self) -> ControllerSpec:
+        """Return the specification with its delay; one that is shorter than the experiments' is warned of."""
+        assert self.problem.spec is not None  # whoever tunes has asked for the design plant before
+        design, source = self.problem.design_plant, self.parameters()
+        spec = settle_delay(self.problem.spec, design, source)
+        self._warn(warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, design, source))
+        return spec
+
+    def _warn(self, notes: Iterable[str]) -> None:
+        """Write each warning on stderr, once."""
+        for note in notes:
             if note not in self._warned:
                 self.say(f"warning: {note}")
             self._warned.add(note)
-        return values
 
     def controller(self) -> Controller:
         """Return the controller of this run or of the folder."""
@@ -262,8 +275,7 @@ class Session:
     def _tune(self, tell: Callable[[str], None]) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        spec = self.problem.spec
-        assert spec is not None
+        spec = self._spec()
         tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
         draws = self.problem.draws(self.parameters())
         table = self.problem.robustness
@@ -283,8 +295,7 @@ class Session:
     def _sweep(self, tell: Callable[[str], None]) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        spec = self.problem.spec
-        assert spec is not None
+        spec = self._spec()
         tell(f"{spec.structure}, {len(self.bandwidths_hz)} bandwidths")
         result = sweep(
             design, values, spec, self.bandwidths_hz, robust_to,

@@ -232,7 +232,7 @@ class ControllerTable(_Strict):
     bandwidth_hz: Annotated[Number, Field(description=BY_NAME["bandwidth_hz"].description)]
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
     sample_rate_hz: Number = 1000.0
-    delay_samples: Whole = 1
+    delay_samples: Whole | None = None
     max_sensitivity: Number | None = _limit("max_sensitivity")
     max_complementary: Number | None = _limit("max_complementary")
     min_disk_margin: Number | None = _limit("min_disk_margin")

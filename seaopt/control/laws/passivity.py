@@ -245,7 +245,7 @@ def passivity_rows(
 
     """
     port = port_of(plant, params, spec.measured, per_effort)
-    loop, unit = weigh_passivity(port, spec.sample_time_s, spec.delay_samples, f)
+    loop, unit = weigh_passivity(port, spec.sample_time_s, spec.loop_delay_samples, f)
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 

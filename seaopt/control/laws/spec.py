@@ -38,8 +38,9 @@ class ControllerSpec:
         k_r = 1/P(0) + k_p and c = 1; or the derivative on the measurement alone, c = 0, with k_r tuned.
     sample_rate_hz : float
         Of the controller.
-    delay_samples : int
-        Whole samples from measurement to output, besides the hold.
+    delay_samples : int, optional
+        Whole samples from measurement to output, besides the hold. Left out: where `seaopt.tune` is given a fit, the
+        delay of its experiments on the design plant, rounded up; at least 1.
     max_sensitivity, max_complementary : float, optional
         Ms and Mt, peaks of abs(S) and abs(L/(1+L)), on every plant.
     min_disk_margin : float, optional
@@ -77,7 +78,7 @@ class ControllerSpec:
     notch: Notch | None = None
     reference_weights: ReferenceWeights = "tuned"
     sample_rate_hz: float = 1000.0
-    delay_samples: int = 1
+    delay_samples: int | None = None
     max_sensitivity: float | None = BY_NAME["max_sensitivity"].default
     max_complementary: float | None = BY_NAME["max_complementary"].default
     min_disk_margin: float | None = BY_NAME["min_disk_margin"].default
@@ -111,7 +112,7 @@ class ControllerSpec:
             )
         if self.objective not in ("disturbance", "noise"):
             raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
-        if not 0 <= self.delay_samples <= MAX_DELAY_SAMPLES:
+        if not 0 <= self.loop_delay_samples <= MAX_DELAY_SAMPLES:
             raise ControlError(f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}")
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz < math.inf:
             raise ControlError(
@@ -121,7 +122,7 @@ class ControllerSpec:
         self._check_limits()
 
     def _check_types(self) -> None:
-        if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int):
+        if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int | None):
             raise ControlError(
                 f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give 0, 1, ..."
             )
@@ -179,6 +180,11 @@ class ControllerSpec:
                 continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= top[name]:
                 raise ControlError(f"notch.{name} = {value!r} is not above 0 and up to {top[name]:g}")
+
+    @property
+    def loop_delay_samples(self) -> int:
+        """Whole samples of delay that a loop is closed with: as given, or 1."""
+        return 1 if self.delay_samples is None else self.delay_samples
 
     @property
     def sample_time_s(self) -> float:

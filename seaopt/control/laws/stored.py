@@ -102,7 +102,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     """
     table = check_table(StoredController, plain(content), "controller.json", remedy=TUNE_AGAIN)
     spec, robust_to = _build_spec(table.spec)
-    for name, expected in (("structure", spec.structure), ("delay_samples", spec.delay_samples)):
+    for name, expected in (("structure", spec.structure), ("delay_samples", spec.loop_delay_samples)):
         if getattr(table, name) != expected:
             raise _contradict(name, f"is {getattr(table, name)!r} and spec.{name} {expected!r}")
     if not abs(table.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:

@@ -91,7 +91,7 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
         low, high = (
             (middle, high) if sensitivity_possible(middle, ms, spec.sample_time_s, late) else (low, middle)
         )  # fmt: skip
-    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with delay_samples = {spec.delay_samples}"
+    asked = f"bandwidth_hz = {spec.bandwidth_hz:g} with delay_samples = {spec.loop_delay_samples}"
     raise ControlError(
         f"{asked} at {spec.sample_rate_hz:g} Hz: no controller keeps |S| below -3 dB up to {wanted:.4g} Hz with "
         f"max_sensitivity = {ms:g}; the delay allows at most {low:.3g} Hz, so lower bandwidth_hz or "

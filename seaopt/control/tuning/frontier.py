@@ -7,11 +7,13 @@ from dataclasses import fields, replace
 from typing import Any
 
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task, solve
 from seaopt.errors import ControlError
+from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -86,7 +88,7 @@ class Frontier:
 
 def sweep(
     plant: Plant,
-    params: ParameterSet,
+    params: Fit | ParameterSet,
     spec: ControllerSpec,
     bandwidths_hz: Sequence[float],
     robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
@@ -119,6 +121,8 @@ def sweep(
     """
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
+    spec = settle_delay(spec, plant, params)
+    params = params.parameters if isinstance(params, Fit) else params
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=float(f)) for f in bandwidths_hz]
     task = make_task(plant, params, specs[0], robust_to or {}, draws)

@@ -183,7 +183,7 @@ class Task:
             low, high = self.spec.passive_band_hz
             inside = np.flatnonzero((f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9)))
             port[inside], unit[inside] = weigh_passivity(
-                self.port, self.spec.sample_time_s, self.spec.delay_samples, f[inside]
+                self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside]
             )  # fmt: skip
         return Grid(f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit)
 
@@ -258,7 +258,7 @@ class Task:
         port, spec, band = None, self.spec, self.spec.passive_band_hz
         if self.port is not None and band is not None:
             _, law = self.gains(x).transfer_functions(spec.structure, spec.sample_time_s)
-            port = measure_port(self.port, law, spec.sample_time_s, spec.delay_samples, band)
+            port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
         return [
             MeasuredLoop(name=name, figures=self.loop(x, i).figures(), port=None if i else port)
             for i, name in enumerate(self.names)

@@ -25,6 +25,7 @@ from jaxtyping import Complex
 
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import Nominal
@@ -38,6 +39,7 @@ from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, place_frequencies
 from seaopt.control.tuning.starts import find_starts
 from seaopt.errors import ControlError, suggestion
+from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
@@ -53,7 +55,7 @@ BANDWIDTHS_PROBED = 5  # when the lowest cannot be met
 
 def tune(
     plant: Plant,
-    params: ParameterSet,
+    params: Fit | ParameterSet,
     spec: ControllerSpec,
     robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
     *,
@@ -63,8 +65,10 @@ def tune(
 
     Parameters
     ----------
-    plant, params
-        The design plant, the test stand as a rule, and its parameters.
+    plant : Plant
+        The design plant, the test stand as a rule.
+    params : Fit or ParameterSet
+        Its parameters; of a fit also the delay, where the specification leaves delay_samples out.
     spec : ControllerSpec
         Bandwidth and limits.
     robust_to : mapping of name to Plant or (Plant, ParameterSet), optional
@@ -94,6 +98,8 @@ def tune(
     (True, 30)
 
     """
+    spec = settle_delay(spec, plant, params)
+    params = params.parameters if isinstance(params, Fit) else params
     values = plant.complete(params)
     task = make_task(plant, values, spec, robust_to or {}, draws)
     check_delay(spec, task.plants[0])
@@ -136,7 +142,7 @@ def make_task(
     pairs = [*models.items(), *_draw_plants(models, draws)]
     design_plant = pairs[0][1][0]
     plants = tuple(
-        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.delay_samples)
+        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.loop_delay_samples)
         for _, (model, values) in pairs
     )
     static = plants[0].static_gain
@@ -287,7 +293,7 @@ def make_controller(
         structure=spec.structure,
         gains=gains.by_name(),
         sample_time_s=spec.sample_time_s,
-        delay_samples=spec.delay_samples,
+        delay_samples=spec.loop_delay_samples,
         reference=reference,
         measurement=measurement,
         command=command_of(*design, spec.measured),

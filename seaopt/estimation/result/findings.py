@@ -51,7 +51,7 @@ class Nuisance:
 
     `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise
     over each state's size (of a prediction-error fit), `substeps` how many integration steps each sample took (a linear
-    plant needs one).
+    plant needs one), `plant` the name of the experiment's plant, empty in older files.
     """
 
     delay_s: float
@@ -62,6 +62,7 @@ class Nuisance:
     drift: dict[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
     noise: dict[str, float] = field(default_factory=dict[str, float])
     std: dict[str, float] = field(default_factory=dict[str, float])
+    plant: str = ""
 
     def describe(self) -> list[str]:
         """Return what was estimated of delay and gains, in words."""

@@ -20,6 +20,7 @@ from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.solver.methods import Method
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
@@ -125,6 +126,11 @@ class Fit:
     def all_unknowns(self) -> int:
         """Number of all unknowns, sigmas included."""
         return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
+
+    def delay_s(self, plant: Plant) -> float:
+        """Return the longest delay of the plant's experiments, fitted or given; of all, where it has none."""
+        own = [one.delay_s for one in self.nuisance.values() if one.plant in ("", plant.name)]
+        return max(own or [one.delay_s for one in self.nuisance.values()], default=0.0)
 
     def require_minimum(self, what: str) -> Minimum:
         """Return the minimum, for `what` needs it.

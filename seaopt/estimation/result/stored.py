@@ -113,6 +113,7 @@ class StoredExperiment(ResultTable):
     drift: dict[str, list[Number]] = {}
     noise: dict[str, Number] = {}
     std: dict[str, NullIsInfinite] = {}
+    plant: str = ""
 
     def restore(self) -> Nuisance:
         """Return the unknowns."""

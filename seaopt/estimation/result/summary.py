@@ -235,6 +235,7 @@ def _describe_nuisance(
             key: float(np.sqrt(max(variance[slot.index], 0.0))) for key, slot in free.items() if slot.index is not None
         },
         substeps=experiment.substeps,
+        plant=experiment.data.plant.name,
     )
 
 

@@ -194,6 +194,8 @@ class Certificate:
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
         Of each model with friction: for how steep a friction stability is proved, between sliding and stuck.
+    remarks : tuple of str
+        What only the fit could tell, one sentence each: a delay that the controller does not count on.
 
     """
 
@@ -210,6 +212,7 @@ class Certificate:
     simulated: Simulated | None = None
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
+    remarks: tuple[str, ...] = ()
 
     @property
     def linear_models(self) -> dict[str, Plant]:
@@ -312,6 +315,7 @@ class Certificate:
                 varied=varied,
                 brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
                 friction=prove_frictions(controller, models, parameters),
+                remarks=tuple(stored.remarks),
             )
             played = stored.simulation
             if played is None:
@@ -339,6 +343,7 @@ class Certificate:
             },
             "monte_carlo": _list_fields(self.monte_carlo),
             "varied": [_list_fields(varied) for varied in self.varied],
+            "remarks": list(self.remarks),
             "notes": list(self.notes),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
@@ -362,7 +367,7 @@ class Certificate:
             else ()
         )
         friction = (f"{name}: {margin}" for name, margin in self.friction.items())
-        return (*warn_unidentified(self.parameters, used), *friction, *outside, *little)
+        return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little)
 
     def _bounds(self, name: str) -> dict[str, Any]:
         return self.brackets[name].to_dict() if name in self.brackets else {}

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
+from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
@@ -181,7 +182,15 @@ def certify(
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
         brackets=brackets, friction=prove_frictions(controller, models, nominal),
+        remarks=_remark_delay(controller, parameters),
     )  # fmt: skip
+
+
+def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tuple[str, ...]:
+    """Return a warning where the controller counts on less delay than the fit's experiments have."""
+    assert controller.design is not None
+    plant, _ = controller.design
+    return warn_short_delay(controller.delay_samples, controller.spec.sample_rate_hz, plant, parameters)
 
 
 def _check_arguments(

@@ -98,6 +98,7 @@ class StoredCertificate(ResultTable):
     monte_carlo: StoredMonteCarlo
     varied: list[StoredVaried] = []
     simulation: StoredSimulation | None = None
+    remarks: list[str] = []
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
