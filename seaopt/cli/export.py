@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from seaopt.cli.provenance import FILES, digest
+from seaopt.cli.provenance import FILES, check_unedited, digest
 from seaopt.cli.session import SCHEMAS
 from seaopt.control.deploy.export import export
 from seaopt.errors import ProblemError
@@ -19,7 +19,7 @@ def export_controller(results: Path, target: Path, json: bool, **options: Any) -
     Raises
     ------
     SeaoptError
-        There is no controller, or it was made from another fit than the one beside it, or it cannot be written.
+        There is no controller, it was edited, or made from another fit than the one beside it, or it cannot be written.
 
     """
     path = results / FILES["tune"]
@@ -27,8 +27,7 @@ def export_controller(results: Path, target: Path, json: bool, **options: Any) -
         raise ProblemError(f"{path}: no such file; give the folder of results of seaopt run or seaopt tune")
     content = read_json(path, SCHEMAS["tune"])
     fitted, made_from = results / FILES["fit"], content.get("made_from")
-    if made_from is not None and not (isinstance(made_from, dict) and isinstance(made_from.get("problem"), str)):
-        raise ProblemError(f"{path}: made_from does not say of which problem file; run seaopt tune again")
+    check_unedited(path, content, "run seaopt tune again")
     expected = None if made_from is None else made_from.get(fitted.name)
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")

@@ -1,7 +1,8 @@
 """What a result was made from: digests of what its stage reads of a problem, and of the results before it.
 
 Each stage counts only what can change its result, so that a result stays good while the file asks something else of it:
-a controller through new draws of its certificate, a fit through plants that no experiment has.
+a controller through new draws of its certificate, a fit through plants that no experiment has. A digest of the result
+itself tells whether it was edited since.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from seaopt.errors import ProblemError
+from seaopt.files import plain
 from seaopt.problem import Problem
 from seaopt.problem.schema import ControllerTable
 from seaopt.robustness.uncertainty.draws import find_modes
@@ -23,6 +26,7 @@ FILES = {
     "sweep": "frontier.json",
     "certify": "robustness.json",
 }
+ROBUSTNESS = "[robustness]"  # the digest of what a design took from there
 
 
 def digest(path: Path) -> str:
@@ -30,8 +34,41 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def digest_content(content: dict[str, Any]) -> str:
+    """Return the SHA-256 of a result, as it is written, without what says where it is from."""
+    return _hash({name: value for name, value in content.items() if name != "made_from"})
+
+
+def check_unedited(path: Path, content: dict[str, Any], again: str) -> None:
+    """Refuse a result that was edited since it was written; one without `made_from` was written by hand, and may be.
+
+    Raises
+    ------
+    ProblemError
+        The content is not the one that was written, or `made_from` is damaged.
+
+    """
+    made_from = content.get("made_from")
+    if made_from is None:
+        return
+    if not (isinstance(made_from, dict) and all(isinstance(value, str) for value in made_from.values())):
+        raise ProblemError(f"{path}: made_from is damaged; {again}")
+    if "problem" not in made_from or "content" not in made_from:
+        raise ProblemError(f"{path}: made_from does not say of which problem file, or of which content; {again}")
+    if made_from["content"] != digest_content(content):
+        raise ProblemError(
+            f"{path}: was edited after it was written, so that it is no longer what was tuned or certified; {again}"
+        )
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
+
+
 def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]:
     """Return digests of what a stage reads: of the problem, and of the results before it in the folder, by file.
+
+    What a design takes from [robustness] is apart, for a certificate may ask a controller about another one.
 
     Parameters
     ----------
@@ -44,7 +81,9 @@ def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]
 
     """
     read, earlier = _READ_BY_STAGE[stage]
-    out = {"problem": hashlib.sha256(json.dumps(read(problem), sort_keys=True).encode()).hexdigest()}
+    out = {"problem": _hash(read(problem))}
+    if stage in ("tune", "sweep"):
+        out[ROBUSTNESS] = _hash(_shape_by_robustness(problem, problem.robustness.retune if stage == "tune" else 0))
     for before in earlier:
         path = folder / FILES[before]
         if path.exists() and (before != "fit" or problem.table.experiment):
@@ -62,35 +101,36 @@ def _read_by_fit(problem: Problem) -> dict[str, Any]:
     return table
 
 
-def _read_by_tune(problem: Problem) -> dict[str, Any]:
-    return _read_by_design(problem, problem.robustness.retune)
-
-
-def _read_by_sweep(problem: Problem) -> dict[str, Any]:
-    return _read_by_design(problem, 0)
-
-
-def _read_by_design(problem: Problem, retune: int) -> dict[str, Any]:
-    """Return what a design reads: [controller], its plants and values; of [robustness] what has a part in tuning."""
-    asked, robustness = _controller(problem), problem.robustness
-    ranges = bool(asked.robust_to or asked.draws or retune)
-    plants = {asked.plant, *asked.robust_to}
-    modes = find_modes(problem.certified_plants())
-    if retune or (
-        ranges and not modes.keys().isdisjoint(problem.ranges)
-    ):  # a mode's first plant says what puts it there
-        plants |= problem.certified_plants().keys()
+def _read_by_design(problem: Problem) -> dict[str, Any]:
+    """Return what a design reads besides [robustness]: [controller], its plants and values."""
+    asked = _controller(problem)
     out = problem.table.model_dump(mode="json", include={"controller"})
-    out["plant"] = {name: problem.table.plant[name].model_dump(mode="json") for name in sorted(plants)}
-    known = dict.fromkeys(name for each in sorted(plants) for name in problem.plants[each].parameters)
-    out["values"] = {name: problem.parameters[name].value for name in known}
-    if ranges:
-        out["ranges"] = robustness.model_dump(mode="json")["parameters"]
+    return out | _describe_plants(problem, {asked.plant, *asked.robust_to})
+
+
+def _shape_by_robustness(problem: Problem, retune: int) -> dict[str, Any]:
+    """Return what has a part in a design of [robustness], and of the uncertainty that it is asked about."""
+    asked, robustness, out = _controller(problem), problem.robustness, dict[str, Any]()
+    if not (asked.robust_to or asked.draws or retune):
+        return out
+    out["ranges"] = robustness.model_dump(mode="json")["parameters"]
+    modes = find_modes(problem.certified_plants())
+    if retune or not modes.keys().isdisjoint(problem.ranges):  # a mode's first plant says what puts it there
+        out |= _describe_plants(problem, set(problem.certified_plants()))
     if asked.draws or retune:
         out["parameters"], out["seed"] = problem.table.model_dump(mode="json")["parameters"], robustness.seed
     if retune:
         out |= {"retune": retune, "samples": robustness.samples, "certified": list(problem.certified_plants())}
     return out
+
+
+def _describe_plants(problem: Problem, plants: set[str]) -> dict[str, Any]:
+    """Return plants and the values of their parameters."""
+    known = dict.fromkeys(name for each in sorted(plants) for name in problem.plants[each].parameters)
+    return {
+        "plant": {name: problem.table.plant[name].model_dump(mode="json") for name in sorted(plants)},
+        "values": {name: problem.parameters[name].value for name in known},
+    }
 
 
 def _read_by_certify(problem: Problem) -> dict[str, Any]:
@@ -109,7 +149,7 @@ def _controller(problem: Problem) -> ControllerTable:
 _READ_BY_STAGE: dict[str, tuple[Callable[[Problem], dict[str, Any]], tuple[str, ...]]] = {
     "fit": (_read_by_fit, ()),
     "frf": (_read_by_fit, ()),
-    "tune": (_read_by_tune, ("fit",)),
-    "sweep": (_read_by_sweep, ("fit",)),
+    "tune": (_read_by_design, ("fit",)),
+    "sweep": (_read_by_design, ("fit",)),
     "certify": (_read_by_certify, ("fit", "tune")),
 }

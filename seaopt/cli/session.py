@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from seaopt.cli.frontier import print_frontier
-from seaopt.cli.provenance import FILES, digest_sources
+from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
 from seaopt.control import Controller, ControllerSpec, sweep, tune
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
@@ -177,32 +177,54 @@ class Session:
                 self.say(f"warning: {note}")
             self._warned.add(note)
 
+    def _note(self, text: str) -> None:
+        """Write a note on stderr, unless it was a warning before."""
+        if text not in self._warned:
+            self.say(f"note: {text}")
+        self._warned.add(text)
+
     def controller(self) -> Controller:
-        """Return the controller of this run or of the folder."""
+        """Return the controller of this run or of the folder; one for other limits than the problem's is refused."""
         if "tune" not in self.results:
-            self.results["tune"] = Controller.from_dict(self._read("tune"), self.problem.design_plant, self.values())
+            controller = Controller.from_dict(self._read("tune"), self.problem.design_plant, self.values())
+            self._check_spec(controller.spec)
+            self.results["tune"] = controller
         return self.results["tune"]
 
+    def _check_spec(self, stored: ControllerSpec) -> None:
+        asked, path = self._spec().to_dict(), self.folder / FILES["tune"]
+        for name, value in stored.to_dict().items():
+            if value != asked[name]:
+                raise ProblemError(
+                    f"{path}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
+                    f"{asked[name]}; correct one of them, or run seaopt tune {self.problem.source} again"
+                )
+
     def _write(self, stage: str, content: dict[str, Any]) -> None:
-        """Write a result with the digest of what it was made from."""
-        self.written.append(
-            write_json(
-                self.folder / FILES[stage], content | {"made_from": digest_sources(self.problem, stage, self.folder)}
-            )
-        )
+        """Write a result with the digests of what it was made from, and of itself."""
+        made_from = digest_sources(self.problem, stage, self.folder) | {"content": digest_content(content)}
+        self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": made_from}))
 
     def _read(self, stage: str) -> dict[str, Any]:
-        """Read an earlier stage's result; one made from something else than what is there now is refused.
+        """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused.
 
-        A file that does not say what it was made from (written by hand) is taken as it is.
+        A file that does not say what it was made from (written by hand) is taken as it is; and a controller made for
+        another [robustness], which a certificate may ask about.
         """
         path, again = self.folder / FILES[stage], f"run seaopt {stage} {self.problem.source} -o {self.folder}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
         content = read_json(path, SCHEMAS[stage])
+        check_unedited(path, content, f"{again} again")
+        made_from = content.get("made_from")
+        if made_from is None:
+            return content
         expected = digest_sources(self.problem, stage, self.folder)
-        if content.get("made_from", expected) != expected:
+        changed = {name for name in {*expected, *made_from} - {"content"} if expected.get(name) != made_from.get(name)}
+        if changed - {ROBUSTNESS}:
             raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
+        if changed:
+            self._note(f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one")
         return content
 
     def _simulate(self, tell: Callable[[str], None]) -> None:
@@ -323,8 +345,7 @@ class Session:
         )
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         for remark in (*result.notes, *self.problem.remarks(self.values())):
-            if remark not in self._warned:
-                self.say(f"note: {remark}")
+            self._note(remark)
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 

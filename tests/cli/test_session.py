@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli.export import export_controller
 from seaopt.cli.main import run
 from seaopt.cli.provenance import digest_sources
 from seaopt.cli.session import Session
@@ -156,14 +157,56 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
         Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.5")), folder).run("certify")
 
 
-def test_a_controller_that_ranges_shaped_is_taken_without_its_memory(write, tmp_path):
+@pytest.fixture
+def tuned(write, tmp_path):
+    """Return a problem's text without experiments, and the folder of its controller, which ranges shaped."""
     text = CORNERS[: CORNERS.index("[[experiment]]")] + CORNERS[CORNERS.index("[controller]") :]
-    folder = tmp_path / "out"
-    Session(write(text), folder).run("tune")
-    asked = write(text.replace("[0.3, 0.5]", "[0.1, 0.5]"))
-    with pytest.raises(so.SeaoptError, match="run seaopt tune"):
-        Session(asked, folder).controller()
+    Session(write(text), tmp_path / "out").run("tune")
+    return text, tmp_path / "out"
+
+
+def edit(folder, changes, *, by_hand):
+    """Change entries of controller.json, with or without what says where it is from."""
     content = json.loads((folder / "controller.json").read_text(encoding="utf-8"))
-    del content["made_from"]
+    for key, value in changes.items():
+        content[key] = {**content[key], **value} if isinstance(value, dict) else value
+    if by_hand:
+        content.pop("made_from", None)
     (folder / "controller.json").write_text(json.dumps(content), encoding="utf-8")
-    assert Session(asked, folder).controller().gains == content["gains"]
+    return content
+
+
+def test_a_controller_that_ranges_shaped_answers_for_others(write, tuned, capsys, without_simulation):
+    text, folder = tuned
+    session = Session(write(text.replace("[0.3, 0.5]", "[0.1, 0.5]")), folder)
+    session.run("certify")
+    assert session.results["certify"].varied[-1].low == 0.1
+    assert "another [robustness]" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("changes", [{"spec": {"max_sensitivity": 99.0}}, {"feasible": False}, {"gains": {"k_p": 9.0}}])
+def test_an_edited_controller_is_refused(write, tuned, tmp_path, changes):
+    text, folder = tuned
+    edit(folder, changes, by_hand=False)
+    with pytest.raises(so.SeaoptError, match=r"was edited.*run seaopt tune"):
+        Session(write(text), folder).controller()
+    with pytest.raises(so.SeaoptError, match=r"was edited.*run seaopt tune"):
+        export_controller(folder, tmp_path / "c", json=False)
+
+
+def test_a_controller_by_hand_is_judged_by_the_problems_limits(write, tuned):
+    text, folder = tuned
+    held = edit(folder, {}, by_hand=True)
+    assert Session(write(text), folder).controller().gains == held["gains"]
+    edit(folder, {"spec": {"max_sensitivity": 99.0}}, by_hand=True)
+    with pytest.raises(so.SeaoptError, match=r"spec.max_sensitivity is 99.0, and .*asks for 1.6"):
+        Session(write(text), folder).controller()
+
+
+def test_feasible_is_found_out_again(write, tuned):
+    """The loop of this law has Ms 1.3 or so, by the tests of the tuner; asked for 1.05, it is not feasible."""
+    text, folder = tuned
+    edit(folder, {"feasible": True, "spec": {"max_sensitivity": 1.05}}, by_hand=True)
+    controller = Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.05")), folder).controller()
+    assert not controller.feasible
+    assert "max_sensitivity (design plant)" in controller.active_constraints

@@ -12,7 +12,7 @@ from seaopt.control.laws.command import Command, actuation_notes
 from seaopt.control.laws.limits import Limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver
-from seaopt.control.laws.verdict import list_design_figures
+from seaopt.control.laws.verdict import list_broken_figures, list_design_figures
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -29,6 +29,7 @@ from seaopt.formatting import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 CONTROLLER_SCHEMA = "seaopt/controller/2"
@@ -208,6 +209,8 @@ class Controller:
     def from_dict(cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet) -> Controller:
         """Return the controller of a controller.json; what it achieves is computed again on the design plant.
 
+        One that calls itself feasible and breaks a limit there, as it may with other parameters, is not feasible.
+
         Raises
         ------
         FileError
@@ -219,8 +222,13 @@ class Controller:
         stored = read_controller(content)
         law = {name: stored[name] for name in ("reference", "measurement")}
         ts, gain = stored["sample_time_s"], stored["command"].per_effort
-        sampled = sample(plant, params, stored["spec"].measured, gain, ts, stored["delay_samples"])
-        return cls(**stored, achieved=Loop(plant=sampled, **law).figures(), design=(plant, params))
+        sliding = take_sliding(plant, params)
+        sampled = sample(sliding, params, stored["spec"].measured, gain, ts, stored["delay_samples"])
+        achieved = Loop(plant=sampled, **law).figures()
+        broken = list_broken_figures(stored["spec"], achieved) if stored["feasible"] else []
+        if broken:
+            stored |= {"feasible": False, "active_constraints": tuple(broken), "blocked_by": tuple(broken)}
+        return cls(**stored, achieved=achieved, design=(plant, params))
 
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec

@@ -206,4 +206,5 @@ class ControllerSpec:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return values | {"notch": None if self.notch is None else asdict(self.notch)}
+        notch = None if self.notch is None else asdict(self.notch)
+        return values | {"notch": notch, "delay_samples": self.loop_delay_samples}

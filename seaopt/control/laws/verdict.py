@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -59,6 +60,12 @@ def judge_all(spec: ControllerSpec, loops: Sequence[MeasuredLoop], design_states
 def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
     """Return the limits that are broken, with the plant that breaks them."""
     return [verdict.label for verdict in verdicts if not verdict.met]
+
+
+def list_broken_figures(spec: ControllerSpec, figures: LoopFigures) -> list[str]:
+    """Return the limits that the design plant's figures break; a passive band is not among them."""
+    verdicts = judge_all(replace(spec, passive_band_hz=None), [MeasuredLoop(name="design plant", figures=figures)])
+    return list_broken(verdicts)
 
 
 def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
