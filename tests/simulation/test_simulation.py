@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,6 +17,7 @@ from seaopt.simulation import Clock, Layout, Point, Segment, Weights, layout_of,
 from seaopt.simulation.compiled import Program
 from seaopt.simulation.interpreted import interpreted_passes
 from seaopt.simulation.native import find_compiler
+from tests.casadi_functions import compile_expression
 
 RATE = 400.0
 
@@ -26,16 +26,16 @@ def reference(plant, params, u, x0, hold):
     """Integrate sample by sample with DOP853, so that the hold's corners fall on step ends."""
     u = np.hstack([u, np.zeros((len(u), len(plant.inputs) - u.shape[1]))])
     p = plant.complete(params).vector
-    f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
-    h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
+    arguments = (plant.t, plant.x, plant.u, plant.p)
+    f, h = (compile_expression(arguments, expression) for expression in (plant.dynamics, plant.output))
     x, out = np.array(x0, float), []
     for k in range(len(u)):
-        out.append(np.array(h(k / RATE, x, u[k], p)).ravel())
+        out.append(h(k / RATE, x, u[k], p))
         after = u[min(k + 1, len(u) - 1)] if hold == "first" else u[k]
 
         def rate(t, state, k=k, after=after):
             part = (t - k / RATE) * RATE
-            return np.array(f(t, state, u[k] + (after - u[k]) * part, p)).ravel()
+            return f(t, state, u[k] + (after - u[k]) * part, p)
 
         x = solve_ivp(rate, (k / RATE, (k + 1) / RATE), x, method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
     return np.array(out)
