@@ -22,11 +22,13 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.loops.crossings import add_minima
-from seaopt.control.loops.loop import GROWING, STABLE, Loop
+from seaopt.control.loops.loop import GRID_LOWEST_HZ, GROWING, STABLE, Loop
 from seaopt.control.loops.peaks import find_extremes
 from seaopt.errors import ControlError
 from seaopt.records import record
 
+ON_THE_CIRCLE = 1e-10  # distance of a pole from 1 that is rounding
+SETTLED_DECADES, POINTS_PER_DECADE = 3.0, 30  # below the lowest pole, where a response is a power law
 SKEWS = {"symmetric": (0.0, 2), "S-based": (1.0, 0), "T-based": (-1.0, 1)}  # skew, curve whose peak decides
 
 
@@ -166,10 +168,12 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
 
     .. math:: \delta_\nu = \sup_\omega \frac{|L_1 - L_2|}{\sqrt{1 + |L_1|^2}\sqrt{1 + |L_2|^2}}
 
-    where :math:`1 + \overline{L_2} L_1` winds about zero as often as :math:`L_2` has more poles outside the circle than
-    :math:`L_1`; else it is 1 (Vinnicombe, Uncertainty and Feedback, 2001, 3.3). Computed on a grid that resolves the
-    poles of both loops, their plants and their laws, halved until neighbours turn by less than a right angle; every
-    local maximum on it is refined by ternary search. The gap of a plant that is not finite is 1.
+    where :math:`1 + \overline{L_2} L_1` winds about zero as often as :math:`L_1` has more poles outside the circle than
+    :math:`L_2`, and half as often as it has more integrators; else it is 1 (Vinnicombe, Uncertainty and Feedback, 2001,
+    3.3: the path runs outside around a pole at 1, which turns by half a circle, and those of :math:`L_2` count as
+    poles outside). Computed on a grid that resolves the poles of both loops, their plants and their laws, from below
+    the lowest of them, halved until neighbours turn by less than a right angle; every local maximum on it is refined
+    by ternary search. The gap of a plant that is not finite is 1.
 
     Raises
     ------
@@ -186,7 +190,7 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
         return 1.0, None
     loops = (first, second)
     laws = [loop.about(np.linalg.eigvals(loop.measurement.state_space()[0]).astype(complex)) for loop in loops]
-    f = np.unique(np.concatenate([*(loop.grid() for loop in loops), *laws]))
+    f = np.unique(np.concatenate([_low_frequencies(loops), *(loop.grid() for loop in loops), *laws]))
     for _ in range(40):
         turning = _turning(first, second, f)
         wide = np.flatnonzero(np.abs(np.angle(turning[1:] / turning[:-1])) > np.pi / 2)
@@ -194,14 +198,31 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
             break
         f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
     turning = _turning(first, second, f)
-    winding = round(float(np.sum(np.angle(turning[1:] / turning[:-1]))) / np.pi)
-    outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > GROWING)) for loop in (first, second)]
-    if winding != outside[0] - outside[1]:
+    half_turns = round(2.0 * float(np.sum(np.angle(turning[1:] / turning[:-1]))) / np.pi)
+    outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > GROWING)) for loop in loops]
+    integrators = [_count_integrators(loop) for loop in loops]
+    if half_turns != 2 * (outside[0] - outside[1]) + integrators[0] - integrators[1]:
         return 1.0, None
     f = add_minima(lambda x: -_chord(first, second, x), f)
     chord = _chord(first, second, f)
     worst = int(np.argmax(chord))
     return float(chord[worst]), float(f[worst])
+
+
+def _low_frequencies(loops: tuple[Loop, Loop]) -> Float[np.ndarray, " m"]:
+    """Return frequencies from where both loop gains are as they are at 0 Hz, a power law, up to their usual grid."""
+    period = loops[0].plant.sample_time_s
+    poles = np.concatenate([each for loop in loops for each in (loop.system().opened, loop.system().poles)])
+    corners = np.abs(poles - 1.0) / (2 * np.pi * period)
+    lowest = float(np.min(corners[corners > ON_THE_CIRCLE / period], initial=GRID_LOWEST_HZ))
+    decades = max(1.0, np.log10(GRID_LOWEST_HZ / lowest) + SETTLED_DECADES)
+    return np.geomspace(10.0**-decades * GRID_LOWEST_HZ, GRID_LOWEST_HZ, round(POINTS_PER_DECADE * decades))
+
+
+def _count_integrators(loop: Loop) -> int:
+    """Return how many poles of plant and law are at 1, as well as they are known."""
+    system = loop.system()
+    return int(np.sum(np.abs(system.opened - 1.0) <= np.maximum(system.resolution(), ON_THE_CIRCLE)))
 
 
 def _chord(first: Loop, second: Loop, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import cont2discrete
+from scipy.signal import cont2discrete, tf2ss
 
 import seaopt as so
 from seaopt.control import DigitalPlant, Loop, TransferFunction
@@ -296,6 +296,31 @@ def test_a_nu_gap_across_the_winding_is_one():
     assert nu_gap(a, b)[0] > 0.79
     with pytest.raises(ControlError, match="sample time"):
         nu_gap(a, modal([(10.0, 0.5, 2.0)], ts=2e-3))
+
+
+def rational(num, den, ts=1e-3):
+    """A continuous transfer function behind a hold, under a law of 1."""
+    a, b, c, d = (np.atleast_2d(block) for block in tf2ss(num, den))
+    a, b, c, d, _ = cont2discrete((a, b, c, d), ts)
+    gain = num[-1] / den[-1] if den[-1] else np.inf
+    plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=d[0, 0], sample_time_s=ts, delay_samples=0, static_gain=gain)
+    return Loop(plant=plant, reference=ONE, measurement=ONE)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "truth"),
+    [
+        (([1.0], [1.0, -1e-3]), ([1.0], [1.0, 1e-3]), 2e-3 / (1 + 1e-6)),
+        (([1.0], [1e4, 0.0]), ([1.0], [1e8, 0.0, 0.0]), 1 / np.sqrt(2)),
+        (([1.0], [1.0, 0.0]), ([1.0], [1.0, 0.0, 0.0]), 1 / np.sqrt(2)),
+        (([1.0], [1e8, 0.0, 0.0]), ([1.0], [1e4, 0.0]), 1 / np.sqrt(2)),
+        (([5.0], [1.0, 0.0]), ([5.0], [1.0, 1e-5]), 1e-5 / np.hypot(5.0, 1e-5)),
+        (([0.5], [1.0, -1.0]), ([0.5], [1.0, 1.0]), 1.0),
+    ],
+)
+def test_the_nu_gap_of_plants_whose_gap_is_known(first, second, truth):
+    """Of a/(s - e) and a/(s + e) it is 2 a e/(a^2 + e^2) if a > e (Vinnicombe, 2001, 1.3); the others by hand."""
+    assert nu_gap(rational(*first), rational(*second))[0] == pytest.approx(truth, rel=2e-3)
 
 
 def test_a_delay_in_the_plant_is_pythons_exact_one(stand, thor):
