@@ -306,3 +306,20 @@ def test_viscous_friction_as_a_role_is_not_dry():
 def test_roles_that_name_nothing_are_refused(roles, word):
     with pytest.raises(PlantError, match=word):
         mass_on_a_spring(**roles)
+
+
+@pytest.mark.parametrize("kind", [so.plants.high_impedance, so.plants.moving_output])
+def test_figures_of_a_plant_with_friction_are_those_in_motion(kind, thor):
+    """Loop, port, environments and predictive control's margins: friction at rest is damping that vanishes."""
+    plant, sticky, stand = kind(), thor.update(f_c=60.0), so.plants.high_impedance()
+    controller = so.tune(stand, thor, so.ControllerSpec(structure="pd", bandwidth_hz=40, max_noise_gain=25))
+    law = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0))
+    for figures in (
+        lambda params: controller.close(plant, params).figures().ms,
+        lambda params: law.close(plant, params).figures().ms,
+        lambda params: passivity(controller, plant, params).least_damping_N_s_per_m,
+        lambda params: coupled_stability(
+            controller, plant, params, points=3, dampings_N_s_per_m=(10.0,)
+        ).spectral_radius,
+    ):  # fmt: skip
+        np.testing.assert_allclose(figures(sticky), figures(thor), rtol=1e-9)

@@ -152,8 +152,12 @@ class Controller:
         )
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
-        """Return the loop of this controller around a plant."""
-        return Loop(plant=self.plant(plant, params), reference=self.reference, measurement=self.measurement)
+        """Return the loop of this controller around a plant, which slides where it has friction.
+
+        At rest smoothed friction looks like a damper that is gone in motion; `seaopt.plants.friction` has both plants.
+        """
+        sliding = self.plant(take_sliding(plant, params), params)
+        return Loop(plant=sliding, reference=self.reference, measurement=self.measurement)
 
     def force_limit(self, frequency_hz: float) -> float | None:
         """Return the largest amplitude of F_ref (N) at a frequency that `current_limit_A` allows on the design plant.

@@ -52,6 +52,7 @@ from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 Curve = Callable[[Frequencies], Any]
@@ -147,7 +148,8 @@ def passivity(
     controller : Controller
         Its measurement path closes the loop; the reference is constant.
     plant, params
-        An actuator with a port at link 2; its own links do not matter: link 1 is held and link 2 moved.
+        An actuator with a port at link 2; its own links do not matter: link 1 is held and link 2 moved. Where it has
+        friction it slides.
     low_hz, high_hz : float
         The band to examine; up to the Nyquist frequency if left out.
 
@@ -177,7 +179,7 @@ def passivity(
         raise ControlError(
             f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
         )
-    port = port_of(plant, params, controller.spec.measured, controller.command.per_effort)
+    port = port_of(take_sliding(plant, params), params, controller.spec.measured, controller.command.per_effort)
     law = controller.measurement
     impedance, angle = _make_curves(port, law, ts, controller.delay_samples)
     f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))

@@ -37,6 +37,7 @@ from seaopt.estimation import Fit
 from seaopt.formatting import format_count, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
@@ -268,12 +269,14 @@ class ForceMPC:
         return reference, measurement
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
-        """Return the loop around a plant while no limit is active; its figures are in newtons of motor force."""
+        """Return the loop around a plant while no limit is active; its figures are in newtons of motor force.
+
+        A plant with friction slides, as in `Controller.close`.
+        """
         scale = command_of(*self.design, self.spec.measured).per_effort
         reference, measurement = (TransferFunction(num=law.num / scale, den=law.den) for law in self.unlimited())
-        digital = sample(
-            plant, params, self.spec.measured, scale, self.spec.sample_time_s, self.spec.delay_samples
-        )  # fmt: skip
+        spec, sliding = self.spec, take_sliding(plant, params)
+        digital = sample(sliding, params, spec.measured, scale, spec.sample_time_s, spec.delay_samples)
         return Loop(plant=digital, reference=reference, measurement=measurement)
 
     def __repr__(self) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.verdict import judge_all, list_broken
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task, solve
 from seaopt.errors import ControlError
@@ -17,10 +18,20 @@ from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
 MOST_ROWS = 1000
+
+
+@record
+class SlidingAlone:
+    """The best law for the sliding plants alone: feasible, its noise gain, and its disturbance, as in a row."""
+
+    feasible: bool
+    noise_gain: float
+    disturbance: float
 
 
 @record
@@ -47,6 +58,8 @@ class FrontierRow:
         Largest amplitude of the reference at the bandwidth before the current saturates; None without a limit.
     blocked_by : tuple of str
         The limits that are broken.
+    without_sticking : SlidingAlone or None
+        What could be had if no plant ever stuck; None where none has friction. The difference is what friction costs.
 
     """
 
@@ -61,6 +74,7 @@ class FrontierRow:
     disk_margin: float
     force_limit_N: float | None
     blocked_by: tuple[str, ...]
+    without_sticking: SlidingAlone | None = None
 
 
 @record(eq=False)
@@ -72,16 +86,21 @@ class Frontier:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of frontier.json (schema seaopt/frontier/1)."""
-        rows = [{field.name: getattr(row, field.name) for field in fields(FrontierRow)} for row in self.rows]
         return {
             "schema": FRONTIER_SCHEMA,
-            "rows": rows,
+            "rows": [asdict(row) for row in self.rows],
             "controllers": [controller.to_dict() for controller in self.controllers],
         }
 
     def __repr__(self) -> str:
         head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin", "force limit")
-        return "\n".join(format_table(map(_cells, self.rows), (*head, "blocked by"), "><>><>>>>"))
+        sticks = any(row.without_sticking for row in self.rows)
+        cells = [
+            [*_cells(row), *([_friction_cost(row)] if sticks else []), " and ".join(row.blocked_by)]
+            for row in self.rows
+        ]
+        friction = ("cost of friction",) if sticks else ()
+        return "\n".join(format_table(cells, (*head, *friction, "blocked by"), "><>><>>>>" + ">" * sticks))
 
     _repr_html_ = html_text
 
@@ -125,7 +144,10 @@ def sweep(
     params = params.parameters if isinstance(params, Fit) else params
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=float(f)) for f in bandwidths_hz]
-    task = make_task(plant, params, specs[0], robust_to or {}, draws)
+    robust_to = robust_to or {}
+    task = make_task(plant, params, specs[0], robust_to, draws)
+    sliding = _make_sliding_task(plant, params, specs[0], robust_to, draws)
+    sticks = len(sliding.plants) < len(task.plants)
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
     warm: tuple[LawNumbers, ...] = ()
@@ -133,10 +155,33 @@ def sweep(
         present = replace(task, spec=one)
         x, loops = solve(present, warm)
         controller = make_controller(present, x, loops, (plant, params))
-        rows.append(_row(present, x, loops, controller))
+        alone = _tune_sliding(replace(sliding, spec=one), x) if sticks else None
+        rows.append(replace(_row(present, x, loops, controller), without_sticking=alone))
         controllers.append(controller)
         warm = (x,)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
+
+
+def _make_sliding_task(
+    plant: Plant, params: ParameterSet, spec: ControllerSpec,
+    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]],
+) -> Task:  # fmt: skip
+    """Return the task on the sliding plants alone."""
+    pairs = {name: one if isinstance(one, tuple) else (one, params) for name, one in robust_to.items()}
+    sliding = {name: (take_sliding(model, model.complete(values)), values) for name, (model, values) in pairs.items()}
+    return make_task(take_sliding(plant, plant.complete(params)), params, spec, sliding, draws)
+
+
+def _tune_sliding(task: Task, start: LawNumbers) -> SlidingAlone:
+    x, loops = solve(task, (start,))
+    return SlidingAlone(
+        feasible=not list_broken(judge_all(task.spec, loops)), noise_gain=loops[0].figures.noise_gain,
+        disturbance=_worst_disturbance(task, x),
+    )  # fmt: skip
+
+
+def _worst_disturbance(task: Task, x: LawNumbers) -> float:
+    return max(disturbance(task.loop(x, i), task.spec.bandwidth_hz) for i in range(len(task.plants)))
 
 
 def _cells(row: FrontierRow) -> list[str]:
@@ -150,8 +195,15 @@ def _cells(row: FrontierRow) -> list[str]:
         format_figure(row.sensitivity_bandwidth_hz, "Hz", 3),
         MISSING if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg",
         format_figure(row.force_limit_N, "N"),
-        " and ".join(row.blocked_by),
     ]
+
+
+def _friction_cost(row: FrontierRow) -> str:
+    """Return by how much friction raises the disturbance, or that it alone makes a bandwidth impossible."""
+    alone = row.without_sticking
+    if alone is None or not alone.feasible:
+        return MISSING
+    return f"{100.0 * (row.disturbance / alone.disturbance - 1.0):+.0f} %" if row.feasible else "all of it"
 
 
 def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Controller) -> FrontierRow:
@@ -159,7 +211,7 @@ def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Contr
     worst = max(loops, key=lambda loop: loop.figures.ms)
     return FrontierRow(
         bandwidth_hz=f_b, feasible=controller.feasible, noise_gain=design.noise_gain, ms=worst.figures.ms,
-        ms_plant=worst.name, disturbance=max(disturbance(task.loop(x, i), f_b) for i in range(len(loops))),
+        ms_plant=worst.name, disturbance=_worst_disturbance(task, x),
         sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz, phase_margin_deg=design.phase_margin_deg,
         disk_margin=design.disk_margin, force_limit_N=controller.force_limit(f_b),
         blocked_by=controller.blocked_by,

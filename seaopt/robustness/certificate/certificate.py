@@ -28,7 +28,7 @@ from seaopt.formatting import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction, take_sliding
+from seaopt.plants.friction import split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
@@ -156,7 +156,7 @@ def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) ->
     classical = margins(loop)
     assert controller.design is not None
     design, values = controller.design
-    gap, gap_hz = nu_gap(controller.close(take_sliding(design, values), values), loop)
+    gap, gap_hz = nu_gap(controller.close(design, values), loop)
     period = controller.sample_time_s
     reach = min(SEARCHED_DELAYS * ((classical.delay_s or 0.0) + 2 * period), LONGEST_DELAY * period)
     exact = sampled_delay_margin(controller, plant, params, reach) if classical.disks else 0.0

@@ -16,7 +16,6 @@ from seaopt.errors import ControlError, SeaoptError
 from seaopt.formatting import format_band, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
@@ -130,7 +129,6 @@ def run_simulations(
         )
     check_plants(plants, draws or {}, {})
     plant, values = controller.design
-    sliding = take_sliding(plant, values)  # stuck, friction only adds damping
     device = sensors or Sensors()
     left_out: dict[str, str] = {}
 
@@ -152,8 +150,8 @@ def run_simulations(
             controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed
         )),
         large_signal=tuple(sweep for sweep in sweeps if sweep is not None),
-        passivity=attempt("passivity", lambda: passivity(controller, sliding, values)),
-        environments=attempt("environments", lambda: coupled_stability(controller, sliding, values)),
+        passivity=attempt("passivity", lambda: passivity(controller, plant, values)),
+        environments=attempt("environments", lambda: coupled_stability(controller, plant, values)),
         left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
     )  # fmt: skip
 

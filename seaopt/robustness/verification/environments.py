@@ -26,6 +26,7 @@ from seaopt.errors import ControlError
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import batch_figures
 
@@ -191,7 +192,7 @@ def coupled_stability(
     controller : Controller
         The law.
     plant, parameters
-        The actuator; the environment's mass replaces its own link 2.
+        The actuator, sliding where it has friction; the environment's mass replaces its own link 2.
     masses_kg, stiffnesses_N_per_m : (low, high)
         Ranges, logarithmic. They exclude zero mass, where the actuator's own link moves freely.
     dampings_N_s_per_m : tuple of float
@@ -219,7 +220,7 @@ def coupled_stability(
 
     """
     _check_grid(masses_kg, stiffnesses_N_per_m, dampings_N_s_per_m, points)
-    coupled = attach_environment(plant)
+    coupled = attach_environment(take_sliding(plant, parameters))
     values = coupled.complete(parameters).drop_conditions()
     mass, stiffness = (np.geomspace(*ends, points) for ends in (masses_kg, stiffnesses_N_per_m))
     damping = np.array(dampings_N_s_per_m, dtype=float)
