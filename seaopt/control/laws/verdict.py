@@ -17,18 +17,20 @@ NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the
 
 @record(eq=False)
 class Verdict:
-    """One limit against one loop's figure; `plant` is the loop's name."""
+    """One limit against one loop's figure; `plant` is the loop's name, `stuck` the design plant stuck by friction."""
 
     limit: Limit
     plant: str
     value: float
     allowed: float
     met: bool
+    stuck: bool = False
 
     @property
     def label(self) -> str:
-        """The limit's name, with the plant where it holds for all."""
-        return f"{self.limit.name} ({self.plant})" if self.limit.scope == "every plant" else self.limit.name
+        """The limit's name, with the plant where it holds for several."""
+        named = self.limit.scope == "every plant" or self.stuck
+        return f"{self.limit.name} ({self.plant})" if named else self.limit.name
 
 
 def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
@@ -43,7 +45,7 @@ def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool
             continue
         value = limit.figure(loop)
         met = limit.keeps(value, allowed) and (limit.condition is None or limit.condition(loop))
-        verdicts.append(Verdict(limit=limit, plant=loop.name, value=value, allowed=allowed, met=met))
+        verdicts.append(Verdict(limit=limit, plant=loop.name, value=value, allowed=allowed, met=met, stuck=stuck))
     return verdicts
 
 

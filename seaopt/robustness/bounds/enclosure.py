@@ -125,12 +125,22 @@ def _arctangent(a: Taylor) -> Taylor:
 
 
 def _absolute(a: Taylor) -> Taylor:
-    """Return abs(a) where its sign is certain, else the smallest interval that contains it."""
+    """Return abs(a) where its sign is certain; else the strip between the chord of abs over the range and its parallel.
+
+    With the range c +- h the chord's slope is c/h, and abs lies between it and it less (h^2 - c^2)/h.
+    """
     reach = a.reach
-    sign, sure, middle = np.sign(a.c), np.abs(a.c) > reach, 0.5 * (np.abs(a.c) + reach)
-    out = np.where(sure, sign * a.a, 0.0)
-    out[0] = np.where(sure, out[0], middle)
-    return Taylor(a.basis, out, np.where(sure, a.r, middle))
+    sure = np.abs(a.c) > reach
+    bounded = ~sure & np.isfinite(reach) & (reach > 0.0)
+    h = np.where(bounded, reach, 1.0)
+    half = np.where(bounded, 0.5 * (h - a.c**2 / h), 0.0)
+    slope = np.where(sure, np.sign(a.c), np.where(bounded, a.c / h, 0.0))
+    remainder = np.where(sure | bounded, np.abs(slope) * a.r + half, reach)
+    return (a * slope + half).with_remainder(remainder)
+
+
+def _larger(a: Entry, b: Entry) -> Entry:
+    return 0.5 * (a + b + _absolute(a - b))  # pyright: ignore[reportArgumentType]
 
 
 def _sign(a: Taylor) -> Taylor:
@@ -145,6 +155,8 @@ BINARY: dict[int, Callable[[Any, Any], Entry]] = {
     ca.OP_DIV: _divide,
     ca.OP_POW: _raise_to_power,
     ca.OP_CONSTPOW: _raise_to_power,
+    ca.OP_FMAX: _larger,
+    ca.OP_FMIN: lambda a, b: -_larger(-a, -b),
 }
 UNARY: dict[int, Callable[[Any], Entry]] = {
     ca.OP_ASSIGN: lambda a: a,

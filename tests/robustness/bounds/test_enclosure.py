@@ -55,7 +55,8 @@ def test_what_stays_within_the_degree_is_exact():
 FUNCTIONS = {
     "sin": ca.sin, "cos": ca.cos, "tanh": ca.tanh, "exp": ca.exp, "log": ca.log, "sqrt": ca.sqrt, "atan": ca.atan,
     "abs": ca.fabs, "sign": ca.sign, "square": lambda x: x**2, "inverse": lambda x: 1.0 / x, "cube": lambda x: x**3,
-    "power": lambda x: x**1.7, "inverse cube": lambda x: x**-3,
+    "power": lambda x: x**1.7, "inverse cube": lambda x: x**-3, "abs about zero": lambda x: ca.fabs(x - 1.3),
+    "largest": lambda x: ca.fmax(x, 3.0 - x**2), "least": lambda x: ca.fmin(2.0, x * x),
 }  # fmt: skip
 
 
