@@ -90,9 +90,9 @@ def write_report(
         )
     if certificate is not None:
         controller = controller or certificate.controller
-        simulation = certificate.simulated
+        simulation, verification = certificate.simulated, verification or certificate.runs
         if simulation is not None:
-            verification, coupled = verification or simulation.verification, coupled or simulation.environments
+            coupled = coupled or simulation.environments
             large = large or list(simulation.large_signal)
     surveys = fit_surveys(fit) if fit is not None else {}
     diagnostics = diagnose(fit) if fit is not None and fit.minimum is not None else None
@@ -239,8 +239,7 @@ def _describe_forces(controller: Controller | None) -> str:
 
 
 def _describe_simulations(certificate: Certificate) -> str:
-    verification = certificate.simulated.verification if certificate.simulated is not None else None
-    return "" if verification is None else f", {len(verification.rows)} simulations passed"
+    return "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulations passed"
 
 
 def verdict(

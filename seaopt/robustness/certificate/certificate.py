@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import field, fields, replace
 from typing import Any
 
-import numpy as np
-
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.friction_proof import prove_friction
@@ -31,15 +29,21 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
-from seaopt.robustness.certificate.simulated import Simulated, run_simulations
+from seaopt.robustness.certificate.simulated import (
+    NAMED_FAULTS,
+    SIMULATION_FAILURES,
+    Simulated,
+    require_runs,
+    run_simulations,
+    simulate_steps,
+)
 from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.worst import Worst, measure_worst
-from seaopt.robustness.verification.verification import describe_witness
+from seaopt.robustness.verification.verification import Verification
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
-SIMULATION_FAILURES = "simulation_failures"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
@@ -190,6 +194,8 @@ class Certificate:
         What it was certified on, at `parameters`: the plants as they are, friction and all.
     simulated : Simulated or None
         The results of `with_simulation`.
+    steps : Verification, str or None
+        The simulated steps that every plant is judged by; the reason where they cannot be simulated.
     brackets : mapping of name to Bracket
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
@@ -210,6 +216,7 @@ class Certificate:
     parameters: ParameterSet
     varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
+    steps: Verification | str | None = None
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
     remarks: tuple[str, ...] = ()
@@ -243,22 +250,49 @@ class Certificate:
         >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
         >>> certificate = so.certify(controller, {"stand": stand}, thor).with_simulation()
         >>> certificate.passed, len(certificate.simulated.verification.rows)
-        (True, 8)
+        (True, 7)
 
         """
         simulations = self._simulate(sensors, current_step_A, seed)
-        others = tuple(row for row in self.requirements if row.name != SIMULATION_FAILURES)
-        requirements = (*others, *_require_simulations(simulations))
+        runs = simulations.verification or simulations.left_out["simulation"]
+        others = (row for row in self.requirements if row.name not in (SIMULATION_FAILURES, *NAMED_FAULTS.values()))
+        requirements = (*others, *_require_runs(runs))
         passed = all(row.met for row in requirements)
         return replace(self, simulated=simulations, requirements=requirements, passed=passed)
 
-    def _simulate(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
+    def with_steps(self) -> Certificate:
+        """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
+
+        Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
+        reference; nothing may oscillate. `certify` does this; `with_simulation` plays all other scenarios too.
+        """
+        steps = self.simulate_steps()
+        requirements = (*self.requirements, *_require_runs(steps))
+        return replace(self, steps=steps, requirements=requirements, passed=all(row.met for row in requirements))
+
+    @property
+    def runs(self) -> Verification | None:
+        """What was simulated on the nonlinear plants: every scenario after `with_simulation`, else the steps."""
+        if self.simulated is not None:
+            return self.simulated.verification
+        return self.steps if isinstance(self.steps, Verification) else None
+
+    def simulate_steps(self) -> Verification | str:
+        """Play the steps of every plant, at their worst draws too; return why not where that cannot be done."""
+        return simulate_steps(self.controller, self.models, self.parameters, self._draws())
+
+    def _draws(self) -> dict[str, list[ParameterSet]]:
+        """Return the worst draws of each plant, of those with friction sliding and stuck, without what is nominal."""
         draws: dict[str, list[ParameterSet]] = {name: [] for name in self.models}
         for name, model in self.models.items():
             states = split_friction({name: model}, self.parameters, [varied.name for varied in self.varied])
-            draws[name] += [self.worst[state][1] for state in states if state in self.worst]
+            worst = [self.worst[state] for state in states if state in self.worst]
+            draws[name] += [case[1] for case in worst if case.parameters]
+        return draws
+
+    def _simulate(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
         return run_simulations(
-            self.controller, self.models, self.parameters, draws=draws, sensors=sensors,
+            self.controller, self.models, self.parameters, draws=self._draws(), sensors=sensors,
             current_step_A=current_step_A, seed=seed,
         )  # fmt: skip
 
@@ -317,6 +351,7 @@ class Certificate:
                 friction=prove_frictions(controller, models, parameters),
                 remarks=tuple(stored.remarks),
             )
+            certificate = replace(certificate, steps=certificate.simulate_steps())
             played = stored.simulation
             if played is None:
                 return certificate
@@ -346,6 +381,7 @@ class Certificate:
             "remarks": list(self.remarks),
             "notes": list(self.notes),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
+            "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
         }
 
@@ -367,7 +403,9 @@ class Certificate:
             else ()
         )
         friction = (f"{name}: {margin}" for name, margin in self.friction.items())
-        return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little)
+        peak = self.controller.spec.max_reference_peak
+        lifted = () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
+        return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
 
     def _bounds(self, name: str) -> dict[str, Any]:
         return self.brackets[name].to_dict() if name in self.brackets else {}
@@ -379,6 +417,7 @@ class Certificate:
         if self.varied:
             lines.append(f"  varied: {'; '.join(map(str, self.varied))}")
         lines.append(f"  {self.monte_carlo}")
+        lines += [f"  {line}" for line in (self.runs.describe_steps() if self.runs is not None else [])]
         lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
         for row in self.requirements:
             if not row.met:
@@ -409,28 +448,8 @@ class Certificate:
         return format_certificate(self)
 
 
-def _require_simulations(simulations: Simulated) -> list[Requirement]:
-    """Return one requirement per plant where every run passes, else one per run that failed, with its witness."""
-    verification = simulations.verification
-    if verification is None:
-        reason = simulations.left_out["simulation"]
-        return [Requirement(name=SIMULATION_FAILURES, limit=0.0, value=np.inf, met=False, where=reason)]
-    rows: list[Requirement] = []
-    for plant in verification.stages:
-        runs = [row for row in verification.rows if row.plant == plant]
-        failed = [row for row in runs if not row.passed]
-        rows += [
-            Requirement(
-                name=SIMULATION_FAILURES, limit=0.0, value=1.0, met=False,
-                where=f"{plant}, {row.scenario}, draw {row.draw}, seed {verification.seed}: {row.reason}"
-                + describe_witness(row),
-            )
-            for row in failed
-        ]  # fmt: skip
-        if runs and not failed:
-            where = f"{plant}: {len(runs)} runs"
-            rows.append(Requirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, where=where))
-    return rows
+def _require_runs(runs: Verification | str) -> tuple[Requirement, ...]:
+    return tuple(Requirement(**_list_fields(row)) for row in require_runs(runs))
 
 
 def _format_signed(value: float | None) -> str:
@@ -465,7 +484,8 @@ def format_certificate(certificate: Certificate) -> str:
         ],
     )  # fmt: skip
     varied = html_paragraph(f"varied: {'; '.join(map(str, certificate.varied))}") if certificate.varied else ""
-    simulated = html_list(certificate.simulated.lines()) if certificate.simulated is not None else ""
+    steps = certificate.runs.describe_steps() if certificate.runs is not None else []
+    simulated = html_list([*steps, *(certificate.simulated.lines() if certificate.simulated is not None else [])])
     return (
         verdict
         + html_list(certificate.notes)

@@ -177,13 +177,14 @@ def certify(
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
     )
-    return Certificate(
+    certificate = Certificate(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
         brackets=brackets, friction=prove_frictions(controller, models, nominal),
         remarks=_remark_delay(controller, parameters),
     )  # fmt: skip
+    return certificate.with_steps()
 
 
 def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tuple[str, ...]:

@@ -18,10 +18,30 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
+from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
-from seaopt.robustness.verification.verification import Verification, check_plants, verify
+from seaopt.robustness.verification.scenarios import step_scenarios
+from seaopt.robustness.verification.verification import Verification, check_plants, describe_witness, verify
 
 Result = TypeVar("Result")
+SIMULATION_FAILURES = "simulation_failures"
+STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
+# Kinds of fault that have a figure of their own are requirements by these names; all others are counted.
+NAMED_FAULTS = {
+    "overshoot": STEP_OVERSHOOT, "settling": STEP_SETTLING, "steady error": "steady_error_N",
+    "oscillation": "sustained_oscillation_N",
+}  # fmt: skip
+
+
+@record
+class SimulationRequirement:
+    """What runs of one plant require, in the fields of a certificate's requirement."""
+
+    name: str
+    limit: float
+    value: float
+    met: bool
+    where: str
 
 
 @record(eq=False)
@@ -154,6 +174,79 @@ def run_simulations(
         environments=attempt("environments", lambda: coupled_stability(controller, plant, values)),
         left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
     )  # fmt: skip
+
+
+def simulate_steps(
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    parameters: ParameterSet,
+    draws: Mapping[str, Sequence[ParameterSet]],
+) -> Verification | str:
+    """Play the steps of `step_scenarios` on every plant, on ideal devices; return why not where that cannot be done."""
+    try:
+        return verify(controller, plants, parameters, scenarios=step_scenarios, draws=draws)
+    except SeaoptError as error:
+        return str(error)
+
+
+def require_runs(runs: Verification | str) -> list[SimulationRequirement]:
+    """Return what the runs require: the same fault in many runs of a plant is one requirement, with the worst of them.
+
+    Parameters
+    ----------
+    runs : Verification or str
+        What was played, or why nothing could be.
+
+    """
+    if isinstance(runs, str):
+        return [SimulationRequirement(name=SIMULATION_FAILURES, limit=0.0, value=np.inf, met=False, where=runs)]
+    requirements: list[SimulationRequirement] = []
+    for plant in runs.stages:
+        rows = [row for row in runs.rows if row.plant == plant]
+        requirements += [*_list_failures(runs, rows), *_list_kept(runs, plant, rows)]
+    return requirements
+
+
+def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[SimulationRequirement]:
+    faults: dict[str, list[tuple[Fault, Outcome]]] = {}
+    for row in rows:
+        decisive = [fault for fault in row.faults if fault.kind in LOST][:1] or row.faults
+        for fault in decisive:
+            faults.setdefault(fault.kind, []).append((fault, row))
+    requirements: list[SimulationRequirement] = []
+    for kind, cases in faults.items():
+        fault, row = max(cases, key=lambda case: case[0].value / (case[0].limit or 1.0))
+        name = NAMED_FAULTS.get(kind, SIMULATION_FAILURES)
+        where = f"{row.plant}, {row.scenario}, draw {row.draw}, seed {runs.seed}: {fault.text}{describe_witness(row)}"
+        requirements.append(SimulationRequirement(
+            name=name, met=False, limit=fault.limit,
+            value=float(len(cases)) if name == SIMULATION_FAILURES else fault.value,
+            where=where + (f"; the worst of {len(cases)} such runs" if len(cases) > 1 else ""),
+        ))  # fmt: skip
+    return requirements
+
+
+def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[SimulationRequirement]:
+    """Return the requirements on a plant that every run meets, the figures of steps with the worst of them."""
+    if not rows:
+        return []
+    kept: list[SimulationRequirement] = []
+    if all(row.passed for row in rows):
+        where = f"{plant}: {len(rows)} runs"
+        kept.append(SimulationRequirement(name=SIMULATION_FAILURES, limit=0.0, value=0.0, met=True, where=where))
+    steps = [(row, runs.scenario(row)) for row in rows if row.overshoot is not None and row.settling_s is not None]
+    peaks = [
+        (1.0 + (row.overshoot or 0.0), scenario.max_overshoot, row)
+        for row, scenario in steps
+        if scenario.max_overshoot is not None and not row.saturated
+    ]
+    times = [(row.settling_s or 0.0, scenario.settling_s or 0.0, row) for row, scenario in steps]
+    for name, figures in ((STEP_OVERSHOOT, peaks), (STEP_SETTLING, times)):
+        if figures and all(value <= limit for value, limit, _ in figures):
+            value, limit, row = max(figures, key=lambda figure: figure[0])
+            where = f"{plant}, {row.scenario}, draw {row.draw}"
+            kept.append(SimulationRequirement(name=name, limit=limit, value=value, met=True, where=where))
+    return kept
 
 
 def _list_sweeps(

@@ -17,7 +17,8 @@ A run passes if:
 - no oscillation sustains itself in the last phase (`oscillation`), above the level of noise and quantisation. Where a
   link moves, oscillations slower than a tenth of the bandwidth are excluded: an undamped link may swing;
 - the scenario's limits are met: the final error, a mean, with an allowance of four standard deviations of its noise,
-  and of none in the run without noise.
+  and of none in the run without noise; of a step from rest, as its user sees it, the largest force over the reference,
+  unless the current saturates, and the time until the force stays within a tenth of it, both without noise.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from seaopt.records import record
 from seaopt.robustness.verification.linear import LinearView, linearise_last_phase
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Playback, Stage
-from seaopt.robustness.verification.scenarios import Scenario
+from seaopt.robustness.verification.scenarios import SETTLED, Scenario
 
 SETTLE = 0.2  # of the last phase, which is not judged
 GROWTH, GROWTH_FLOOR = 1.05, 1e-3
@@ -51,6 +52,28 @@ LINE_PERIODS = 8.0  # of the slowest oscillation, in the window
 SHORTER = 4.0  # times shorter: the second window
 STILL_PERIODS = 4.0  # where no link moves: of the slowest oscillation that is distinct from a drift
 NOMINAL = "nominal"
+LOST = ("overflow", "unstable")  # kinds of fault that explain every other of the same run
+
+
+@record
+class Fault:
+    """Something that a run is not allowed to do.
+
+    Parameters
+    ----------
+    kind : str
+        "overshoot", "settling", "steady error", "oscillation", "growth", ...: faults of one kind are one failure.
+    text : str
+        What happened, with figures.
+    value, limit : float
+        The figure and what is allowed, in the same unit.
+
+    """
+
+    kind: str
+    text: str
+    value: float = 1.0
+    limit: float = 0.0
 
 
 @record
@@ -64,6 +87,8 @@ class Outcome:
     passed : bool
     reason : str
         What failed; empty if nothing did.
+    faults : tuple of Fault
+        The same, one by one.
     parameters : mapping of name to float
         Where the draw differs from nominal: with scenario, plant and seed, the witness.
     peak_force_N, peak_current_A : float
@@ -78,6 +103,8 @@ class Outcome:
         Mean of reference minus force over the last fifth of the last phase.
     limit_cycle_N, limit_cycle_hz : float or None
         Amplitude and frequency of an oscillation that does not die out.
+    overshoot, settling_s : float or None
+        Of a step from rest: the largest force over the reference, and the time until it stays within a tenth of it.
     contact_impulse, contact_loss_J : float or None
         Of the hardest contact: what stops the link along its coordinate, and the energy lost.
 
@@ -88,6 +115,7 @@ class Outcome:
     draw: str
     passed: bool
     reason: str
+    faults: tuple[Fault, ...]
     parameters: Mapping[str, float]
     peak_force_N: float
     peak_current_A: float
@@ -98,16 +126,21 @@ class Outcome:
     final_error_N: float | None = None
     limit_cycle_N: float | None = None
     limit_cycle_hz: float | None = None
+    overshoot: float | None = None
+    settling_s: float | None = None
     contact_impulse: float | None = None
     contact_loss_J: float | None = None
 
 
 @record
 class _Findings:
-    """Figures of one run, as fields of an `Outcome`, and sentences on what is not allowed."""
+    """Figures of one run, as fields of an `Outcome`, and what is not allowed."""
 
     figures: dict[str, Any] = field(default_factory=dict[str, Any])
-    faults: list[str] = field(default_factory=list[str])
+    faults: list[Fault] = field(default_factory=list[Fault])
+
+    def add(self, kind: str, text: str, value: float = 1.0, limit: float = 0.0) -> None:
+        self.faults.append(Fault(kind=kind, text=text, value=value, limit=limit))
 
 
 def judge_run(
@@ -121,7 +154,7 @@ def judge_run(
     findings, twin = _Findings(), trace if ideal is None else ideal
     view = linearise_last_phase(stage, scenario, sets[run])
     if view.instability:
-        findings.faults.append(view.instability)
+        findings.add("unstable", view.instability)
     measured = stage.controller.spec.measured
     force, current = trace.outputs[measured][run], trace.current[run]
     _judge_extremes(stage, scenario, trace, run, findings)
@@ -131,12 +164,14 @@ def judge_run(
         if not view.instability:
             _judge_outbreak(stage, scenario, trace, twin, run, view, findings)
         _judge_oscillation(stage, scenario, trace, run, view, findings)
+        _judge_step(stage, scenario, twin, run, findings)
         _judge_final_error(stage, scenario, trace, twin, run, findings)
     else:
-        findings.faults.insert(0, "its numbers overflow")
+        findings.faults.insert(0, Fault(kind="overflow", text="its numbers overflow"))
     return Outcome(
         scenario=scenario.name, plant=name, draw=NOMINAL if run == 0 else str(run), passed=not findings.faults,
-        reason="; ".join(findings.faults), parameters=_find_differences(sets[0], sets[run]),
+        reason="; ".join(fault.text for fault in findings.faults), faults=tuple(findings.faults),
+        parameters=_find_differences(sets[0], sets[run]),
         **findings.figures,
     )  # fmt: skip
 
@@ -158,17 +193,17 @@ def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int,
         contact_loss_J=None if hardest is None else float(hardest.loss_J[run]),
     )
     if np.max(current) > most * (1 + 1e-9):
-        findings.faults.append(f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
+        findings.add("current", f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
     for what, value, allowed, unit in (
         (controller.spec.measured, force, scenario.max_force_N, "N"),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
         if allowed is not None and not value <= allowed:
-            findings.faults.append(f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
+            findings.add(f"peak of {what}", f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
     for name, value in scenario.passes.items():
         reached = trace.outputs[name][run]
         if not np.nanmin(reached) <= value <= np.nanmax(reached):
-            findings.faults.append(f"{name} never passes {value:g}, so that the scenario does not happen")
+            findings.add("no event", f"{name} never passes {value:g}, so that the scenario does not happen")
 
 
 def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, findings: _Findings) -> None:
@@ -177,8 +212,9 @@ def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, fi
     if trace.rest is None or limit is None or abs(trace.rest.current_A[run]) <= limit * (1 + 1e-9):
         return
     where = format_values({name: drawn[name].value for name in stage.plant.states if name in drawn}, missing="")
-    findings.faults.append(
-        f"to rest at {where} takes {trace.rest.current_A[run]:.4g} A, above the limit of {limit:g} A; narrow its range"
+    findings.add(
+        "rest",
+        f"to rest at {where} takes {trace.rest.current_A[run]:.4g} A, above the limit of {limit:g} A; narrow its range",
     )
 
 
@@ -197,7 +233,7 @@ def _judge_growth(stage: Stage, scenario: Scenario, trace: Playback, run: int, f
     first, second = (float(np.max(half)) for half in np.array_split(last, 2))
     findings.figures["energy_growth"] = second / max(first, 1e-300)
     if second > GROWTH * first + GROWTH_FLOOR * float(np.max(level)):
-        findings.faults.append(f"{what} grows {second / max(first, 1e-300):.3g} times while the reference is constant")
+        findings.add("growth", f"{what} grows {second / max(first, 1e-300):.3g} times while the reference is constant")
 
 
 def _judge_outbreak(
@@ -213,7 +249,7 @@ def _judge_outbreak(
     allowed = OUTBREAK * before + OUTLIER * view.force_std()
     if not after <= allowed:
         end = f"{after:.4g} N in the end, without noise by {np.max(alone):.4g} N"
-        findings.faults.append(f"{name} is off by up to {end}")
+        findings.add("outbreak", f"{name} is off by up to {end}")
 
 
 def _judge_oscillation(
@@ -234,7 +270,8 @@ def _judge_oscillation(
         if line is not None and (line.sustained or line.growing):
             findings.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
             what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
-            findings.faults.append(f"an oscillation of {line.amplitude:.3g} N at {line.frequency_hz:.4g} Hz {what}")
+            text = f"an oscillation of {line.amplitude:.3g} N at {line.frequency_hz:.4g} Hz {what}"
+            findings.add("oscillation", text, line.amplitude)
             return
 
 
@@ -261,6 +298,29 @@ def _noise_floor(stage: Stage, trace: Playback, run: int) -> float:
     return max(noise + rounding, 1e-3 * float(trace.peaks[name][run]))
 
 
+def _judge_step(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
+    """Judge a step from rest by its largest force, between samples too, and by when it has settled."""
+    if scenario.settling_s is None:
+        return
+    step, name, last = scenario.phases[-1].force_N, stage.controller.spec.measured, trace.last
+    rest = 0.0 if trace.rest is None else float(trace.rest.force[run])
+    response = (trace.outputs[name][run] - rest) / step
+    largest = float(np.max(np.abs(response))) if rest else float(trace.peaks[name][run]) / abs(step)
+    outside = np.flatnonzero(np.abs(response[last] - 1.0) > SETTLED)
+    settled = outside.size == 0 or outside[-1] + 1 < last.stop - last.start
+    settling_s = float(outside[-1] + 1 if outside.size else 0) * stage.controller.sample_time_s if settled else math.inf
+    findings.figures.update(overshoot=max(largest - 1.0, 0.0), settling_s=settling_s)
+    allowed = scenario.max_overshoot
+    if allowed is not None and largest > allowed and not findings.figures["saturated"]:
+        over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
+        text = f"a step of {step:.3g} N overshoots by {over}, {most} are allowed"
+        findings.add("overshoot", text, largest, allowed)
+    if settling_s > scenario.settling_s:
+        when = f"after {settling_s:.3g} s" if settled else "not at all"
+        text = f"a step of {step:.3g} N settles {when}, {scenario.settling_s:.3g} s are allowed"
+        findings.add("settling", text, settling_s, scenario.settling_s)
+
+
 def _judge_final_error(
     stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, findings: _Findings
 ) -> None:
@@ -272,7 +332,8 @@ def _judge_final_error(
     for value, more, what in ((error, spare, ""), (alone, 0.0, " without noise")):
         if scenario.final_error is not None and not abs(value) <= scenario.final_error + more:
             allowed = scenario.final_error + more
-            findings.faults.append(f"the force ends {value:.4g} N off{what}, {allowed:.4g} N are allowed")
+            text = f"the force ends {value:.4g} N off{what}, {allowed:.4g} N are allowed"
+            findings.add("steady error", text, abs(value), allowed)
             return
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Float
 
@@ -72,7 +74,8 @@ def find_oscillation(
 
     """
     size = float(np.max(np.abs(signal)))
-    if not size:
+    spread = float(np.std(signal / size)) if size else 0.0
+    if 2.0 * spread * size <= floor:  # no line in half of the window can be larger
         return None
     fast = _remove_slow(signal / size, sample_time_s, lowest_hz)  # an unstable loop's squares would overflow
     n = fast.size
@@ -89,11 +92,16 @@ def find_oscillation(
 def _remove_slow(signal: Float[np.ndarray, " n"], sample_time_s: float, lowest_hz: float) -> Float[np.ndarray, " n"]:
     """Return the signal less the least-squares fit of a line and of the window's slow cosines."""
     n = signal.size
+    basis = _slow_basis(n, max(int(2 * n * sample_time_s * lowest_hz), 0))
+    return signal - basis @ (basis.T @ signal)
+
+
+@lru_cache(maxsize=8)
+def _slow_basis(n: int, harmonics: int) -> Float[np.ndarray, "n k"]:
+    """Return orthonormal columns that span a constant, a line and the window's slowest cosines."""
     time = np.linspace(-1.0, 1.0, n)
-    harmonics = np.arange(1, max(int(2 * n * sample_time_s * lowest_hz), 0) + 1)
-    slow = np.cos(0.5 * np.pi * np.outer(time + 1.0, harmonics))
-    basis = np.column_stack([np.ones(n), time, slow])
-    return signal - basis @ np.linalg.lstsq(basis, signal, rcond=None)[0]
+    slow = np.cos(0.5 * np.pi * np.outer(time + 1.0, np.arange(1, harmonics + 1)))
+    return np.linalg.qr(np.column_stack([np.ones(n), time, slow]))[0]
 
 
 def _find_frequency(signal: Float[np.ndarray, " n"], sample_time_s: float) -> float:

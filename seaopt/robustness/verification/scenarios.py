@@ -15,12 +15,19 @@ from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
 
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
 NOMINAL_FORCE_N = 100.0
+STEP_SHARES = (0.02, 0.1, 0.5)  # of the force that the current limit can hold at rest
+UNSATURATED = 0.9  # of the step that just reaches the current limit
+FRICTION_STEPS = (0.2, 1.0, 5.0, 25.0)  # times the dry friction, where there is no limit
+PEAK_GRACE = 1.1  # of the reference peak allowed, for the overshoot of a step
+SETTLING_PERIODS = 40.0  # of the bandwidth, until a step is within `SETTLED`
+SETTLED = 0.1  # of a step: how far the force may be off once it has settled
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
 JUDGED_PERIODS = 100.0  # of the bandwidth: after a fifth of settling, eight periods of a tenth of it
@@ -85,6 +92,10 @@ class Scenario:
         No oscillation may sustain itself in the last phase.
     final_error : float or None
         Largest mean error over the last fifth of the last phase, N.
+    max_overshoot : float or None
+        Largest force over the last phase's reference, a step from rest, where the current does not saturate.
+    settling_s : float or None
+        Time of the last phase, a step from rest, until the force stays within a tenth of its reference.
     max_force_N, max_angle_rad : float or None
         Largest peaks of the measured force and of every angle.
     passes : mapping of output name to float
@@ -100,6 +111,8 @@ class Scenario:
     about_rest: bool = True
     quiet: bool = True
     final_error: float | None = None
+    max_overshoot: float | None = None
+    settling_s: float | None = None
     max_force_N: float | None = None
     max_angle_rad: float | None = None
     passes: Mapping[str, float] = field(default_factory=dict[str, float])
@@ -158,7 +171,7 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
 
     Forces are multiples of two: that of the step that just reaches the current limit (at its first samples, where the
     law differentiates), and that which the limit can hold at rest. Without `current_limit_A` nothing saturates: the
-    step is then 100 N, and the scenarios of saturation are left out.
+    scenarios of saturation are left out, and the others are of 100 N, or of the steps of `step_scenarios`.
 
     Parameters
     ----------
@@ -178,14 +191,14 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
     >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> [scenario.name for scenario in default_scenarios(controller, so.plants.high_impedance())]
-    ['small step', 'saturating doublet', 'saturating hold', 'chirp']
+    ['2 % step', '10 % step', '50 % step', 'unsaturated step', 'saturating doublet', 'saturating hold', 'chirp']
 
     """
     step, rest = find_step_limit(controller), controller.force_limit(0.01)
     band = controller.spec.bandwidth_hz
     small = 0.5 * step if step is not None else NOMINAL_FORCE_N
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
-    scenarios = [_small_step(small, lasting, tail, plant)]
+    scenarios = list(step_scenarios(controller, plant))
     if step is not None and rest is not None:
         scenarios += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
     scenarios.append(_chirp(controller, small, tail))
@@ -200,6 +213,52 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     return tuple(scenario for scenario in scenarios if scenario.obstacle(plant, plant) is None)
 
 
+def step_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]:
+    """Return the steps by which a plant is judged as its user sees it: small, middling and large.
+
+    With a current limit they are 2, 10 and 50 % of the force that it can hold at rest, and the largest step that does
+    not saturate; without one a fifth to 25 times the dry friction of the design plant, or 100 N where it has none.
+    Where no link moves the force must keep the specification's reference peak with a grace of 10 %, settle, and end at
+    its reference; a moving link gives way, so that there the force goes back to zero and only what every scenario
+    requires is required.
+
+    Raises
+    ------
+    ControlError
+        The controller does not know its design plant.
+
+    """
+    spec = controller.spec
+    tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / spec.bandwidth_hz)
+    peak = spec.max_reference_peak
+    steps: list[Scenario] = []
+    for name, force in _size_steps(controller).items():
+        if plant.moves:
+            phases = (Phase(duration_s=lasting, force_N=force), Phase(duration_s=tail))
+            steps.append(Scenario(name=name, phases=phases))
+            continue
+        settling_s = SETTLING_PERIODS / spec.bandwidth_hz
+        phases = (Phase(duration_s=lasting), Phase(duration_s=max(tail, 2.0 * settling_s), force_N=force))
+        steps.append(Scenario(
+            name=name, phases=phases, final_error=0.02 * force, settling_s=settling_s,
+            max_overshoot=PEAK_GRACE * peak if peak else None,
+        ))  # fmt: skip
+    return tuple(steps)
+
+
+def _size_steps(controller: Controller) -> dict[str, float]:
+    """Return the forces (N) of steps by name."""
+    limit, rest = find_step_limit(controller), controller.force_limit(0.01)
+    if limit is not None and rest is not None:
+        shares = {f"{100 * share:g} % step": share * rest for share in STEP_SHARES}
+        return shares | {"unsaturated step": UNSATURATED * limit}
+    plant, params = _require_design(controller)
+    friction = sum(find_dry_friction(plant, plant.complete(params)).values())
+    if not friction:
+        return {"step": NOMINAL_FORCE_N}
+    return {f"step of {share:g} times the friction": share * friction for share in FRICTION_STEPS}
+
+
 def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
     """Return the names of the default scenarios that are left out because the controller has no current limit."""
     if controller.spec.current_limit_A is not None:
@@ -211,6 +270,9 @@ def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
 def find_step_limit(controller: Controller) -> float | None:
     """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit.
 
+    It is that of the linear loop, where friction slides; a loop that is unstable reaches the limit with every step, and
+    what the limit holds at rest stands for it.
+
     Raises
     ------
     ControlError
@@ -221,8 +283,11 @@ def find_step_limit(controller: Controller) -> float | None:
     plant, params = _require_design(controller)
     if limit is None:
         return None
+    sliding = take_sliding(plant, params)
+    if not controller.close(sliding, params).figures().stable:
+        return controller.force_limit(0.01)
     loop = SampledLoop(
-        plant=plant,
+        plant=sliding,
         law=runnable(controller, current_limit_A=math.inf),
         measured=controller.spec.measured,
         delay_samples=controller.delay_samples,
@@ -283,19 +348,6 @@ def _size_last_phase(controller: Controller, plant: Plant) -> float:
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0
     judged = max(np.clip(SWINGS * slowest, 1.0, LONGEST_S), JUDGED_PERIODS / controller.spec.bandwidth_hz)
     return float(min(judged, LONGEST_SLOW_S))
-
-
-def _small_step(force: float, lasting: float, tail: float, plant: Plant) -> Scenario:
-    if plant.moves:
-        return Scenario(
-            name="small step",
-            phases=(Phase(duration_s=lasting, force_N=force), Phase(duration_s=tail)),
-        )
-    return Scenario(
-        name="small step",
-        phases=(Phase(duration_s=lasting), Phase(duration_s=tail, force_N=force)),
-        final_error=0.02 * force,
-    )
 
 
 def _doublet(force: float, half: float, tail: float) -> Scenario:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -13,6 +13,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run
@@ -42,8 +43,8 @@ class Verification:
     draws : mapping of plant name to tuple of ParameterSet
         Nominal first; `replay` uses them.
     follows_hz : mapping of plant name to (lo, hi) or None
-        Band in which the linear loop's force is within 3 dB of its reference, at nominal parameters. With a swinging
-        link it does not begin at 0 Hz, and a step does not reach its reference.
+        Band in which the linear loop's force is within 3 dB of its reference, at nominal parameters, friction sliding.
+        With a swinging link it does not begin at 0 Hz, and a step does not reach its reference.
 
     """
 
@@ -92,18 +93,33 @@ class Verification:
         ]
 
     def describe_tracking(self) -> list[str]:
-        """Return a line per plant on which slow references are not tracked."""
+        """Return a line per plant whose moving output keeps the force from following slow references."""
         lines: list[str] = []
         for name, band in self.follows_hz.items():
+            if not self.stages[name].plant.moves:
+                continue
             if band is None:
-                lines.append(f"{name} tracks no reference within 3 dB: a step does not reach its reference")
+                lines.append(f"{name} tracks no reference within 3 dB: the swinging output prevents it")
             elif band[0] > 0.0:
-                moves = self.stages[name].plant.moves
-                below = "the swinging output prevents it" if moves else "the force is not within 3 dB of its reference"
                 lines.append(
                     f"{name} tracks references between {band[0]:.3g} and {band[1]:.3g} Hz (within 3 dB); below "
-                    f"that {below}"
+                    "that the swinging output prevents it"
                 )
+        return lines
+
+    def describe_steps(self) -> list[str]:
+        """Return a line per plant on which steps are judged: the worst that its user sees of them."""
+        lines: list[str] = []
+        for plant in self.stages:
+            rows = [row for row in self.rows if row.plant == plant and row.settling_s is not None]
+            if not rows:
+                continue
+            over = max((row.overshoot or 0.0 for row in rows if not row.saturated), default=0.0)
+            slowest = max(row.settling_s or 0.0 for row in rows)
+            sizes = [self.scenario(row).phases[-1].force_N for row in rows]
+            settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
+            size = f"{min(sizes):.3g} to {max(sizes):.3g} N"
+            lines.append(f"steps on {plant}, {size}: overshoot up to {100 * over:.3g} %, {settled}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
@@ -139,7 +155,7 @@ def verify(
     plants: Mapping[str, Plant],
     parameters: ParameterSet,
     *,
-    scenarios: Sequence[Scenario] | None = None,
+    scenarios: Sequence[Scenario] | Callable[[Controller, Plant], Sequence[Scenario]] | None = None,
     draws: Mapping[str, Sequence[ParameterSet]] | None = None,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
@@ -156,8 +172,9 @@ def verify(
         Plants to simulate it on.
     parameters : ParameterSet
         Nominal values; parameters that are left out have the plants' defaults.
-    scenarios : sequence of Scenario, optional
-        The same for every plant; `default_scenarios` of each if left out.
+    scenarios : sequence of Scenario, or callable (controller, plant) -> sequence of Scenario, optional
+        The same for every plant, or what the callable returns, such as `step_scenarios`; `default_scenarios` of each if
+        left out.
     draws : mapping of plant name to sequence of ParameterSet, optional
         Simulated besides the nominal values, such as a certificate's worst draws; conditions among them (phi, delay_s)
         set where those runs start, and how late the loop is (`seaopt.robustness.verification.playback.play`).
@@ -190,7 +207,7 @@ def verify(
     >>> cell = so.Sensors(noise_std={"F1": 1.0})
     >>> verification = verify(controller, {"stand": stand, "swing": swing}, thor, sensors=cell)
     >>> verification.passed, len(verification.rows)
-    (True, 11)
+    (True, 17)
 
     """
     check_plants(plants, draws or {}, partners or {})
@@ -204,11 +221,12 @@ def verify(
     played: dict[str, tuple[Scenario, ...]] = {}
     skipped: list[tuple[str, str, str]] = []
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
+    choose = default_scenarios if scenarios is None or isinstance(scenarios, Sequence) else scenarios
     rows: list[Outcome] = []
     speeds: dict[str, float] = {}
     error = 0.0
     for name, stage in stages.items():
-        chosen = default_scenarios(controller, stage.plant) if scenarios is None else tuple(scenarios)
+        chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant))
         obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
         played[name] = tuple(scenario for scenario, obstacle in obstacles if obstacle is None)
         if scenarios is None:
@@ -228,7 +246,8 @@ def verify(
         passed=bool(rows) and all(row.passed for row in rows), rows=tuple(rows), skipped=tuple(skipped),
         real_time_factor=speeds, error=error, seed=seed, stages=stages, scenarios=played, draws=sets,
         follows_hz={
-            name: controller.close(plant, parameters).figures().tracking_band_hz for name, plant in plants.items()
+            name: controller.close(take_sliding(plant, parameters), parameters).figures().tracking_band_hz
+            for name, plant in plants.items()
         },
     )  # fmt: skip
 
@@ -254,6 +273,8 @@ def _partner(plant: Plant, partner: Plant | None) -> Plant | None:
 def _to_plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
+    if isinstance(value, tuple):
+        return [fault.kind for fault in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -264,8 +285,8 @@ def describe_witness(row: Outcome) -> str:
 
 def _format_worst(verification: Verification) -> list[str]:
     head = (
-        "plant", "scenario", "size", "", "force N", "current A", "angle deg", "energy J", "at limit", "ends off N",
-        "allowed N", "draw",
+        "plant", "scenario", "size", "", "force N", "overshoot", "settles s", "current A", "angle deg", "energy J",
+        "at limit", "ends off N", "allowed N", "draw",
     )  # fmt: skip
     cells: list[tuple[str, ...]] = []
     for row in verification.worst():
@@ -273,6 +294,7 @@ def _format_worst(verification: Verification) -> list[str]:
         scenario = verification.scenario(row)
         cells.append((
             row.plant, row.scenario, scenario.size, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
+            "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %", format_number(row.settling_s, 3, ""),
             *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),
             f"{100 * row.saturated:.3g} %", format_number(row.final_error_N, 3, ""),
             format_number(scenario.final_error, 3, ""), row.draw,

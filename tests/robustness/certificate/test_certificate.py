@@ -89,9 +89,9 @@ def test_a_controller_that_fails_is_named_with_its_witness(controller, swing, th
     certificate = so.certify(controller, {"swing": swing}, thor, ranges={"eta": (0.5, 4.0)}, samples=200)
     assert not certificate.passed
     assert certificate.monte_carlo.failures > 0
-    (broken,) = [item for item in certificate.requirements if not item.met]
-    assert broken.name == "monte_carlo_failures"
-    assert "eta =" in broken.where
+    broken = [item for item in certificate.requirements if not item.met]
+    assert broken[0].name == "monte_carlo_failures"
+    assert all("eta =" in item.where for item in broken)  # the others are steps at that worst draw
     assert "NOT MET" in repr(certificate)
 
 

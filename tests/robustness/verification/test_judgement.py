@@ -59,10 +59,10 @@ def test_a_load_is_no_bound_on_what_is_known(controller, stand, swing, thor):
     ("on_stand", "on_swing"), [((1, 2), (0, 1)), pytest.param((8, 8), (2, 2), marks=pytest.mark.slow)]
 )
 def test_noise_on_a_healthy_loop_is_no_fault(controller, stand, swing, thor, on_stand, on_swing):
-    """60 Hz, and so many seeds of a load cell of 2 N and of 20 N, more than half of the small step."""
+    """60 Hz, and so many seeds of a load cell of 2 N and of 20 N, more than half of the unsaturated step."""
     healthy = so.tune(stand, thor, replace(controller.spec, bandwidth_hz=60), robust_to={"swing": swing})
     for plant, counts in ((stand, on_stand), (swing, on_swing)):
-        scenarios = [chosen(healthy, plant, name) for name in ("small step", "chirp")]
+        scenarios = [chosen(healthy, plant, name) for name in ("unsaturated step", "chirp")]
         for std, seeds in zip((2.0, 20.0), counts, strict=True):
             for seed in range(seeds):
                 cell = so.Sensors(noise_std={"F1": std})
@@ -141,7 +141,7 @@ def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand
     spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(8192))) / 2048.0
     top = int(np.argmax(spectrum))
     assert spectrum[top] > 30.0 and 3.0 < top / 8.192 < 6.0
-    rows = verify(hunter, {"stand": plant}, params, scenarios=[chosen(hunter, plant, "small step"), hold]).rows
+    rows = verify(hunter, {"stand": plant}, params, scenarios=[chosen(hunter, plant, "unsaturated step"), hold]).rows
     assert len(rows) == 2
     for row in rows:
         assert "sustains itself" in row.reason

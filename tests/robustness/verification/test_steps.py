@@ -1,0 +1,86 @@
+"""Steps as a user sees them: overshoot, settling and steady error, against a stick-slip simulator of the tests' own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import TransferFunction
+from seaopt.plants.friction import friction_states
+from seaopt.robustness.verification.scenarios import step_scenarios
+from seaopt.robustness.verification.verification import verify
+from tests.stick_slip import Mass, simulate
+
+SPEC = so.ControllerSpec(
+    bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3, delay_samples=2, current_limit_A=10
+)
+GAINS = {"reference": 1.0, "measurement": 0.2}
+
+
+@pytest.fixture(scope="module")
+def rubbing(thor):
+    return thor.update(k=120e3, m_l=0.9, l=0.005, N_p=1, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, eta=0.86, f_c=25, v_s=0.004)
+
+
+@pytest.fixture(scope="module")
+def blind(stand, rubbing):
+    """Return a law that was tuned where the friction sticks, as if it were a damper."""
+    return replace(so.tune(friction_states(stand)["stuck"], rubbing, SPEC), design=(stand, rubbing))
+
+
+def play_independently(controller, params, steps, jump=False):
+    mass = Mass.of({name: params[name].value for name in params}, jump=jump)
+    reference = np.repeat(np.array(steps)[:, None], 300, axis=1)
+    return simulate([mass] * len(steps), [controller.to_dict()] * len(steps), reference, substeps=20)
+
+
+def test_steps_overshoot_as_the_independent_simulator_says(blind, stand, rubbing):
+    certificate = so.certify(blind, {"stand": stand}, rubbing)
+    rows = {row.scenario: row for row in certificate.steps.rows if not row.saturated}
+    assert set(rows) == {"2 % step", "unsaturated step"}
+    steps = np.array([certificate.steps.scenario(row).phases[-1].force_N for row in rows.values()])
+    expected = play_independently(blind, rubbing, steps).overshoot(steps)
+    assert [row.overshoot for row in rows.values()] == pytest.approx(expected, rel=2e-3)
+    assert play_independently(blind, rubbing, steps, jump=True).overshoot(steps) == pytest.approx(expected, rel=0.02)
+    (over,) = [row for row in certificate.requirements if row.name == "step_overshoot"]
+    assert not over.met and not certificate.passed
+    assert (over.value, over.limit) == pytest.approx((1.0 + np.max(expected), 1.1 * 1.3), rel=2e-3)
+    assert over.where.startswith("stand, unsaturated step") and over.where.endswith("the worst of 2 such runs")
+
+
+def test_where_no_peak_is_asked_for_the_certificate_says_that_none_is_judged(blind, stand, rubbing):
+    lifted = replace(blind, spec=replace(SPEC, max_reference_peak=None))
+    certificate = so.certify(lifted, {"stand": stand}, rubbing)
+    assert not any(row.name == "step_overshoot" for row in certificate.requirements)
+    assert any("overshoot" in note for note in certificate.notes)
+
+
+def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
+    """A proportional law of static gain 1/(1 + 0.2): every step ends a sixth short."""
+    pd = so.tune(stand, rubbing.update(f_c=0.0), replace(SPEC, current_limit_A=None, max_reference_peak=None))
+    laws = {name: TransferFunction(num=np.array([gain]), den=np.array([1.0])) for name, gain in GAINS.items()}
+    short = replace(pd, **laws, design=(stand, rubbing))
+    found = verify(short, {"stand": stand}, rubbing, scenarios=step_scenarios)
+    steps = [found.scenario(row).phases[-1].force_N for row in found.rows]
+    assert steps == pytest.approx([5.0, 25.0, 125.0, 625.0])  # times the friction, without a current limit
+    for row, step in zip(found.rows, steps, strict=True):
+        faults = {fault.kind: fault for fault in row.faults}
+        assert {"settling", "steady error"} <= set(faults)
+        assert faults["steady error"].value == pytest.approx(step / 6.0, rel=0.02)
+        assert faults["settling"].value == np.inf
+
+
+@pytest.mark.parametrize(("factor", "late"), [(40.0, 0), (1.0, 30)])
+def test_a_run_away_is_told_once_and_allows_nothing_absurd(blind, stand, rubbing, factor, late):
+    laws = {
+        name: TransferFunction(num=factor * getattr(blind, name).num, den=getattr(blind, name).den)
+        for name in ("reference", "measurement")
+    }
+    certificate = so.certify(replace(blind, **laws, delay_samples=2 + late), {"stand": stand}, rubbing)
+    (told,) = [row for row in certificate.requirements if row.name == "simulation_failures"]
+    assert (told.value, "unstable" in told.where) == (4.0, True)
+    sizes = [step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]]
+    assert min(sizes) > 1.0
