@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
@@ -201,7 +203,9 @@ class Session:
                 )
 
     def _write(self, stage: str, content: dict[str, Any]) -> None:
-        """Write a result with the digests of what it was made from, and of itself."""
+        """Write a result with the digests of what it was made from, and of itself, and with what made it."""
+        versions = {"seaopt": __version__, "python": platform.python_version(), "machine": platform.machine()}
+        content = content | {"provenance": content.get("provenance", {}) | versions}
         made_from = digest_sources(self.problem, stage, self.folder) | {"content": digest_content(content)}
         self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": made_from}))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -145,7 +146,7 @@ def _with_slope(plant: Plant, state: str) -> Plant:
         )
 
     def follow(maker: PlantMaker | None) -> PlantMaker | None:
-        return None if maker is None else lambda: friction_states(maker())[state]
+        return None if maker is None else partial(_make_with_slope, maker, state)
 
     def port(one: Port) -> Port:
         return replace(one, held=follow(one.held), probe=follow(one.probe))
@@ -154,6 +155,10 @@ def _with_slope(plant: Plant, state: str) -> Plant:
         plant, name=f"{plant.name} {state}", ports=tuple(port(one) for one in plant.ports),
         friction={name: viscous(friction) for name, friction in plant.friction.items()},
     )  # fmt: skip
+
+
+def _make_with_slope(maker: PlantMaker, state: str) -> Plant:
+    return friction_states(maker())[state]
 
 
 @memo

@@ -249,6 +249,13 @@ def wrapped(
     return plant
 
 
+def _make_filtered(make: Callable[[], Plant], part: str, signals: Sequence[str]) -> Plant:
+    """Return what `make` makes, with one filter on each of the named signals that it has."""
+    inner = make()
+    known = inner.inputs if _FILTERS[part][2] == "input" else inner.outputs
+    return _add_filter(inner, part, [signal for signal in signals if signal in known])
+
+
 def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
     """Return a plant with one filter on each of the named inputs or outputs."""
     law, parameter, where, order = _FILTERS[part]
@@ -277,14 +284,9 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
             rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
         return inner_u, dict(out), rates
 
-    def make_filtered(make: Callable[[], Plant]) -> Plant:
-        inner = make()
-        known = inner.inputs if where == "input" else inner.outputs
-        return _add_filter(inner, part, [signal for signal in signals if signal in known])
-
     def port_behind(port: Port) -> Port:
         makers = {"held": port.held, "probe": port.probe}
-        behind = {name: partial(make_filtered, make) for name, make in makers.items() if make is not None}
+        behind = {name: partial(_make_filtered, make, part, signals) for name, make in makers.items() if make}
         return replace(port, **behind)
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:

@@ -22,6 +22,7 @@ from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
 from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring
+from seaopt.plants.stored_equations import store_plant
 from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
@@ -238,6 +239,15 @@ class Plant:
             name=self.name,
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore_plant, (store_plant(self),)
+
+    def __copy__(self) -> Plant:
+        return self  # nothing of a plant changes
+
+    def __deepcopy__(self, memory: dict[int, Any]) -> Plant:
+        return self
+
     def __repr__(self) -> str:
         def format_names(units: Mapping[str, Any]) -> str:
             return ", ".join(f"{name} [{unit if isinstance(unit, str) else unit.unit}]" for name, unit in units.items())
@@ -248,6 +258,10 @@ class Plant:
         )
 
     _repr_html_ = html_text
+
+
+def _restore_plant(content: Mapping[str, Any]) -> Plant:
+    return Plant(**content)
 
 
 @final

@@ -71,6 +71,17 @@ class Model:
         """Number of free parameters."""
         return len(self.free)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        known = [str(symbol) for symbol in ca.vertsplit(self.p)]
+        stored = ca.Function("model", [self.t, self.x, self.u, self.p], [self.f, self.h])
+        return _restore_model, (self.plant, self.free, self.outputs, known, self.constants, stored, self.linear)
+
+    def __copy__(self) -> Model:
+        return self  # nothing of a model changes
+
+    def __deepcopy__(self, memory: dict[int, Any]) -> Model:
+        return self
+
     def parameters(self, theta: Float[np.ndarray, " np"]) -> Float[np.ndarray, " m"]:
         """Return the values of `p`."""
         return np.concatenate([theta, self.constants])
@@ -136,6 +147,22 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
         plant=plant, free=names, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta,
         p=ca.vertcat(theta, *known), constants=np.zeros(len(known)),
         f=f, h=h, linear=_is_linear(f, h, plant.t, plant.x, u),
+    )  # fmt: skip
+
+
+def _restore_model(
+    plant: Plant, free: tuple[str, ...], outputs: tuple[str, ...], known: list[str],
+    constants: Float[np.ndarray, " nc"], stored: Any, linear: bool,
+) -> Model:  # fmt: skip
+    """Return a pickled model, in its plant's symbols."""
+    symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
+    theta = ca.vertcat(*(symbols[name] for name in free)) if free else ca.SX(0, 1)
+    u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
+    p = ca.vertcat(theta, *(symbols[name] for name in known[len(free) :]))
+    f, h = stored(plant.t, plant.x, u, p)
+    return Model(
+        plant=plant, free=free, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta, p=p, constants=constants,
+        f=f, h=h, linear=linear,
     )  # fmt: skip
 
 

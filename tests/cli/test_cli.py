@@ -28,7 +28,7 @@ def test_run_leaves_everything(done):
     fit = json.loads((done.results / "fit.json").read_text(encoding="utf-8"))
     assert fit["schema"] == "seaopt/fit/1"
     assert fit["status"] == "converged"
-    for field in ("cost", "iterations", "samples", "wall_s", "derived", "covariance", "outputs", "identifiability"):
+    for field in ("cost", "iterations", "samples", "provenance", "derived", "covariance", "outputs", "identifiability"):
         assert field in fit
     assert set(fit["outputs"]["chirp"]["F1"]) >= {
         "fit_percent",

@@ -210,3 +210,17 @@ def test_feasible_is_found_out_again(write, tuned):
     controller = Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.05")), folder).controller()
     assert not controller.feasible
     assert "max_sensitivity (design plant)" in controller.active_constraints
+
+
+def test_a_fit_made_again_from_the_same_file_keeps_its_controller(write, tmp_path, monkeypatch):
+    """How long a fit took, and on what, is part of no digest."""
+    path = write(BENCH + '[controller]\nplant = "stand"\nbandwidth_hz = 30\n')
+    Session(path, tmp_path).run("fit")
+    Session(path, tmp_path).run("tune")
+    before = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
+    monkeypatch.setattr("platform.python_version", lambda: "4.0")
+    Session(path, tmp_path).run("fit")
+    after = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
+    assert after["provenance"] != before["provenance"] and after["provenance"]["python"] == "4.0"
+    assert after["made_from"] == before["made_from"] and "wall_s" not in after
+    Session(path, tmp_path).controller()  # is not refused

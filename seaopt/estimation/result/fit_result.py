@@ -184,7 +184,6 @@ class Fit:
             "cost": self.cost,
             "iterations": self.iterations,
             "samples": self.samples,
-            "wall_s": self.wall_s,
             "parameters": {name: _parameter_dict(one) for name, one in self.parameters.items()},
             "derived": {
                 name: {"value": figure.value, "unit": figure.unit, "std": figure.std, "ci95": list(figure.ci95)}
@@ -212,6 +211,7 @@ class Fit:
             "aic": self.aic,
             "bic": self.bic,
             "notes": list(self.notes),
+            "provenance": {"wall_s": self.wall_s},
         }
 
     @classmethod

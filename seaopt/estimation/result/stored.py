@@ -141,6 +141,12 @@ class StoredIdentifiability(ResultTable):
         )  # fmt: skip
 
 
+class StoredProvenance(ResultTable):
+    """What a fit's provenance says of it; the rest is of the machine."""
+
+    wall_s: Number
+
+
 class StoredFit(ResultTable):
     """A fit.json."""
 
@@ -156,7 +162,7 @@ class StoredFit(ResultTable):
     cost: NullIsInfinite
     iterations: Whole
     samples: Whole
-    wall_s: Number
+    provenance: StoredProvenance
     step_error_sigma: NullIsInfinite = 0.0
     step_error_parameter: NullIsInfinite = 0.0
     log_likelihood: NullIsNaN = math.nan
@@ -184,10 +190,11 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
         )
     white = covariance if stored.white_covariance is None else stored.white_covariance.restore("white_covariance")
     kept = (
-        "status", "message", "cost", "iterations", "samples", "wall_s", "step_error_sigma", "step_error_parameter",
+        "status", "message", "cost", "iterations", "samples", "step_error_sigma", "step_error_parameter",
         "log_likelihood", "unknowns", "method",
     )  # fmt: skip
     return {name: getattr(stored, name) for name in kept} | {
+        "wall_s": stored.provenance.wall_s,
         "parameters": parameters,
         "covariance": covariance,
         "white_covariance": white,

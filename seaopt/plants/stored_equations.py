@@ -1,0 +1,156 @@
+"""Plants that pickle, whatever functions their equations are: each function is stored as a CasADi function.
+
+Python pickles no lambda and no function inside another one, which is what equations are written as. What they return
+is symbolic, though, and CasADi stores that: a pickled plant has, in the place of each of its functions, a
+`StoredFunction` that holds the expressions. It takes symbols or numbers as the function did, so that the plant works
+on as before, in another process too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
+from functools import partial
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+
+from seaopt.plants.roles import Friction, Port
+from seaopt.records import record
+
+if TYPE_CHECKING:
+    from seaopt.plants.plant import Plant
+
+
+@record(eq=False)
+class StoredFunction:
+    """A function of namespaces (or of scalars), as the expressions that it returned for symbols.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Of the symbols that the expressions depend on.
+    places : tuple of (int, str or None)
+        Where each of them comes from: which argument, and which of its attributes (None: the argument itself).
+    layout : mapping, tuple, str or int
+        What is returned; a whole number stands for that output of the function.
+
+    """
+
+    function: Any
+    places: tuple[tuple[int, str | None], ...]
+    layout: Any
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return what the stored function returned, at these arguments."""
+        values = [
+            arguments[index] if name is None else getattr(arguments[index], name) for index, name in self.places
+        ]
+        return _arrange(self.layout, self.function.call(values))
+
+
+def store_function(function: Callable[..., Any], *arguments: Iterable[str] | str) -> StoredFunction:
+    """Return a function as its expressions.
+
+    Parameters
+    ----------
+    function : callable
+        Returns expressions, alone or in mappings and tuples (with texts among them).
+    *arguments : names, or one name
+        The attributes of each argument; a single text stands for an argument that is one symbol.
+
+    Examples
+    --------
+    >>> import pickle
+    >>> stored = store_function(lambda x, p: {"v": p.k * x.q}, ["q", "v"], ["k"])
+    >>> again = pickle.loads(pickle.dumps(stored))
+    >>> float(again(SimpleNamespace(q=2.0, v=0.0), SimpleNamespace(k=3.0))["v"])
+    6.0
+
+    """
+    symbols: dict[tuple[int, str | None], Any] = {}
+    given: list[Any] = []
+    for index, names in enumerate(arguments):
+        if isinstance(names, str):
+            symbols[index, None] = ca.SX.sym(names)
+            given.append(symbols[index, None])
+        else:
+            own = {name: ca.SX.sym(name) for name in names}
+            symbols |= {(index, name): symbol for name, symbol in own.items()}
+            given.append(SimpleNamespace(**own))
+    leaves: list[Any] = []
+    layout = _take_leaves(function(*given), leaves)
+    # What the expressions do not depend on need not be there when they are evaluated.
+    used = {place: symbol for place, symbol in symbols.items() if any(ca.depends_on(leaf, symbol) for leaf in leaves)}
+    return StoredFunction(
+        function=ca.Function("stored", list(used.values()), leaves), places=tuple(used), layout=layout
+    )
+
+
+def _take_leaves(result: Any, leaves: list[Any]) -> Any:
+    """Return the layout of a result; its expressions are added to `leaves`."""
+    if isinstance(result, Mapping):
+        return {name: _take_leaves(part, leaves) for name, part in result.items()}
+    if isinstance(result, tuple):
+        return tuple(_take_leaves(part, leaves) for part in result)
+    if isinstance(result, str):
+        return result
+    leaves.append(ca.SX(result))
+    return len(leaves) - 1
+
+
+def _arrange(layout: Any, leaves: list[Any]) -> Any:
+    if isinstance(layout, dict):
+        return {name: _arrange(part, leaves) for name, part in layout.items()}
+    if isinstance(layout, tuple):
+        return tuple(_arrange(part, leaves) for part in layout)
+    return layout if isinstance(layout, str) else leaves[layout]
+
+
+def store_plant(plant: Plant) -> dict[str, Any]:
+    """Return what a plant is made of, with every function of its own as a `StoredFunction`."""
+    x, p = tuple(plant.states), tuple(plant.parameters)
+    u = (*plant.inputs, *plant.friction)
+    content = {field.name: getattr(plant, field.name) for field in fields(plant) if field.init}
+
+    def store(function: Callable[..., Any] | None, *arguments: Iterable[str] | str) -> Any:
+        return function if function is None or _has_name(function) else store_function(function, *arguments)
+
+    def store_friction(one: Friction) -> Friction:
+        return replace(
+            one, velocity=store(one.velocity, x, p), force=store(one.force, "velocity", p),
+            effort=store(one.effort, p), slopes=store(one.slopes, p),
+        )  # fmt: skip
+
+    def store_port(one: Port) -> Port:
+        return replace(one, ratio=store(one.ratio, p), held=_store_maker(one.held), probe=_store_maker(one.probe))
+
+    content |= {name: store(getattr(plant, name), "t", x, u, p) for name in ("f", "h")}
+    content |= {"derived": store(plant.derived, p), "energy": store(plant.energy, x, p)}
+    if plant.actuation is not None:
+        content["actuation"] = replace(plant.actuation, effort=store(plant.actuation.effort, p))
+    if plant.spring is not None:
+        content["spring"] = replace(plant.spring, deflection=store(plant.spring.deflection, x, p))
+    content["ports"] = tuple(store_port(one) for one in plant.ports)
+    content["friction"] = {name: store_friction(one) for name, one in plant.friction.items()}
+    return content
+
+
+def _has_name(function: Any) -> bool:
+    """Tell whether a function pickles as it is: by the name of its package's module, or as what it is made of."""
+    if isinstance(function, StoredFunction):
+        return True
+    if isinstance(function, partial):
+        inner = [function.func, *(argument for argument in function.args if callable(argument))]
+        return all(map(_has_name, inner))
+    # A function of the user's script may not be there under its name in another process.
+    return "<" not in getattr(function, "__qualname__", "<") and function.__module__.startswith("seaopt.")
+
+
+def _store_maker(maker: Callable[[], Any] | None) -> Callable[[], Any] | None:
+    return maker if maker is None or _has_name(maker) else partial(_give_back, maker())
+
+
+def _give_back(plant: Any) -> Any:
+    return plant
