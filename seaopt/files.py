@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +24,26 @@ def write_bytes(path: Path | str, content: bytes) -> Path:
 
     """
     target = Path(path)
-    name = None
+    temporary = target.with_name(f".seaopt-{secrets.token_hex(8)}")
+    made = False
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+        # The system takes the umask off the mode; asking for it would change it for other threads.
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        made = True
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)  # noqa: PTH101
-        os.replace(name, target)  # noqa: PTH105
-    except OSError as error:
-        if name is not None:
-            Path(name).unlink(missing_ok=True)
-        raise FileError(f"{target}: cannot be written ({error.strerror}); choose another folder") from error
+        temporary.replace(target)
+    except (OSError, ValueError) as error:
+        if made:
+            temporary.unlink(missing_ok=True)
+        raise FileError(f"{target}: cannot be written ({describe_os_error(error)}); choose another folder") from error
     return target
+
+
+def describe_os_error(error: OSError | ValueError) -> str:
+    """Return why a file cannot be opened; a ValueError is a path that no system can have."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def write_text(path: Path | str, content: str) -> Path:

@@ -67,7 +67,9 @@ def test_a_pickled_plant_keeps_its_roles():
 def test_a_plant_of_lambdas_works_in_another_process(tmp_path):
     file = tmp_path / "plant.pickle"
     file.write_bytes(pickle.dumps(PLANTS["of the user"]()))
-    code = f"import pickle; p = pickle.load(open({str(file)!r}, 'rb')); print(p.linearize(p.defaults).poles().real.min())"
+    code = (
+        f"import pickle; p = pickle.load(open({str(file)!r}, 'rb')); print(p.linearize(p.defaults).poles().real.min())"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert float(done.stdout) == pytest.approx(-0.5)
 

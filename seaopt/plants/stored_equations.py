@@ -44,9 +44,7 @@ class StoredFunction:
 
     def __call__(self, *arguments: Any) -> Any:
         """Return what the stored function returned, at these arguments."""
-        values = [
-            arguments[index] if name is None else getattr(arguments[index], name) for index, name in self.places
-        ]
+        values = [arguments[index] if name is None else getattr(arguments[index], name) for index, name in self.places]
         return _arrange(self.layout, self.function.call(values))
 
 

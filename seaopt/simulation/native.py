@@ -3,8 +3,10 @@
 A kernel is one C function ``int f(const jobs *, long count)`` that does independent jobs one after the other.
 `load_kernel` compiles it once per user and source; `Kernel.run` shares the jobs among threads.
 
-The shared libraries live in a folder of the user's own (mode 0700, refused if anyone else can write to it) under
-the hash of their source, flags and compiler. ``SEAOPT_COMPILER`` names a compiler, or "none" to use none;
+The shared libraries live in a folder of the user's own (mode 0700, refused if anyone else can write to it, or if it is
+a link) under the hash of their source, flags and compiler. A file with the hash of the library itself stands beside
+each: Python would die of a library that was cut off, so one that does not match is compiled again. A compiler that
+does not end within a minute is not asked again for a day. ``SEAOPT_COMPILER`` names a compiler, or "none" to use none;
 ``SEAOPT_CACHE_DIR`` names the folder.
 
 Threads write to arrays by address, which nothing but this module keeps alive. An interrupt (Ctrl-C) reaches the main
@@ -21,14 +23,17 @@ import os
 import platform
 import re
 import shutil
+import signal
 import stat
 import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from functools import lru_cache
+from contextlib import suppress
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,6 +45,10 @@ from jaxtyping import Int, Shaped
 from seaopt.records import record
 
 THREAD_NAME = "seaopt-native"
+COMPILER_S = 60.0  # that a compiler gets for one library
+HUNG_S = 86_400.0  # for which one that took longer is not asked again
+ORPHAN_S = 3_600.0  # after which a folder of the compiler's has nobody who waits for it
+BUILD = "build-"  # begins the names of those folders
 FLAGS = ("-O3", "-std=gnu99", "-fPIC", "-shared", "-fno-math-errno", "-fvisibility=hidden")
 NATIVE = (
     "-march=native",
@@ -70,10 +79,13 @@ def cache_folder() -> Path | None:
 
     base = os.environ.get("SEAOPT_CACHE_DIR")
     folder = (Path(base) if base else user_cache_path("seaopt")) / "kernels"
+    if folder.is_symlink():  # before its mode is touched, which is that of whatever it leads to
+        return None
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        folder.chmod(0o700)
-    except OSError:
+        if folder.lstat().st_uid == os.getuid():
+            folder.chmod(0o700)
+    except (OSError, ValueError):
         return None
     return folder if _is_private(folder) else None
 
@@ -96,18 +108,25 @@ def load_library(source: str) -> ctypes.CDLL | None:
         return None
     key = hashlib.sha256("\0".join((source, *FLAGS, *compiler, sys.platform, _processor())).encode()).hexdigest()
     library = folder / f"{key}.so"
-    if not library.exists() and not _compile(compiler, source, library):
-        return None
-    if not _is_private(library):
-        return None
+    for ready in (_is_whole, partial(_compile, compiler, source)):
+        if ready(library) and _is_private(library):
+            try:
+                return ctypes.CDLL(str(library))
+            except OSError:  # built for another machine that shares this folder
+                continue
+    return None
+
+
+def _is_whole(library: Path) -> bool:
+    """Tell whether a library is the one that was compiled: the hash beside it is its own."""
     try:
-        return ctypes.CDLL(str(library))
-    except OSError:  # built for another machine that shares this folder
-        pass
-    try:
-        return ctypes.CDLL(str(library)) if _compile(compiler, source, library) else None
-    except OSError:
-        return None
+        return _hash_beside(library).read_text(encoding="ascii") == hashlib.sha256(library.read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return False
+
+
+def _hash_beside(library: Path) -> Path:
+    return library.with_suffix(".sha256")
 
 
 @lru_cache(maxsize=1)
@@ -121,23 +140,77 @@ def _processor() -> str:
 
 
 def _compile(compiler: list[str], source: str, library: Path) -> bool:
-    return any(_run_compiler([*compiler, *FLAGS, *extra], source, library) for extra in (NATIVE, ()))
+    """Compile a source to a library with its hash beside it; whatever goes wrong, there is none, and it is False."""
+    hung = _hung_marker(compiler, library.parent)
+    try:
+        if time.time() - hung.lstat().st_mtime < HUNG_S:
+            return False
+    except OSError:  # it never hung
+        pass
+    _sweep(library.parent)
+    try:
+        return any(_run_compiler([*compiler, *FLAGS, *extra], source, library) for extra in (NATIVE, ()))
+    except subprocess.TimeoutExpired:
+        with suppress(OSError):
+            hung.touch()
+    except OSError:  # no room on the disk, among others
+        pass
+    return False
+
+
+def _hung_marker(compiler: list[str], folder: Path) -> Path:
+    """Return the file that is there if a compiler hung; another build of the compiler has another one."""
+    try:
+        build = str(os.stat(compiler[0]).st_mtime_ns)  # noqa: PTH116
+    except OSError:
+        build = ""
+    return folder / f"{hashlib.sha256(chr(0).join((*compiler, build)).encode()).hexdigest()}.hung"
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what compilers that were killed have left behind."""
+    with suppress(OSError):
+        for left in [*folder.glob(f"{BUILD}*"), *folder.glob("tmp*")]:
+            if time.time() - left.lstat().st_mtime > ORPHAN_S:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def _run_compiler(command: list[str], source: str, library: Path) -> bool:
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        code, built = Path(folder) / "kernel.c", Path(folder) / "kernel.so"
+    """Compile a source, and move the library into its place once all of it is on the disk.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written, or the compiler not started.
+    subprocess.TimeoutExpired
+        The compiler hangs; it is killed with all that it started.
+
+    """
+    with tempfile.TemporaryDirectory(dir=library.parent, prefix=BUILD, ignore_cleanup_errors=True) as folder:
+        code, built, beside = (Path(folder) / name for name in ("kernel.c", "kernel.so", "kernel.sha256"))
         code.write_text(source, encoding="utf-8")
-        arguments = [*command, str(code), "-o", str(built), "-lm"]
-        try:
-            process = subprocess.run(arguments, capture_output=True, timeout=120, check=False)  # noqa: S603
-        except (OSError, subprocess.SubprocessError):
+        _wait_for([*command, str(code), "-o", str(built), "-lm"])
+        if not built.exists():
             return False
-        if process.returncode or not built.exists():
-            return False
-        built.chmod(0o700)
-        built.replace(library)
+        beside.write_text(hashlib.sha256(built.read_bytes()).hexdigest(), encoding="ascii")
+        for file, target in ((built, library), (beside, _hash_beside(library))):
+            file.chmod(0o700)
+            with file.open("rb+") as stream:
+                os.fsync(stream.fileno())
+            file.replace(target)
     return True
+
+
+def _wait_for(command: list[str]) -> None:
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
+    try:
+        process.wait(COMPILER_S)
+    except BaseException:
+        with suppress(OSError):
+            os.killpg(process.pid, signal.SIGKILL)  # a compiler's driver starts others
+        process.wait()
+        raise
 
 
 def define_constants(constants: Mapping[str, int]) -> str:

@@ -164,3 +164,133 @@ def test_the_kernel_folder_is_private(tmp_path, monkeypatch):
     (tmp_path / "linked" / "kernels").symlink_to(elsewhere)
     monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path / "linked"))
     assert native.cache_folder() is None
+
+
+def test_a_linked_kernel_folder_is_refused_before_its_mode_is_touched(tmp_path, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    elsewhere.chmod(0o755)
+    (tmp_path / "kernels").symlink_to(elsewhere)
+    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path))
+    assert native.cache_folder() is None
+    assert elsewhere.stat().st_mode & 0o777 == 0o755
+
+
+ANSWER = '__attribute__((visibility("default"))) int answer(const void *jobs, long count) { return 42; } /* %s */'
+
+
+@pytest.fixture
+def kernels(tmp_path, monkeypatch):
+    """Return an empty folder for kernels."""
+    monkeypatch.setenv("SEAOPT_CACHE_DIR", str(tmp_path))
+    native.load_library.cache_clear()
+    yield native.cache_folder()
+    native.load_library.cache_clear()
+
+
+@pytest.fixture
+def make_compiler(tmp_path, monkeypatch):
+    """Return what puts a shell script in the place of the compiler."""
+
+    def make(script):
+        compiler = tmp_path / "compiler"
+        compiler.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
+        compiler.chmod(0o700)
+        monkeypatch.setenv("SEAOPT_COMPILER", str(compiler))
+
+    return make
+
+
+def damage_nothing(library):
+    pass
+
+
+def cut(library):
+    library.write_bytes(library.read_bytes()[:5000])
+
+
+def empty(library):
+    library.write_bytes(b"")
+
+
+def flip(library):
+    content = bytearray(library.read_bytes())
+    content[len(content) // 2] ^= 1
+    library.write_bytes(content)
+
+
+def lose_hash(library):
+    library.with_suffix(".sha256").unlink()
+
+
+LOAD = """
+from seaopt.simulation import native
+library = native.load_library({source!r})
+print(library.answer(None, 0))
+"""
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", [damage_nothing, cut, empty, flip, lose_hash])
+def test_a_damaged_kernel_is_compiled_again(kernels, damage):
+    """Loading a library that was cut off ends Python with SIGBUS, in every run from then on: so in a process apart."""
+    source = ANSWER % damage.__name__
+    assert native.load_library(source) is not None
+    (library,) = kernels.glob("*.so")
+    copy = library.with_name("copy")  # this process has the library itself mapped
+    copy.write_bytes(library.read_bytes())
+    copy.chmod(0o700)
+    copy.replace(library)
+    inode = library.stat().st_ino
+    damage(library)
+    process = subprocess.run(
+        [sys.executable, "-c", LOAD.format(source=source)], capture_output=True, text=True, check=False
+    )
+    assert (process.returncode, process.stdout) == (0, "42\n"), process.stderr
+    assert native._is_whole(library)
+    assert (library.stat().st_ino == inode) == (damage is damage_nothing)
+
+
+def test_a_compiler_that_hangs_is_asked_once(kernels, make_compiler, monkeypatch, tmp_path):
+    """It and what it started are killed; the next process does not wait again."""
+    make_compiler(f'echo asked >> "{tmp_path}/asked"; sleep 30 & wait')
+    monkeypatch.setattr(native, "COMPILER_S", 0.3)
+    begin = time.monotonic()
+    assert native.load_library(ANSWER % "hangs") is None
+    native.load_library.cache_clear()
+    assert native.load_library(ANSWER % "hangs") is None
+    assert native.load_library(ANSWER % "hangs with another source") is None
+    assert time.monotonic() - begin < 5.0
+    assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == 1
+    assert not list(kernels.glob(f"{native.BUILD}*"))
+    (marker,) = kernels.glob("*.hung")
+    os.utime(marker, (1.0, 1.0))
+    assert native.load_library(ANSWER % "another day") is None
+    assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == 2
+
+
+def test_a_compiler_that_fails_leaves_nothing(kernels, make_compiler):
+    make_compiler("exit 1")
+    assert native.load_library(ANSWER % "fails") is None
+    assert not list(kernels.iterdir())
+
+
+@needs_compiler
+def test_what_killed_compilers_left_is_swept(kernels):
+    old, new = kernels / "build-old", kernels / "build-new"
+    for left in (old, new):
+        left.mkdir()
+        (left / "kernel.c").write_text("int x;", encoding="utf-8")
+    os.utime(old, (1.0, 1.0))
+    assert native.load_library(ANSWER % "sweeps") is not None
+    assert not old.exists() and new.exists()
+
+
+@needs_compiler
+def test_a_full_disk_under_the_kernels_is_as_no_compiler(kernels, monkeypatch):
+    def refuse(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(native.os, "fsync", refuse)
+    assert native.load_library(ANSWER % "full disk") is None
+    assert not list(kernels.glob("*.so"))

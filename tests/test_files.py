@@ -1,0 +1,36 @@
+"""Files that are whole or absent: their mode, their names, and what is said where they cannot be written."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+import pytest
+
+from seaopt.errors import FileError
+from seaopt.files import write_bytes
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_a_file_gets_the_mode_of_the_umask_which_nobody_changes(tmp_path, umask, monkeypatch):
+    before = os.umask(umask)
+    try:
+        with monkeypatch.context() as context:
+            context.setattr(os, "umask", lambda mask: pytest.fail("the umask is that of all threads"))
+            path = write_bytes(tmp_path / "fit.json", b"{}")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
+    assert path.read_bytes() == b"{}" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_name_as_long_as_the_system_allows_is_written(tmp_path):
+    assert write_bytes(tmp_path / ("n" * 255), b"x").read_bytes() == b"x"
+
+
+@pytest.mark.parametrize("name", ["n" * 256, "a\0b", "below/file"])
+def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path, name):
+    (tmp_path / "below").write_bytes(b"")
+    with pytest.raises(FileError, match="cannot be written"):
+        write_bytes(tmp_path / name, b"x")
+    assert [path.name for path in tmp_path.iterdir()] == ["below"]
