@@ -110,10 +110,32 @@ def test_what_the_tuner_and_the_certificate_claim(stand, swing, thor, structure,
     for name, plant, scratch in (("stand", stand, design), ("swing", swing, moving)):
         scratch.check(certificate.plants[name])
         worst = certificate.worst[name]
-        again = Scratch(controller, plant, thor.update(**worst.parameters))
-        assert worst.ms == pytest.approx(np.abs(again.s).max(), rel=2e-4)
-        assert worst.mt == pytest.approx(np.abs(again.loop * again.s).max(), rel=2e-4)
+        for witness in (worst.witness, *worst.largest):
+            again = Scratch(controller, plant, thor.update(**witness.parameters))
+            assert witness.ms == pytest.approx(np.abs(again.s).max(), rel=2e-4)
+            assert witness.mt == pytest.approx(np.abs(again.loop * again.s).max(), rel=2e-4)
     if controller.feasible:
         assert max(np.abs(design.s).max(), np.abs(moving.s).max()) <= 1.6
         assert np.abs(design.cy * design.s).max() <= 60
         assert design.t.max() / design.t[0] <= 1.3
+
+
+def test_the_worst_mt_is_not_that_of_the_plant_with_the_worst_ms(stand, swing, thor):
+    """A light motor has the largest Ms, a heavy one the largest Mt: against a grid of plants, each from scratch."""
+    spec = so.ControllerSpec(bandwidth_hz=40, max_sensitivity=1.7, max_noise_gain=60)
+    controller = so.tune(stand, thor, spec, robust_to={"swing": swing})
+    ranges = {"J": (1.5e-6, 6e-6), "eta": (0.4, 1.6)}
+    certificate = so.certify(controller, {"stand": stand}, thor, ranges=ranges, samples=50)
+    worst = certificate.worst["stand"]
+    peaks = []
+    for inertia, efficiency in itertools.product(np.linspace(*ranges["J"], 4), np.linspace(*ranges["eta"], 4)):
+        loop = Scratch(controller, stand, thor.update(J=inertia, eta=efficiency))
+        peaks.append((np.abs(loop.s).max(), np.abs(loop.loop * loop.s).max()))
+    ms, mt = np.max(peaks, axis=0)
+    assert ms * (1 - 1e-4) <= worst.ms <= ms * 1.02
+    assert mt * (1 - 1e-4) <= worst.mt <= mt * 1.02
+    assert worst.witness.mt < worst.mt
+    stored = certificate.to_dict()["plants"]["stand"]["worst"]["largest"]["mt"]
+    again = Scratch(controller, stand, thor.update(**stored["parameters"]))
+    assert stored["value"] == pytest.approx(np.abs(again.loop * again.s).max(), rel=2e-4)
+    assert "largest Mt at" in repr(certificate)

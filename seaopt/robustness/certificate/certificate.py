@@ -39,7 +39,7 @@ from seaopt.robustness.certificate.simulated import (
 )
 from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
-from seaopt.robustness.uncertainty.worst import Worst, measure_worst
+from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
 from seaopt.robustness.verification.verification import Verification
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
@@ -339,7 +339,9 @@ class Certificate:
                 plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
                 margins={name: plant_margins(controller, plant, parameters) for name, plant in linear.items()},
                 worst={
-                    name: measure_worst(controller, plant, parameters, stored.plants[name].worst.parameters)
+                    name: combine_worst(
+                        [measure_worst(controller, plant, parameters, at) for at in stored.plants[name].worst.cases]
+                    )
                     for name, plant in linear.items()
                 },
                 monte_carlo=MonteCarlo(**stored.monte_carlo.model_dump()),
@@ -369,7 +371,7 @@ class Certificate:
             "plants": {
                 name: {key: getattr(figures, key) for key in _REPORTED}
                 | self.margins[name].to_dict()
-                | {"worst": _list_fields(self.worst[name].witness) | self._bounds(name)}
+                | {"worst": self._worst_dict(name)}
                 for name, figures in self.plants.items()
             },
             "friction": {
@@ -407,8 +409,15 @@ class Certificate:
         lifted = () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
 
-    def _bounds(self, name: str) -> dict[str, Any]:
-        return self.brackets[name].to_dict() if name in self.brackets else {}
+    def _worst_dict(self, name: str) -> dict[str, Any]:
+        """Return the worst case, the largest Ms and Mt with their parameters, and bounds where there are any."""
+        worst = self.worst[name]
+        ms, mt = worst.largest
+        largest = {
+            "ms": {"value": ms.ms, "parameters": ms.parameters}, "mt": {"value": mt.mt, "parameters": mt.parameters}
+        }  # fmt: skip
+        bounds = self.brackets[name].to_dict() if name in self.brackets else {}
+        return _list_fields(worst.witness) | {"largest": largest} | bounds
 
     def __repr__(self) -> str:
         lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]
@@ -439,7 +448,7 @@ class Certificate:
                 + f", disk margin {figures.disk_margin:.3g}"
             )
         if worst.parameters:
-            lines.append(f"    worst case at {format_values(worst.parameters)}")
+            lines.append(f"    worst case at {_format_place(worst)}")
         if name in self.brackets:
             lines.append(f"    {self.brackets[name].statement}")
         return lines
@@ -454,6 +463,12 @@ def _require_runs(runs: Verification | str) -> tuple[Requirement, ...]:
 
 def _format_signed(value: float | None) -> str:
     return "none" if value is None else f"{value:+.4g}"
+
+
+def _format_place(worst: Worst) -> str:
+    """Return the parameters of the worst case, and those of the largest Ms or Mt where they are others."""
+    others = (f"; largest {name} at {format_values(one.parameters)}" for name, one in worst.elsewhere.items())
+    return format_values(worst.parameters) + "".join(others)
 
 
 def _format_confidence(value: float) -> str:
@@ -510,5 +525,5 @@ def _format_plant(certificate: Certificate, name: str) -> tuple[str, ...]:
         name, "yes" if figures.stable else "NO", *map(format_figure, (figures.ms, figures.mt, worst.ms, worst.mt)),
         format_figure(figures.gain_margin_db, "dB"), format_figure(figures.phase_margin_deg, "deg"),
         format_figure(None if late is None else 1e3 * late, "ms"), format_figure(figures.disk_margin),
-        format_band(figures.tracking_band_hz, "Hz", MISSING), format_values(worst.parameters),
+        format_band(figures.tracking_band_hz, "Hz", MISSING), _format_place(worst),
     )  # fmt: skip

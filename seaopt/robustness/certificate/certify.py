@@ -37,8 +37,8 @@ from seaopt.robustness.certificate.certificate import (
 from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
-from seaopt.robustness.uncertainty.severity import limits, severities
-from seaopt.robustness.uncertainty.worst import find_worst, measure_worst
+from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
+from seaopt.robustness.uncertainty.worst import combine_worst, find_worst, measure_worst
 
 CONFIDENCE = 1.0 - 1e-6
 DRAWS_PER_BLOCK = 50_000
@@ -51,10 +51,16 @@ DrawProgress = Callable[[int, int], None]
 
 @record(eq=False)
 class _Tally:
-    """The worst draws of a plant so far, as coordinates."""
+    """The worst draws of a plant so far by one figure, as coordinates."""
 
     points: Float[np.ndarray, "n k"]
     severity: Float[np.ndarray, " n"]
+
+    def add(self, points: Float[np.ndarray, "m k"], severity: Float[np.ndarray, " m"]) -> _Tally:
+        """Return the worst of these and of new draws."""
+        points, severity = np.vstack([self.points, points]), np.concatenate([self.severity, severity])
+        worst = np.argsort(severity)[::-1][:WORST_KEPT]
+        return _Tally(points=points[worst], severity=severity[worst])
 
 
 @dataclass(slots=True, kw_only=True)  # counts up, block by block
@@ -156,17 +162,15 @@ def certify(
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
-    failures, tallies = _measure_draws(controller, plants, unknown, samples, rng, progress)
-    worst = {
-        name: find_worst(controller, plant, unknown, tallies[name].points, tallies[name].severity)
-        for name, plant in plants.items()
-    }
+    failures, drawn = _measure_draws(controller, plants, unknown, samples, rng, progress)
+    worst = {name: find_worst(controller, plant, unknown, drawn[name]) for name, plant in plants.items()}
     brackets: dict[str, Bracket] = {}
     if bounds is not None:
         brackets = {name: bracket(controller, plant, unknown, worst[name], bounds) for name, plant in plants.items()}
     for name, bounded in brackets.items():
         if bounded.parameters:
-            worst[name] = measure_worst(controller, plants[name], nominal, bounded.parameters)
+            case = measure_worst(controller, plants[name], nominal, bounded.parameters)
+            worst[name] = combine_worst([worst[name], case])
     monte_carlo = MonteCarlo(
         samples=samples, failures=failures.count, seed=seed, confidence=confidence,
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
@@ -256,9 +260,10 @@ def _digest(controller: Controller) -> int:
 def _measure_draws(
     controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
     progress: DrawProgress | None,
-) -> tuple[_Failures, dict[str, _Tally]]:  # fmt: skip
+) -> tuple[_Failures, dict[str, Float[np.ndarray, "n k"]]]:  # fmt: skip
     """Draw and measure in blocks: the draws that fail on some plant, and the worst of each plant."""
-    tallies = {name: _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0)) for name in plants}
+    none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
+    tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
     ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
     failures, steps = _Failures(), samples * len(plants)
     for start in range(0, samples, DRAWS_PER_BLOCK):
@@ -272,13 +277,13 @@ def _measure_draws(
             unstable |= batch.spectral_radius >= STABLE
             over_ms |= batch.ms > ms
             over_mt |= batch.mt > mt
-            tally, severity = tallies[name], severities(controller, batch)
-            points_so_far = np.vstack([tally.points, points])
-            severity_so_far = np.concatenate([tally.severity, severity])
-            worst = np.argsort(severity_so_far)[::-1][:WORST_KEPT]
-            tallies[name] = _Tally(points=points_so_far[worst], severity=severity_so_far[worst])
+            tallies[name] = [
+                tally.add(points, severities(controller, batch, by))
+                for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)
+            ]
         failures.add(unstable, over_ms, over_mt)
-    return failures, tallies
+    drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
+    return failures, drawn
 
 
 def failure_bound(samples: int, failures: int, confidence: float) -> float:

@@ -75,7 +75,7 @@ def draw_requirements(
     name = max(worst, key=lambda key: worst[key].severity)
     case = worst[name]
     where = format_values(case.parameters, missing="")
-    size = f"has Ms {case.ms:.4g}, Mt {case.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
+    size = f"has Ms {case.witness.ms:.4g}, Mt {case.witness.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
     witness = f"{name}: worst case {size}" + (f" at {where}" if where else "")
     rows = [
         Requirement(

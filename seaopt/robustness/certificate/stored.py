@@ -25,10 +25,17 @@ class StoredRequirement(ResultTable):
     where: str
 
 
-class StoredWorst(ResultTable):
-    """The parameters of a worst case and, where bounds were asked for, what they prove."""
+class StoredLargest(ResultTable):
+    """The parameters at which a figure is largest."""
 
     parameters: dict[str, Number]
+
+
+class StoredWorst(ResultTable):
+    """The parameters of a worst case and of the largest Ms and Mt and, where bounds were asked for, what they prove."""
+
+    parameters: dict[str, Number]
+    largest: dict[str, StoredLargest] = {}
     ms_lower: NullIsInfinite = math.inf
     ms_upper: NullIsInfinite = math.inf
     mt_lower: NullIsInfinite = math.inf
@@ -38,9 +45,14 @@ class StoredWorst(ResultTable):
     left_out: str = ""
 
     @property
+    def cases(self) -> list[dict[str, float]]:
+        """The parameters of the worst case, and those of the largest Ms and Mt."""
+        return [self.parameters, *(each.parameters for each in self.largest.values())]
+
+    @property
     def bounds(self) -> dict[str, Any] | None:
         """The fields of its `Bracket`; None if bounds were not asked for."""
-        return self.model_dump(exclude={"parameters"}) if "ms_upper" in self.model_fields_set else None
+        return self.model_dump(exclude={"parameters", "largest"}) if "ms_upper" in self.model_fields_set else None
 
 
 class StoredPlant(ResultTable):

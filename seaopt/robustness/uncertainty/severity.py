@@ -29,6 +29,9 @@ from seaopt.robustness.uncertainty.draws import Uncertainty
 
 UNSTABLE = 1e6
 COMPLEX_STEP = 1e-20  # its square vanishes beside 1
+LARGEST_MS, LARGEST_MT = np.array([1.0, np.inf]), np.array([np.inf, 1.0])  # levels by which a severity is Ms, and Mt
+
+Levels = Float[np.ndarray, "*n 2"]
 
 SeveritySlopes = Float[np.ndarray, "n k"]
 
@@ -50,11 +53,16 @@ class _SampledPlants:
         return _SampledPlants(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
 
-def severities(controller: Controller, figures: BatchFigures) -> Float[np.ndarray, " n"]:
-    """Return the severity of every draw: instability first, then the fraction of the limits that it uses."""
-    ms, mt = limits(controller)
+def severities(
+    controller: Controller, figures: BatchFigures, by: Levels | None = None
+) -> Float[np.ndarray, " n"]:  # fmt: skip
+    """Return the severity of every draw: instability first, then the fraction of the limits that it uses.
+
+    With `by`, levels of Ms and Mt for all draws or for each, that is the fraction of these.
+    """
+    ms, mt = levels(controller).T if by is None else by.T
     with np.errstate(invalid="ignore"):  # infinite over infinite, of unstable draws, which are ranked apart
-        used = np.maximum(figures.ms / ms, figures.mt / mt) if np.isfinite(min(ms, mt)) else figures.ms
+        used = np.maximum(figures.ms / ms, figures.mt / mt)
     return np.where(figures.spectral_radius >= STABLE, UNSTABLE + figures.spectral_radius, used)
 
 
@@ -64,9 +72,16 @@ def limits(controller: Controller) -> tuple[float, float]:
     return np.inf if ms is None else ms, np.inf if mt is None else mt
 
 
+def levels(controller: Controller) -> Levels:
+    """Return the levels of Ms and Mt that make a severity of 1: the limits, or an Ms of 1 where there are none."""
+    both = np.array(limits(controller))
+    return both if np.any(np.isfinite(both)) else LARGEST_MS
+
+
 def severity_slopes(
-    controller: Controller, plant: Plant, unknown: Uncertainty, points: Float[np.ndarray, "n k"]
-) -> SeveritySlopes:
+    controller: Controller, plant: Plant, unknown: Uncertainty, points: Float[np.ndarray, "n k"],
+    by: Levels | None = None,
+) -> SeveritySlopes:  # fmt: skip
     """Return the derivatives of each point's severity with respect to its coordinates.
 
     These are derivatives of the spectral radius where the loop is unstable, else of the larger of Ms and Mt as
@@ -79,6 +94,8 @@ def severity_slopes(
         The loop's controller and plant, and what is uncertain of the plant.
     points : array, shape (n, k)
         Coordinates of `unknown`.
+    by : array, shape (2,) or (n, 2), optional
+        Levels of Ms and Mt, as in `severities`.
 
     """
     sampled, out = _sample_plants(controller, plant, unknown, points), np.zeros(points.shape)
@@ -89,10 +106,12 @@ def severity_slopes(
     with np.errstate(all="ignore"):  # where there is no derivative it is not finite
         loop = compute_products(controller, sampled.a, sampled.b, sampled.c, sampled.d)
         stable = np.max(np.abs(loop.closed), axis=1) < STABLE
-        for part, slopes in ((stable, _peak_slopes), (~stable, _radius_slopes)):
-            rows = np.flatnonzero(part)
-            if rows.size:
-                out[finite[rows]] = slopes(controller, loop.take(rows), sampled.take(rows))
+        ranked = np.broadcast_to(levels(controller) if by is None else by, (points.shape[0], 2))[finite]
+        rows, growing = np.flatnonzero(stable), np.flatnonzero(~stable)
+        if rows.size:
+            out[finite[rows]] = _peak_slopes(controller, loop.take(rows), sampled.take(rows), ranked[rows])
+        if growing.size:
+            out[finite[growing]] = _radius_slopes(controller, loop.take(growing), sampled.take(growing))
     return np.where(np.isfinite(out), out, 0.0)
 
 
@@ -132,17 +151,18 @@ def _radius_slopes(controller: Controller, loop: Products, sampled: _SampledPlan
     return np.real(np.conj(pole)[:, None] * moved) / np.abs(pole)[:, None]
 
 
-def _peak_slopes(controller: Controller, loop: Products, sampled: _SampledPlants) -> SeveritySlopes:
+def _peak_slopes(
+    controller: Controller, loop: Products, sampled: _SampledPlants, by: Levels
+) -> SeveritySlopes:  # fmt: skip
     (ms, ms_at), (mt, mt_at) = find_peaks(loop)
-    ms_limit, mt_limit = limits(controller)
+    ms_limit, mt_limit = by.T
     of_t = mt / mt_limit > ms / ms_limit
     z = np.exp(1j * np.where(of_t, mt_at, ms_at))
     s = loop.sensitivity(z[:, None])
     slope = _loop_slopes(controller, sampled, z)
     of_s = -np.abs(s) * np.real(s * slope)
     complement = np.abs(1.0 - s) * np.real(s**2 / (1.0 - s) * slope)
-    limit = np.where(of_t, mt_limit, ms_limit)[:, None]
-    return np.where(of_t[:, None], complement, of_s) / np.where(np.isfinite(limit), limit, 1.0)
+    return np.where(of_t[:, None], complement, of_s) / np.where(of_t, mt_limit, ms_limit)[:, None]
 
 
 def _loop_slopes(

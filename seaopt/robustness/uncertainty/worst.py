@@ -1,16 +1,17 @@
-r"""The worst case from below: the parameters, of all that fit and ranges allow, with the largest Ms or spectral radius.
+r"""The worst case from below: the parameters, of all that fit and ranges allow, with the largest Ms, and those of Mt.
 
 The set is an ellipsoid of the fit's covariance that holds `LEVEL` of its probability, cut by the physical bounds, times
-the box of the ranges. The search starts from the worst draws and vertices of the ranges, from distant ones first. Each
-round takes the exact gradient of a point's severity (`seaopt.robustness.uncertainty.severity`) and tries points along
-it, towards the vertex of the set that it points to (Frank, Wolfe, Naval Research Logistics 3, 1956) and about the
-point, all starts of a round in one batch. The result is a lower bound on the true worst case: a witness, checked by
-`Worst.verify`, and not a proof that there is none worse; `seaopt.robustness.bounds` bounds it from above.
+the box of the ranges. Ms and Mt are searched each for itself, instability before either. A search starts from the worst
+draws and vertices of the ranges, from distant ones first. Each round takes the exact gradient of a point's severity
+(`seaopt.robustness.uncertainty.severity`) and tries points along it, towards the vertex of the set that it points to
+(Frank, Wolfe, Naval Research Logistics 3, 1956) and about the point, all starts of a round in one batch. The result is
+a lower bound on the true worst case: a witness, checked by `Worst.verify`, and not a proof that there is none worse;
+`seaopt.robustness.bounds` bounds it from above.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -25,9 +26,17 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, confidence_radius
-from seaopt.robustness.uncertainty.severity import SeveritySlopes, limits, severities, severity_slopes
+from seaopt.robustness.uncertainty.severity import (
+    LARGEST_MS,
+    LARGEST_MT,
+    Levels,
+    SeveritySlopes,
+    limits,
+    severities,
+    severity_slopes,
+)
 
-STARTS = 8
+STARTS = 5  # of each figure
 CORNERS = 64  # vertices of the ranges evaluated
 APART = 0.5  # least distance of starts: of half a range, or of the ellipsoid's radius
 ROUNDS = 30
@@ -39,11 +48,12 @@ WITNESS_TOLERANCE = 1e-6
 
 Trials = Float[np.ndarray, "s t k"]
 Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
+Slopes = Callable[[Float[np.ndarray, "m k"]], SeveritySlopes]
 
 
 @record
 class Witness:
-    """The figures of a worst case, and the parameters that produce them."""
+    """The figures of a loop, and the parameters that produce them."""
 
     parameters: dict[str, float]
     ms: float
@@ -57,16 +67,24 @@ class Worst(tuple[Plant, ParameterSet]):
     """A plant and the parameters at which it is nearest to failing, or fails most.
 
     It is the pair (plant, parameters) that `tune(..., robust_to=...)` takes, with the figures there. Points are ranked
-    by instability, then by the fraction of the Ms or Mt limit that they use; by Ms where there is no limit.
+    by instability, then by the fraction of the Ms or Mt limit that they use; by Ms where there is no limit. The largest
+    Ms and the largest Mt found, which other parameters may have, stand beside it with witnesses of their own.
     """
 
     witness: Witness
+    largest: tuple[Witness, Witness]
     limited: bool
 
-    def __new__(cls, plant: Plant, values: ParameterSet, witness: Witness, *, limited: bool) -> Worst:
-        """Return the pair with its figures; `limited` if the specification limits Ms or Mt."""
+    def __new__(
+        cls, plant: Plant, values: ParameterSet, witness: Witness, *, limited: bool,
+        largest: tuple[Witness, Witness] | None = None,
+    ) -> Worst:  # fmt: skip
+        """Return the pair with its figures; `limited` if the specification limits Ms or Mt.
+
+        `largest` are the witnesses of the largest Ms and Mt found; the pair's own where they are left out.
+        """
         self = super().__new__(cls, (plant, values))
-        self.witness, self.limited = witness, limited
+        self.witness, self.limited, self.largest = witness, limited, largest or (witness, witness)
         return self
 
     @property
@@ -76,18 +94,24 @@ class Worst(tuple[Plant, ParameterSet]):
 
     @property
     def ms(self) -> float:
-        """Peak of abs(S) there; infinite if unstable."""
-        return self.witness.ms
+        """The largest peak of abs(S) found; infinite if unstable."""
+        return self.largest[0].ms
 
     @property
     def mt(self) -> float:
-        """Peak of abs(T) there; infinite if unstable."""
-        return self.witness.mt
+        """The largest peak of abs(T) found; infinite if unstable."""
+        return self.largest[1].mt
 
     @property
     def severity(self) -> float:
         """The fraction of the limits that is used; a million plus the spectral radius if unstable."""
         return self.witness.severity
+
+    @property
+    def elsewhere(self) -> dict[str, Witness]:
+        """The witnesses of the largest Ms and Mt, by name, that are not at the worst case's own parameters."""
+        named = zip(("Ms", "Mt"), self.largest, strict=True)
+        return {name: witness for name, witness in named if witness.parameters != self.witness.parameters}
 
     def figures(self, controller: Controller) -> LoopFigures:
         """Return every figure of the loop there, computed again."""
@@ -101,41 +125,59 @@ class Worst(tuple[Plant, ParameterSet]):
 
     def __repr__(self) -> str:
         where = ", ".join(f"{name} = {value:.5g}" for name, value in self.parameters.items()) or "the nominal values"
-        return (
-            f"Worst(Ms {self.ms:.5g}, Mt {self.mt:.5g}, spectral radius {self.witness.spectral_radius:.6g} at {where})"
-        )
+        stated = self.witness
+        return f"Worst(Ms {stated.ms:.5g}, Mt {stated.mt:.5g}, spectral radius {stated.spectral_radius:.6g} at {where})"
 
     def _repr_html_(self) -> str:
-        ms = f"{format_figure(self.ms)} at {format_figure(self.witness.ms_hz, 'Hz')}"
-        rows = [("Ms", ms), ("Mt", format_figure(self.mt)), ("spectral radius", f"{self.witness.spectral_radius:.6g}")]
+        ms = f"{format_figure(self.witness.ms)} at {format_figure(self.witness.ms_hz, 'Hz')}"
+        rows = [
+            ("Ms", ms),
+            ("Mt", format_figure(self.witness.mt)),
+            ("spectral radius", f"{self.witness.spectral_radius:.6g}"),
+        ]
         rows += [(name, f"{value:.5g}") for name, value in self.parameters.items()]
         return html_table(("worst case", ""), rows)
 
 
-def find_worst(
-    controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"],
-    severity: Float[np.ndarray, " n"],
-) -> Worst:  # fmt: skip
-    """Return the worst of the draws and of the points that a search from the worst draws reaches.
+def find_worst(controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"]) -> Worst:
+    """Return the worst of the draws and of the points that searches from the worst draws reach.
 
     Parameters
     ----------
     controller, plant, unknown
         The loop's controller and plant, and what is uncertain of the plant.
-    drawn, severity
-        Draws as coordinates, and the severity of each; empty if nothing is uncertain.
+    drawn
+        Draws as coordinates, those of the largest Ms and Mt among them; empty if nothing is uncertain.
 
     """
-    points, scores = drawn, severity
-    if unknown.size:
-        score = _make_score(controller, plant, unknown)
-        starts = _project(unknown, np.vstack([drawn, _list_corners(unknown)]))
-        reached, value = _climb(controller, plant, unknown, _choose_starts(unknown, starts, score(starts)), score)
-        worst = np.argsort(severity)[::-1][:1]
-        points, scores = np.vstack([drawn[worst], reached]), np.concatenate([severity[worst], value])
-    k = int(np.argmax(scores)) if scores.size else 0
-    at = unknown.values(points[k : k + 1]) if unknown.size else {}
-    return measure_worst(controller, plant, unknown.nominal, {name: float(column[0]) for name, column in at.items()})
+    if not unknown.size:
+        return measure_worst(controller, plant, unknown.nominal, {})
+    start, levels = _choose_all_starts(controller, plant, unknown, drawn)
+
+    def score(points: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " m"]:
+        """Return severities, each by its start's level; points outside the bounds score minus infinity."""
+        figures = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
+        by = np.repeat(levels, len(points) // len(levels), axis=0)
+        return np.where(unknown.inside(points), severities(controller, figures, by), -np.inf)
+
+    def slopes(points: Float[np.ndarray, "s k"]) -> SeveritySlopes:
+        return severity_slopes(controller, plant, unknown, points, levels)
+
+    reached, _ = _climb(unknown, start, score, slopes)
+    found = np.vstack([drawn, reached])
+    figures = batch_figures(controller, plant, unknown.nominal, unknown.values(found))
+    largest = [found[int(np.argmax(severities(controller, figures, by)))] for by in (LARGEST_MS, LARGEST_MT)]
+    values = [unknown.values(point[None]) for point in largest]
+    at = [{name: float(column[0]) for name, column in each.items()} for each in values]
+    return combine_worst([measure_worst(controller, plant, unknown.nominal, each) for each in at])
+
+
+def combine_worst(cases: Sequence[Worst]) -> Worst:
+    """Return the most severe of some cases of one plant, with the largest Ms and Mt of all."""
+    worst = max(cases, key=lambda case: case.severity)
+    ms = max((case.largest[0] for case in cases), key=lambda witness: witness.ms)
+    mt = max((case.largest[1] for case in cases), key=lambda witness: witness.mt)
+    return Worst(*worst, worst.witness, limited=worst.limited, largest=(ms, mt))
 
 
 def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
@@ -157,16 +199,6 @@ def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, a
     return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))
 
 
-def _make_score(controller: Controller, plant: Plant, unknown: Uncertainty) -> Score:
-    """Return the function from points to severities; points outside the bounds score minus infinity."""
-
-    def score(points: Float[np.ndarray, "m k"]) -> Float[np.ndarray, " m"]:
-        figures = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
-        return np.where(unknown.inside(points), severities(controller, figures), -np.inf)
-
-    return score
-
-
 def _list_corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
     """Return vertices of the ranges, the Gaussian part at its mean: all of them, or a fixed choice of many."""
     size, rng = len(unknown.ranges), np.random.default_rng(0)
@@ -175,6 +207,20 @@ def _list_corners(unknown: Uncertainty) -> Float[np.ndarray, "n k"]:
     else:
         signs = rng.choice((-1.0, 1.0), (CORNERS, size))
     return np.hstack([np.zeros((len(signs), len(unknown.names))), signs])
+
+
+def _choose_all_starts(
+    controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Float[np.ndarray, "n k"]
+) -> tuple[Float[np.ndarray, "s k"], Levels]:
+    """Return where to start from for a large Ms, then for a large Mt, and the levels by which each is ranked."""
+    points = _project(unknown, np.vstack([drawn, _list_corners(unknown)]))
+    figures, inside = batch_figures(controller, plant, unknown.nominal, unknown.values(points)), unknown.inside(points)
+    starts, levels = list[Float[np.ndarray, "s k"]](), list[Levels]()
+    for by in (LARGEST_MS, LARGEST_MT):
+        severity = np.where(inside, severities(controller, figures, by), -np.inf)
+        starts.append(_choose_starts(unknown, points, severity))
+        levels.append(np.tile(by, (len(starts[-1]), 1)))
+    return np.vstack(starts), np.vstack(levels)
 
 
 def _choose_starts(
@@ -194,12 +240,12 @@ def _choose_starts(
 
 
 def _climb(
-    controller: Controller, plant: Plant, unknown: Uncertainty, x: Float[np.ndarray, "s k"], score: Score
+    unknown: Uncertainty, x: Float[np.ndarray, "s k"], score: Score, slopes: Slopes
 ) -> tuple[Float[np.ndarray, "s k"], Float[np.ndarray, " s"]]:
     """Climb from every start until none rises further."""
     value, rng = score(x), np.random.default_rng(0)
     for _ in range(ROUNDS):
-        slope = _project_slopes(unknown, x, severity_slopes(controller, plant, unknown, x))
+        slope = _project_slopes(unknown, x, slopes(x))
         trials = _propose_trials(unknown, x, slope, rng)
         scores = score(trials.reshape(-1, x.shape[1])).reshape(trials.shape[:2])
         best = np.argmax(scores, axis=1)

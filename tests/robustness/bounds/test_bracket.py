@@ -69,7 +69,7 @@ def test_no_draw_is_above_the_bound_and_the_bound_is_near(case, controller, thor
 def test_what_was_met_is_no_worse_than_what_the_search_finds(controller, stand, thor):
     """Centres of boxes that reach beyond the ellipsoid are no plants of the set."""
     unknown = of(stand, thor.prior(J=3.3e-7, b_r=2e-5, eta=0.03), {})
-    worst = find_worst(controller, stand, unknown, np.zeros((1, 3)), np.zeros(1))
+    worst = find_worst(controller, stand, unknown, np.zeros((1, 3)))
     bounds = bracket(controller, stand, unknown, budget=Budget(tolerance=0.05))
     assert 0.95 * worst.ms <= bounds.ms_lower <= worst.ms * (1.0 + 1e-6)
 
