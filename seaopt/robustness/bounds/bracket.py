@@ -1,4 +1,4 @@
-r"""The worst case from above, for the certificate: bounds on Ms and Mt over the whole set, and a proof of stability.
+r"""The worst case from above, for the certificate: bounds on Ms and Mt over the whole set, and stability.
 
 Branch and bound over boxes of the uncertain coordinates times arcs of the unit circle. An arc of a box is done when
 its bounds on abs(S) and abs(T) are within a tolerance of the largest that any plant is known to have; else the arc is
@@ -78,9 +78,9 @@ class Bracket:
     ms_lower, mt_lower : float
         The largest Ms and Mt of any plant of the set that was measured.
     ms_upper, mt_upper : float
-        No plant of the set has more; infinite where that is not proven.
-    proven_stable : bool
-        Every plant of the set is stable with this controller.
+        No plant of the set has more; infinite where there is no bound. Rounding is estimated, not enclosed.
+    bounded_stable : bool
+        Every plant of the set is stable with this controller, by those bounds.
     boxes : int
         Number of boxes used.
     left_out : str
@@ -94,21 +94,22 @@ class Bracket:
     ms_upper: float
     mt_lower: float
     mt_upper: float
-    proven_stable: bool
+    bounded_stable: bool
     boxes: int
     left_out: str = ""
     parameters: dict[str, float] = field(default_factory=dict[str, float])
 
     @property
     def statement(self) -> str:
-        """What is proven, as text; its figures are rounded up."""
+        """What is bounded, as text; its figures are rounded up."""
         if self.left_out:
             return f"no bound: {self.left_out}"
         if not np.isfinite(self.ms_lower):
             return "no bound: a plant of the set is unstable"
-        if not self.proven_stable:
+        if not self.bounded_stable:
             return f"no bound in {self.boxes} boxes"
-        return f"proven: all stable, Ms below {_round_up(self.ms_upper)}, Mt below {_round_up(self.mt_upper)}"
+        ms, mt = _round_up(self.ms_upper), _round_up(self.mt_upper)
+        return f"bounded, rounding estimated: all stable, Ms below {ms}, Mt below {mt}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return what robustness.json keeps with the worst case."""
@@ -147,11 +148,11 @@ class _BranchAndBound:
     parameters: dict[str, float] = field(default_factory=dict[str, float])
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is not proven
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is no bound
 def bracket(
     controller: Controller, plant: Plant, unknown: Uncertainty, worst: Worst | None = None, budget: Budget | None = None
 ) -> Bracket:
-    """Bound the worst Ms and Mt over the set of `find_worst` from above, and prove that all its plants are stable.
+    """Bound the worst Ms and Mt over the set of `find_worst` from above, and find whether all its plants are stable.
 
     Parameters
     ----------
@@ -160,12 +161,12 @@ def bracket(
     worst : Worst, optional
         The worst case known, from `find_worst`.
     budget : Budget, optional
-        When to stop; what is proven by then still holds.
+        When to stop; what is bounded by then still holds.
 
     Returns
     -------
     Bracket
-        With infinite bounds if nothing could be proven.
+        With infinite bounds if nothing could be bounded.
 
     Examples
     --------
@@ -175,7 +176,7 @@ def bracket(
     >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
     >>> unknown = combine_uncertainty(thor, so.ParameterSet(), {"eta": (0.8, 1.0)}, {"stand": stand})
     >>> bounds = bracket(controller, stand, unknown)
-    >>> bounds.proven_stable, bounds.ms_upper / bounds.ms_lower < 1.011
+    >>> bounds.bounded_stable, bounds.ms_upper / bounds.ms_lower < 1.011
     (True, True)
 
     """
@@ -191,25 +192,25 @@ def bracket(
         search.stable &= bool(np.all(_measure(search, search.boxes.centre)))
     except ControlError as error:
         return Bracket(
-            ms_lower=float(known[0]), ms_upper=np.inf, mt_lower=float(known[1]), mt_upper=np.inf, proven_stable=False,
+            ms_lower=float(known[0]), ms_upper=np.inf, mt_lower=float(known[1]), mt_upper=np.inf, bounded_stable=False,
             boxes=0, left_out=str(error),
         )  # fmt: skip
     return _conclude(search)
 
 
 def _conclude(search: _BranchAndBound) -> Bracket:
-    """Return what is proven when a search ends: bounds of all arcs, unless a measured plant contradicts them."""
+    """Return what is bounded when a search ends: bounds of all arcs, unless a measured plant contradicts them."""
     open_bounds = [np.max(search.arcs.s, initial=0.0), np.max(search.arcs.t, initial=0.0)]
     bound = np.maximum(search.upper, open_bounds) * (1.0 + SLACK)
     exceeded = np.any(search.lower > bound * (1.0 + AGREEMENT)) and np.all(np.isfinite(search.lower))
     void = bool(search.boxes.centre.size and exceeded)
     upper = np.maximum(bound, search.lower)
-    proven = bool(np.all(np.isfinite(upper)) and search.stable) and not void
-    ms, mt = (float(value) if proven else np.inf for value in upper)
+    bounded = bool(np.all(np.isfinite(upper)) and search.stable) and not void
+    ms, mt = (float(value) if bounded else np.inf for value in upper)
     reason = "a plant of the set is worse than the bound, which is therefore void; the model was not enclosed"
     return Bracket(
         ms_lower=float(search.lower[0]), ms_upper=ms, mt_lower=float(search.lower[1]), mt_upper=mt,
-        proven_stable=proven, boxes=search.count, parameters=search.parameters, left_out=reason if void else "",
+        bounded_stable=bounded, boxes=search.count, parameters=search.parameters, left_out=reason if void else "",
     )  # fmt: skip
 
 

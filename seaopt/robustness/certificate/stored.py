@@ -1,6 +1,6 @@
 """What a certificate needs of its robustness.json, as pydantic models; all other figures are computed again.
 
-Null stands for what is infinite: the value of a requirement that an unstable plant breaks, a bound that is not proven.
+Null stands for what is infinite: the value of a requirement that an unstable plant breaks, a bound that there is not.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class StoredWorst(ResultTable):
     ms_upper: NullIsInfinite = math.inf
     mt_lower: NullIsInfinite = math.inf
     mt_upper: NullIsInfinite = math.inf
-    proven_stable: Flag = False
+    bounded_stable: Flag = False
     boxes: Whole = 0
     left_out: str = ""
 

@@ -1,4 +1,4 @@
-"""Bounds from above: never below any draw, near the worst case found, and nothing proven that is not so."""
+"""Bounds from above: never below any draw, near the worst case found, and nothing bounded that is not so."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_no_draw_is_above_the_bound_and_the_bound_is_near(case, controller, thor
     unknown = of(plant, thor.prior(**priors) if priors else thor, ranges)
     bounds = bracket(controller, plant, unknown)
     figures = batch_figures(controller, plant, unknown.nominal, unknown.values(draws(unknown, count)))
-    assert bounds.proven_stable
+    assert bounds.bounded_stable
     assert np.max(figures.spectral_radius) < 1.0
     assert np.max(figures.ms) <= bounds.ms_upper <= 1.012 * bounds.ms_lower
     assert np.max(figures.mt) <= bounds.mt_upper <= 1.012 * bounds.mt_lower
@@ -87,7 +87,7 @@ def test_parts_are_bounded_too(part, ranges, controller, thor):
     unknown = of(plant, thor, ranges)
     bounds = bracket(controller, plant, unknown)
     figures = batch_figures(controller, plant, unknown.nominal, unknown.values(draws(unknown, 500)))
-    assert bounds.proven_stable
+    assert bounds.bounded_stable
     assert np.max(figures.ms) <= bounds.ms_upper <= 1.012 * bounds.ms_lower
     assert np.max(figures.mt) <= bounds.mt_upper <= 1.012 * bounds.mt_lower
 
@@ -117,7 +117,7 @@ def test_a_lag_with_uncertain_gain_has_its_closed_form(tolerance, controller, th
     bounds = bracket(lag, plant, unknown, budget=Budget(tolerance=tolerance))
     a = np.exp(-lag.sample_time_s / 0.01)
     exact = (1 + a) / (1 + a - 12.0 * (1 - a))
-    assert bounds.proven_stable
+    assert bounds.bounded_stable
     assert exact <= bounds.ms_upper <= exact * (1.0 + tolerance + 1e-6)
     assert bounds.ms_lower == pytest.approx(exact, rel=1e-6)
 
@@ -131,10 +131,10 @@ def test_feedthrough_without_delay_is_bounded(controller, thor):
     )  # fmt: skip
     unknown = of(direct, so.ParameterSet(plant.defaults.values()), {"K": (0.5, 2.0)})
     bounds = bracket(lag, direct, unknown)
-    assert bounds.proven_stable
+    assert bounds.bounded_stable
     assert bounds.ms_upper == pytest.approx(0.4, rel=0.02)
     unknown = of(direct, so.ParameterSet(plant.defaults.values()), {"K": (-0.6, 0.5)})
-    assert not bracket(lag, direct, unknown, budget=Budget(boxes=300)).proven_stable
+    assert not bracket(lag, direct, unknown, budget=Budget(boxes=300)).bounded_stable
 
 
 def test_a_jump_at_a_whole_sample_of_delay_is_covered(controller, stand, thor):
@@ -151,10 +151,10 @@ def test_a_jump_at_a_whole_sample_of_delay_is_covered(controller, stand, thor):
     ("name", "ranges"),
     [("swing", {"delay_s": (0.0, 1e-2)}), ("stand", {"eta": (0.01, 20.0)}), ("swing", {"delay_s": (6.6e-3, 6.7e-3)})],
 )
-def test_an_unstable_set_is_never_proven_stable(name, ranges, controller, thor, request):
+def test_an_unstable_set_is_never_bounded_stable(name, ranges, controller, thor, request):
     plant = request.getfixturevalue(name)
     bounds = bracket(controller, plant, of(plant, thor, ranges), budget=Budget(boxes=200))
-    assert not bounds.proven_stable
+    assert not bounds.bounded_stable
     assert (bounds.ms_upper, bounds.mt_upper) == (np.inf, np.inf)
     assert "no bound" in repr(bounds)
 
@@ -202,9 +202,9 @@ def test_the_certificate_states_and_keeps_the_bounds(controller, swing, thor, tm
     certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50, bounds=Budget())
     bounds = certificate.brackets["swing"]
     assert certificate.worst["swing"].ms <= bounds.ms_upper < 1.011 * certificate.worst["swing"].ms
-    assert "proven: all stable, Ms below 1.5" in repr(certificate)
+    assert "bounded, rounding estimated: all stable, Ms below 1.5" in repr(certificate)
     content = json.loads(json.dumps(certificate.to_dict(), default=lambda array: array.tolist()))
-    assert content["plants"]["swing"]["worst"]["proven_stable"] is True
+    assert content["plants"]["swing"]["worst"]["bounded_stable"] is True
     again = so.robustness.Certificate.from_dict(content, controller, {"swing": swing}, thor)
     assert again.brackets == certificate.brackets
     plain = replace(certificate, brackets={})
@@ -230,15 +230,15 @@ def test_what_cannot_be_enclosed_is_left_out(controller, stand, thor):
     )  # fmt: skip
     bounds = bracket(controller, plant, of(plant, thor, {"eta": (0.9, 1.0)}))
     assert "erf" in bounds.left_out
-    assert not bounds.proven_stable
+    assert not bounds.bounded_stable
     assert "no bound: " in bounds.statement
 
 
 def test_figures_are_rounded_up():
     bounds = Bracket(
-        ms_lower=1.5, ms_upper=1.54401, mt_lower=1.2, mt_upper=12.3450001, proven_stable=True, boxes=3
+        ms_lower=1.5, ms_upper=1.54401, mt_lower=1.2, mt_upper=12.3450001, bounded_stable=True, boxes=3
     )  # fmt: skip
-    assert bounds.statement == "proven: all stable, Ms below 1.545, Mt below 12.35"
+    assert bounds.statement == "bounded, rounding estimated: all stable, Ms below 1.545, Mt below 12.35"
 
 
 @pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"boxes": 0}, {"seconds": -1.0}])
@@ -271,5 +271,5 @@ def test_a_range_of_no_width_is_that_value(eta, controller, stand, thor):
     updated = combine_uncertainty(thor.update(eta=eta), so.ParameterSet(), ranges, {"stand": stand})
     budget = Budget(boxes=50, seconds=20.0)
     bounds, expected = (bracket(controller, stand, unknown, None, budget) for unknown in (pinned, updated))
-    assert bounds.proven_stable
+    assert bounds.bounded_stable
     assert bounds.ms_upper == pytest.approx(expected.ms_upper, rel=1e-9)

@@ -16,7 +16,7 @@ CONTENT = {
     "plants": {
         "stand": {"ms": 1.5, "worst": {"parameters": {}}},
         "swing": {"worst": {"parameters": {"I_p": 0.2}, "ms_lower": 1.5, "ms_upper": None, "mt_lower": 1.2,
-                            "mt_upper": None, "proven_stable": False, "boxes": 7}},
+                            "mt_upper": None, "bounded_stable": False, "boxes": 7}},
     },
     "monte_carlo": {"samples": 50, "failures": 0, "seed": 1, "failure_probability_bound": 0.2, "confidence": 0.999999},
     "varied": [{"name": "J", "unit": "kg m^2", "value": 3e-6, "std": 1e-9, "low": None, "high": None}],
@@ -30,7 +30,7 @@ def test_null_is_infinite_and_bounds_are_there_where_they_were_asked_for():
     assert (stored.varied[0].low, stored.varied[0].high) == (-np.inf, np.inf)
     assert stored.plants["stand"].worst.bounds is None
     assert stored.plants["swing"].worst.bounds == {
-        "ms_lower": 1.5, "ms_upper": np.inf, "mt_lower": 1.2, "mt_upper": np.inf, "proven_stable": False, "boxes": 7,
+        "ms_lower": 1.5, "ms_upper": np.inf, "mt_lower": 1.2, "mt_upper": np.inf, "bounded_stable": False, "boxes": 7,
         "left_out": "",
     }  # fmt: skip
 
