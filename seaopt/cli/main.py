@@ -1,4 +1,4 @@
-"""Commands, options and exit codes: 0 done and every requirement met, 1 a requirement not met, 2 bad input."""
+"""Commands, options and exit codes: 0 done and every requirement met, 1 a requirement not met, 2 bad input, 130 Ctrl-C."""
 
 from __future__ import annotations
 
@@ -8,11 +8,27 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from seaopt.errors import SeaoptError
 
+INTERRUPTED = 130  # exit code, as a shell's
+
+
+class _Commands(TyperGroup):
+    """The commands; Ctrl-C is one line on stderr and exit code 130."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            sys.stderr.write("\nseaopt: interrupted" + (f"; {stop}" if stop.args else "") + "\n")
+        raise SystemExit(INTERRUPTED)
+
+
 app = typer.Typer(
     name="seaopt",
+    cls=_Commands,
     help="Series elastic actuators: from raw bench logs to a certified force controller.",
     no_args_is_help=True,
     add_completion=False,

@@ -115,8 +115,11 @@ class Session:
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
-        with self._progress(LABELS[stage]) as tell:
-            stages[stage](tell)
+        try:
+            with self._progress(LABELS[stage]) as tell:
+                stages[stage](tell)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
 
     @contextmanager
     def _progress(self, label: str) -> Generator[Callable[[str], None]]:

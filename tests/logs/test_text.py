@@ -66,6 +66,22 @@ def test_encodings(file, encoding):
     check(read_table(file(mark + DRESSES["decimal comma"].encode(encoding))))
 
 
+def test_a_header_in_windows_1252_is_read_and_said(file):
+    """As a spreadsheet saves it in Germany: µ and ° are single bytes there."""
+    text = "t [ms];Strom [µA];Kraft [N] µ;Winkel [°]\n0;1,5;10;90\n1;2,5;20;180\n2;3,5;30;270\n"
+    table = read_table(file(text.encode("cp1252")))
+    np.testing.assert_allclose(table.signals["Strom"].values, [1.5e-6, 2.5e-6, 3.5e-6])
+    np.testing.assert_allclose(table.signals["Winkel"].values, np.radians([90, 180, 270]))
+    (force,) = [name for name in table.signals if name.startswith("Kraft")]
+    np.testing.assert_allclose(table.signals[force].values, [10, 20, 30])
+    assert any("Windows-1252: ° µ" in note for note in table.notes)
+
+
+def test_bytes_that_are_no_utf_8_among_the_data_are_refused_with_what_converts_them(file):
+    with pytest.raises(LogError, match=r"iconv -f WINDOWS-1252 -t UTF-8"):
+        read_table(file("t;I;F;note\n0;1;2;Pr\xfcfung\n1;1;2;x\n".encode("latin-1")))
+
+
 def test_two_header_lines_are_joined_and_said(file):
     table = read_table(file("motor;;load\nt [ms];I [mA];F [N]\n" + POINT), time="motor t [ms]")
     assert list(table.signals) == ["I", "load F"]

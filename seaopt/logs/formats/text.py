@@ -25,6 +25,7 @@ from seaopt.logs.formats.source import Field, Source, Window, summarise_error
 from seaopt.logs.formats.text_layout import (
     BLANK,
     MAX_LINE,
+    WINDOWS,
     TextLayout,
     encoding_error,
     find_layout,
@@ -124,7 +125,8 @@ def _read_block(stream: IO[Any], form: TextLayout) -> bytes:
     stream.readline(MAX_LINE + 1)
     end = stream.tell()
     stream.seek(start)
-    return stream.read(end - start)
+    block = stream.read(end - start)
+    return block.decode(WINDOWS).encode() if form.encoding == WINDOWS else block
 
 
 def _find_first_line(path: Path, form: TextLayout, number: int) -> int:

@@ -25,6 +25,7 @@ COMMENTS = ("#", "%", "//")
 BLANK = frozenset({"", "nan", "na", "n/a"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?inf(inity)?", re.IGNORECASE | re.ASCII)
 _DELIMITERS = ("\t", ";", "|", ",", " ")
+WINDOWS = "cp1252"  # of which Latin-1's signs and letters are a part
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 
 
@@ -81,11 +82,17 @@ def find_layout(path: Path) -> TextLayout:
         first = filled[1][0] if len(filled) > 1 else len(lines)
     if first >= len(lines):
         raise LogError(f"{path}: 0 rows below the header; record the log again")
-    rows = [split_cells(line, delimiter) for at, line in filled if at >= first]
+    data = [line for at, line in filled if at >= first]
+    if encoding == WINDOWS:
+        _check_ascii(path, data)
+    rows = [split_cells(line, delimiter) for line in data]
     headers, units, notes = _find_headers(path, lines[:first], delimiter, width, rows)
     numeric = tuple(_is_numeric(rows, index, comma) for index in range(len(headers)))
     if comma:
         notes.append("the decimal sign is a comma")
+    if encoding == WINDOWS:
+        signs = sorted({sign for line in lines[:first] for sign in line if not sign.isascii()})
+        notes.append(f"its header is no UTF-8 text and was read as Windows-1252: {' '.join(signs)}")
     return TextLayout(
         encoding=encoding, delimiter=delimiter, comma=comma, headers=tuple(headers), units=tuple(units),
         numeric=numeric, first=first, notes=tuple(notes),
@@ -117,10 +124,7 @@ def _read_head(path: Path) -> tuple[str, list[str]]:
     if encoding != "utf-16" and b"\x00" in raw[:4096]:
         line = raw.count(b"\n", 0, raw.index(0)) + 1
         raise LogError(f"{path}: line {line} holds a zero byte, it is not a text file; save the log as CSV")
-    try:
-        text = codecs.getincrementaldecoder(encoding)().decode(raw, final=len(raw) < HEAD_BYTES)
-    except UnicodeError as error:
-        raise encoding_error(path, encoding, error) from error
+    encoding, text = _decode(path, encoding, raw)
     whole = len(raw) < HEAD_BYTES
     lines = text.rstrip("\x1a" if whole else "").split("\n", HEAD_LINES)
     rest = len(lines) > HEAD_LINES  # the last item is all that is left
@@ -134,9 +138,44 @@ def _read_head(path: Path) -> tuple[str, list[str]]:
     return encoding, [line.rstrip("\r") for line in lines]
 
 
+def _decode(path: Path, encoding: str, raw: bytes) -> tuple[str, str]:
+    """Return the encoding of a file's first bytes, and their text: Windows-1252 where they are no UTF-8."""
+
+    def decode(name: str) -> str:
+        return codecs.getincrementaldecoder(name)().decode(raw, final=len(raw) < HEAD_BYTES)
+
+    try:
+        return encoding, decode(encoding)
+    except UnicodeError as error:
+        refused = encoding_error(path, encoding, error)
+        if encoding != "utf-8":
+            raise refused from error
+        try:
+            return WINDOWS, decode(WINDOWS)
+        except UnicodeError:
+            raise refused from error
+
+
+def _check_ascii(path: Path, data: list[str]) -> None:
+    """Refuse bytes that are no UTF-8 among the data, where they may be damage and not a header's µ or °.
+
+    Raises
+    ------
+    LogError
+        There is one.
+
+    """
+    for line in data:
+        if not line.isascii():
+            raise LogError(
+                f'{path}: is not UTF-8 text ("{line[:40]}"); save the log as UTF-8 CSV, or convert it: '
+                f"iconv -f WINDOWS-1252 -t UTF-8 {path.name} > utf8_{path.name}"
+            )
+
+
 def encoding_error(path: Path, encoding: str, error: UnicodeError) -> LogError:
     """Return the error of a byte that is not text."""
-    name = "UTF-16" if encoding == "utf-16" else "UTF-8"
+    name = {"utf-16": "UTF-16", WINDOWS: "Windows-1252"}.get(encoding, "UTF-8")
     at = f"byte {error.start}" if isinstance(error, UnicodeDecodeError) else "no text"
     return LogError(f"{path}: is not {name} text ({at}); save the log as UTF-8 CSV")
 
