@@ -1,4 +1,4 @@
-"""Commands, options and exit codes: 0 done and every requirement met, 1 a requirement not met, 2 bad input, 130 Ctrl-C."""
+"""Commands, options, exit codes: 0 done and all requirements met, 1 one is not met, 2 bad input, 130 Ctrl-C."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from seaopt.formatting import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import take_sliding
+from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.records import record
 
 CONTROLLER_SCHEMA = "seaopt/controller/2"
@@ -250,6 +250,7 @@ class Controller:
                 f"tracking band {format_band(a.tracking_band_hz, 'Hz')}",
                 f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
                 f"  gain margin {gain_margin} dB, phase margin {phase_margin} deg, delay margin {delay_margin} ms",
+                *self._friction_lines(),
                 *self._force_lines(),
                 f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
                 if self.feasible
@@ -257,6 +258,21 @@ class Controller:
                 *(f"  note: {note}" for note in self.notes),
             ]
         ).rstrip()
+
+    def _friction_lines(self) -> list[str]:
+        """Say of which state the figures are where the design plant has friction, and give the other's."""
+        if self.design is None:
+            return []
+        plant, params = self.design
+        _, *stuck = split_friction({"": plant}, params).values()
+        loops = [
+            Loop(plant=self.plant(one, params), reference=self.reference, measurement=self.measurement) for one in stuck
+        ]
+        return [
+            "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
+            f"{format_number(figures.bandwidth_hz, missing='none')} Hz, Ms {figures.ms:.4g}, Mt {figures.mt:.4g}"
+            for figures in (loop.figures() for loop in loops)
+        ]
 
     def _gain_lines(self) -> list[str]:
         law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}

@@ -130,6 +130,16 @@ def test_a_notch_without_effect_is_noted(depth, noted, stand, thor):
     assert ("tune without it" in repr(replace(controller, gains=gains))) is noted
 
 
+def test_the_summary_says_where_friction_has_the_bandwidth_placed(stand, thor):
+    """Stuck, the plant has a damper of f_c/v_s besides: the same law, on the plant with that b_r, from scratch."""
+    rubbing = thor.update(f_c=50.0, v_s=1e-3)
+    controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25))
+    r = thor["l"].value / (2 * np.pi * thor["N_p"].value)
+    stuck = controller.close(stand, thor.update(b_r=thor["b_r"].value + 50.0 / 1e-3 * r**2)).figures()
+    assert f"stuck: bandwidth {stuck.bandwidth_hz:.4g} Hz, Ms {stuck.ms:.4g}" in repr(controller)
+    assert "sliding" not in repr(so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=20)))
+
+
 def test_json_round_trip(stand, swing, thor, tmp_path):
     from seaopt.files import read_json, write_json
 
