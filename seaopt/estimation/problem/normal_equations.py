@@ -1,7 +1,15 @@
-"""Normal equations: Gram matrices of passes added up over unknowns, solved over what the data show.
+r"""Normal equations: Gram matrices of passes added up over unknowns, solved over what the data show.
 
 A matrix is scaled to a unit diagonal before it is inverted. Its eigenvalues below a cut, a part of the largest, are
 directions that the data do not show: they are left out, as in a pseudo-inverse.
+
+A log of many segments has as many initial states, which meet the parameters but not one another: the matrix is an
+arrow, of blocks D and a shaft (A, B) of what they share. Each block is then eliminated alone,
+
+.. math:: S = A - \sum_i B_i^T D_i^+ B_i, \qquad
+          x_0 = S^+ \Big(b_0 - \sum_i B_i^T D_i^+ b_i\Big), \qquad x_i = D_i^+ (b_i - B_i x_0),
+
+which costs in proportion to the number of blocks; an eigendecomposition of all costs its cube.
 """
 
 from __future__ import annotations
@@ -13,6 +21,8 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.records import record
 
+FEWEST = 100  # unknowns from which the blocks of an arrow are eliminated one by one
+LARGEST_BLOCK = 50  # unknowns
 RANK = 1e-10  # eigenvalues of the normalised Hessian below this part of the largest are zero
 
 
@@ -79,27 +89,24 @@ def invert(
     matrix: Float[np.ndarray, "n n"], cut: float = RANK
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
     """Return the inverse over what is seen, and how much of each unknown is not (0 to 1, squared)."""
-    scale, values, vectors = _decompose(matrix)
-    seen = _seen(values, cut)
-    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T / np.outer(scale, scale)
-    return inverse, np.sum(vectors[:, ~seen] ** 2, axis=1)
+    scale, factors = _factor(matrix, cut)
+    return factors.invert() / np.outer(scale, scale), factors.unseen()
 
 
 def solve_seen(
     matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n ..."], cut: float
 ) -> Float[np.ndarray, "n ..."]:
     """Return matrix^-1 right over what is seen; the rest stays where it is."""
-    scale, values, vectors = _decompose(matrix)
-    seen = _seen(values, cut)
-    along = (vectors[:, seen] / scale[:, None]).T @ right
-    return (vectors[:, seen] / scale[:, None]) @ (along.T / values[seen]).T
+    scale, factors = _factor(matrix, cut)
+    if not right.size:
+        return right.copy()
+    columns = right.reshape(len(scale), -1) / scale[:, None]
+    return (factors.solve(columns) / scale[:, None]).reshape(right.shape)
 
 
 def measure_decrement(matrix: Float[np.ndarray, "n n"], gradient: Float[np.ndarray, " n"], cut: float) -> float:
     """Return the Newton decrement gradient' matrix^-1 gradient over what is seen."""
-    scale, values, vectors = _decompose(matrix)
-    seen = _seen(values, cut)
-    return float(np.sum((vectors.T @ (gradient / scale))[seen] ** 2 / values[seen]))
+    return float(gradient @ solve_seen(matrix, gradient, cut))
 
 
 def eliminate(matrix: Float[np.ndarray, "n n"], p: int, cut: float = 1e-12) -> Float[np.ndarray, "p p"]:
@@ -109,14 +116,135 @@ def eliminate(matrix: Float[np.ndarray, "n n"], p: int, cut: float = 1e-12) -> F
     return matrix[:p, :p] - matrix[:p, p:] @ solve_seen(matrix[p:, p:], matrix[p:, :p], cut)
 
 
-def _decompose(
-    matrix: Float[np.ndarray, "n n"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Return the scale of the unknowns, and eigenvalues and eigenvectors of the matrix scaled to a unit diagonal."""
+def _factor(matrix: Float[np.ndarray, "n n"], cut: float) -> tuple[Float[np.ndarray, " n"], _Spectrum | _Arrow]:
+    """Return the scale of the unknowns, and the factors of the matrix scaled to a unit diagonal."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return scale, values, vectors
+    shape = find_arrow(matrix)
+    if shape is None:
+        return scale, _Spectrum.of(matrix / np.outer(scale, scale), cut)
+    return scale, _Arrow.of(matrix / np.outer(scale, scale), shape, cut)
 
 
-def _seen(values: Float[np.ndarray, " n"], cut: float) -> Bool[np.ndarray, " n"]:
-    return values > cut * np.max(values, initial=1e-300)
+@record(eq=False)
+class _Spectrum:
+    """The eigenvalues and eigenvectors that are seen, of matrices in a stack, and the eigenvectors that are not."""
+
+    values: Float[np.ndarray, "... n"]
+    vectors: Float[np.ndarray, "... n n"]
+    seen: Bool[np.ndarray, "... n"]
+
+    @classmethod
+    def of(cls, matrix: Float[np.ndarray, "... n n"], cut: float, largest: float = 1e-300) -> _Spectrum:
+        values, vectors = np.linalg.eigh(matrix)
+        return cls(values=values, vectors=vectors, seen=values > cut * np.max(values, initial=largest))
+
+    def solve(self, right: Float[np.ndarray, "... n m"]) -> Float[np.ndarray, "... n m"]:
+        inverse = np.where(self.seen, 1.0 / np.where(self.seen, self.values, 1.0), 0.0)
+        return self.vectors @ (inverse[..., None] * (np.swapaxes(self.vectors, -1, -2) @ right))
+
+    def invert(self) -> Float[np.ndarray, "... n n"]:
+        inverse = np.where(self.seen, 1.0 / np.where(self.seen, self.values, 1.0), 0.0)
+        return (self.vectors * inverse[..., None, :]) @ np.swapaxes(self.vectors, -1, -2)
+
+    def unseen(self) -> Float[np.ndarray, "... n"]:
+        return np.sum(np.where(self.seen[..., None, :], 0.0, self.vectors) ** 2, axis=-1)
+
+
+@record(eq=False)
+class ArrowShape:
+    """Which unknowns are the shaft of an arrow, and which are its blocks: those of one size are rows of one array."""
+
+    shaft: Int[np.ndarray, " q"]
+    blocks: tuple[Int[np.ndarray, "..."], ...]
+
+
+def find_arrow(matrix: Float[np.ndarray, "n n"]) -> ArrowShape | None:
+    """Return the shape of a matrix that is an arrow of many small blocks; None where that would save nothing.
+
+    Unknowns that meet far more others than the usual one does are the shaft; what is left falls apart into blocks.
+
+    Examples
+    --------
+    >>> matrix = np.eye(200)
+    >>> matrix[0, :] = matrix[:, 0] = 0.05
+    >>> shape = find_arrow(matrix)
+    >>> shape.shaft.tolist(), [rows.shape for rows in shape.blocks]
+    ([0], [(199, 1)])
+
+    """
+    if len(matrix) < FEWEST:
+        return None
+    from scipy.sparse import csr_array  # deferred: scipy is slow to load
+    from scipy.sparse.csgraph import connected_components
+
+    meet = matrix != 0.0
+    counts = np.count_nonzero(meet, axis=1)
+    shaft = counts > 2.0 * np.median(counts)
+    rest = np.flatnonzero(~shaft)
+    _, labels = connected_components(csr_array(meet[np.ix_(rest, rest)]), directed=False)
+    sizes = np.bincount(labels)
+    if np.max(sizes) > LARGEST_BLOCK or np.count_nonzero(shaft) > len(matrix) // 2:
+        return None
+    rows = rest[np.argsort(labels, kind="stable")]
+    ends = np.cumsum(sizes)
+    blocks = tuple(
+        np.array([rows[end - size : end] for end in ends[sizes == size]]) for size in np.unique(sizes).tolist()
+    )
+    return ArrowShape(shaft=np.flatnonzero(shaft), blocks=blocks)
+
+
+@record(eq=False)
+class _Arrow:
+    """The factors of an arrow: of each block, what takes the shaft's unknowns to the block's, and of the rest."""
+
+    shape: ArrowShape
+    blocks: tuple[_Spectrum, ...]
+    across: tuple[Float[np.ndarray, "..."], ...]
+    rest: _Spectrum
+
+    @classmethod
+    def of(cls, matrix: Float[np.ndarray, "n n"], shape: ArrowShape, cut: float) -> _Arrow:
+        shaft = matrix[np.ix_(shape.shaft, shape.shaft)]
+        reduced = shaft.copy()
+        blocks: list[_Spectrum] = []
+        across: list[Float[np.ndarray, "..."]] = []
+        for rows in shape.blocks:
+            beside = matrix[rows[:, :, None], shape.shaft]
+            blocks.append(_Spectrum.of(matrix[rows[:, :, None], rows[:, None, :]], cut))
+            across.append(blocks[-1].solve(beside))
+            reduced -= np.einsum("bkp,bkq->pq", beside, across[-1])
+        largest = float(np.max(np.linalg.eigvalsh(shaft), initial=1e-300))
+        return cls(shape=shape, blocks=tuple(blocks), across=tuple(across), rest=_Spectrum.of(reduced, cut, largest))
+
+    def solve(self, right: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+        solution = np.empty_like(right)
+        shaft = right[self.shape.shaft].copy()
+        for rows, across in zip(self.shape.blocks, self.across, strict=True):
+            shaft -= np.einsum("bkq,bkm->qm", across, right[rows])
+        solution[self.shape.shaft] = shaft = self.rest.solve(shaft)
+        for rows, block, across in zip(self.shape.blocks, self.blocks, self.across, strict=True):
+            solution[rows] = block.solve(right[rows]) - across @ shaft
+        return solution
+
+    def invert(self) -> Float[np.ndarray, "n n"]:
+        every = self._extend(np.eye(self.shape.shaft.size))
+        inverse = every @ self.rest.solve(every.T)
+        for rows, block in zip(self.shape.blocks, self.blocks, strict=True):
+            inverse[rows[:, :, None], rows[:, None, :]] += block.invert()
+        return inverse
+
+    def unseen(self) -> Float[np.ndarray, " n"]:
+        null = self._extend(self.rest.vectors[:, ~self.rest.seen])
+        unseen = np.sum(null**2 / np.maximum(np.sum(null**2, axis=0), 1e-300), axis=1)
+        for rows, block in zip(self.shape.blocks, self.blocks, strict=True):
+            unseen[rows] += block.unseen()
+        return np.minimum(unseen, 1.0)
+
+    def _extend(self, shaft: Float[np.ndarray, "q m"]) -> Float[np.ndarray, "n m"]:
+        """Return vectors of the shaft's unknowns with those of the blocks that follow them."""
+        count = self.shape.shaft.size + sum(rows.size for rows in self.shape.blocks)
+        every = np.empty((count, shaft.shape[1]))
+        every[self.shape.shaft] = shaft
+        for rows, across in zip(self.shape.blocks, self.across, strict=True):
+            every[rows] = -across @ shaft
+        return every

@@ -21,16 +21,18 @@ from typing import Generic, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.estimation.problem.normal_equations import M, QuadraticModel, TrustRegionStep, solve_seen
+from seaopt.estimation.problem.normal_equations import M, QuadraticModel, TrustRegionStep, find_arrow, solve_seen
 from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
 Callback = Callable[[int, float], None]
+DampedSolver = Callable[[float, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]  # (lambda, b) -> (H + lambda)^-1 b
 
 DECREMENT = 1e-10  # squared standard deviations still to go
 RELATIVE_DECREMENT = 1e-12  # of the cost
 FIRST_RADIUS = 0.3  # over the size of the first point
 ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave of residuals that are rounding
+UNSEEN = 1e-14  # of the largest eigenvalue; directions below it are left where they are
 ROUNDING_RADIUS = 1e-15  # of the size of the point
 STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
 
@@ -194,29 +196,44 @@ def _step(
         gradient = gradient - h[np.ix_(bound, follow)] @ response[:, 0]
     step = np.zeros(blocked.size)
     d = scale[bound]
-    values, vectors = np.linalg.eigh(matrix / np.outer(d, d))
-    along, multiplier = _shorten(np.maximum(values, 0.0), vectors.T @ (gradient / d), radius)
-    step[bound] = vectors @ along / d
+    solve, largest = _make_damped_solver(matrix / np.outer(d, d))
+    along, multiplier = _shorten(solve, largest, gradient / d, radius)
+    step[bound] = along / d
     if np.any(follow):
         step[follow] = -response[:, 0] - response[:, 1:] @ step[bound]
     return step, multiplier
 
 
+def _make_damped_solver(matrix: Float[np.ndarray, "n n"]) -> tuple[DampedSolver, float]:
+    """Return (lambda, b) -> (matrix + lambda)^-1 b over what is seen, and a bound on the largest eigenvalue."""
+    if find_arrow(matrix) is not None:
+        one = np.eye(len(matrix))
+        largest = float(np.max(np.sum(np.abs(matrix), axis=1)))
+        return lambda damping, right: solve_seen(matrix + damping * one, right, UNSEEN), largest
+    values, vectors = np.linalg.eigh(matrix)
+    values = np.maximum(values, 0.0)
+    largest = float(np.max(values, initial=0.0))
+
+    def solve(damping: float, right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        seen = values + damping > UNSEEN * max(largest, 1e-300)
+        return vectors @ np.where(seen, (vectors.T @ right) / np.where(seen, values + damping, 1.0), 0.0)
+
+    return solve, largest
+
+
 def _shorten(
-    values: Float[np.ndarray, " n"], g: Float[np.ndarray, " n"], radius: float
+    solve: DampedSolver, largest: float, g: Float[np.ndarray, " n"], radius: float
 ) -> tuple[Float[np.ndarray, " n"], float]:
-    """Return the step -g / (values + lambda), no longer than the radius, with the smallest such lambda >= 0."""
-    floor = 1e-14 * max(float(np.max(values, initial=0.0)), 1e-300)
-    seen = values > floor
-    newton = np.where(seen, -g / np.where(seen, values, 1.0), 0.0)
+    """Return the step -(H + lambda)^-1 g, no longer than the radius, with the smallest such lambda >= 0."""
+    newton = -solve(0.0, g)
     if float(np.linalg.norm(newton)) <= radius:
         return newton, 0.0
-    multiplier = max(float(np.linalg.norm(g)) / radius - float(np.max(values)), floor)
+    multiplier = max(float(np.linalg.norm(g)) / radius - largest, UNSEEN * max(largest, 1e-300))
     for _ in range(50):  # Newton's method on 1 / |step|, which is nearly straight in lambda
-        step = -g / (values + multiplier)
+        step = -solve(multiplier, g)
         size = float(np.linalg.norm(step))
         if abs(size - radius) <= 1e-3 * radius:
             break
-        slope = float(np.sum(step**2 / (values + multiplier))) / size
+        slope = float(step @ solve(multiplier, step)) / size
         multiplier = max(multiplier + (size / slope) * (size - radius) / radius, 1e-3 * multiplier)
-    return -g / (values + multiplier), multiplier
+    return -solve(multiplier, g), multiplier
