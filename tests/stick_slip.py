@@ -69,9 +69,10 @@ class Runs:
 
 
 def simulate(
-    masses: Sequence[Mass], laws: Sequence[Mapping[str, Any]], reference: np.ndarray, *, substeps: int = 50
-) -> Runs:
-    """Simulate each mass under its law (the content of a controller.json), from rest.
+    masses: Sequence[Mass], laws: Sequence[Mapping[str, Any]], reference: np.ndarray, *, substeps: int = 50,
+    velocity: np.ndarray | None = None,
+) -> Runs:  # fmt: skip
+    """Simulate each mass under its law (the content of a controller.json), from rest or with a first velocity (m/s).
 
     `reference` is (runs, samples); all laws have one sample time.
     """
@@ -85,7 +86,8 @@ def simulate(
     steps = [_DifferenceEquations(laws, path) for path in ("reference", "measurement")]
     delays = np.array([law["delay_samples"] for law in laws])
     effort, force = np.zeros((len(masses), n)), np.zeros((len(masses), n))
-    q, v, largest = np.zeros(len(masses)), np.zeros(len(masses)), np.zeros(len(masses))
+    q, largest = np.zeros(len(masses)), np.zeros(len(masses))
+    v = np.zeros(len(masses)) if velocity is None else np.array(velocity, dtype=float)
     inertia = m + THETA * h * (b + THETA * h * k)
     for sample in range(n):
         force[:, sample] = k * q

@@ -40,6 +40,18 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
     True
 
     """
+    loop = take_friction_out(controller, plant, params)
+    if loop is None:
+        return None
+    closed = Loop(plant=loop.plant, reference=controller.reference, measurement=controller.measurement)
+    if np.max(np.abs(closed.eigenvalues())) >= STABLE:
+        zeros = (0.0,) * loop.slopes.size
+        return FrictionMargin(factor=0.0, slopes=zeros, frequency_hz=0.0, multiplier="none: unstable without friction")
+    return friction_margin(loop)
+
+
+def take_friction_out(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionLoop | None:
+    """Return the sliding loop with what friction has above its flattest slope taken out; None without friction."""
     values = plant.complete(params)
     if not has_friction(plant, values):
         return None
@@ -51,15 +63,9 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
     a, motor, output, _ = (block[0] for block in linearise(sliding, values.vector[:, None], at, measured, gain))
     x, u = find_rest(plant, values)
     on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, values.vector))
-    sampled = sample(sliding, values, measured, gain, controller.sample_time_s, controller.delay_samples)
-    loop = Loop(plant=sampled, reference=controller.reference, measurement=controller.measurement)
-    if np.max(np.abs(loop.eigenvalues())) >= STABLE:
-        zeros = (0.0,) * flattest.size
-        return FrictionMargin(factor=0.0, slopes=zeros, frequency_hz=0.0, multiplier="none: unstable without friction")
-    return friction_margin(
-        FrictionLoop(
-            a=a, motor=motor, friction=on_states, velocity=velocity, measured=output,
-            through=on_outputs[list(plant.outputs).index(measured)], slopes=steepest - flattest, plant=sampled,
-            law=controller.measurement, delay_s=conditions.get(DELAY, 0.0),
-        )
+    return FrictionLoop(
+        a=a, motor=motor, friction=on_states, velocity=velocity, measured=output,
+        through=on_outputs[list(plant.outputs).index(measured)], slopes=steepest - flattest,
+        plant=sample(sliding, values, measured, gain, controller.sample_time_s, controller.delay_samples),
+        law=controller.measurement, delay_s=conditions.get(DELAY, 0.0),
     )  # fmt: skip

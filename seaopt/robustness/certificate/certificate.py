@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import field, fields, replace
 from typing import Any
 
+import numpy as np
+
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.friction_proof import prove_friction
-from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
 from seaopt.errors import FileError, SeaoptError
@@ -40,11 +42,13 @@ from seaopt.robustness.certificate.simulated import (
 from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
+from seaopt.robustness.verification.limit_cycles import FrictionCycle, list_step_cycles, seek_limit_cycles
 from seaopt.robustness.verification.verification import Verification
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
+FRICTION_CYCLE = "friction_cycle_N"
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
@@ -196,6 +200,8 @@ class Certificate:
         The results of `with_simulation`.
     steps : Verification, str or None
         The simulated steps that every plant is judged by; the reason where they cannot be simulated.
+    cycles : mapping of name to tuple of FrictionCycle
+        Of each model whose friction is not proved harmless: limit cycles predicted and simulated.
     brackets : mapping of name to Bracket
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
@@ -217,6 +223,7 @@ class Certificate:
     varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
     steps: Verification | str | None = None
+    cycles: Mapping[str, tuple[FrictionCycle, ...]] = field(default_factory=dict[str, tuple[FrictionCycle, ...]])
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
     remarks: tuple[str, ...] = ()
@@ -266,9 +273,9 @@ class Certificate:
         Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
         reference; nothing may oscillate. `certify` does this; `with_simulation` plays all other scenarios too.
         """
-        steps = self.simulate_steps()
-        requirements = (*self.requirements, *_require_runs(steps))
-        return replace(self, steps=steps, requirements=requirements, passed=all(row.met for row in requirements))
+        played = self.play_steps()
+        requirements = (*self.requirements, *played._require_cycles(), *_require_runs(played.steps or ""))
+        return replace(played, requirements=requirements, passed=all(row.met for row in requirements))
 
     @property
     def runs(self) -> Verification | None:
@@ -277,9 +284,28 @@ class Certificate:
             return self.simulated.verification
         return self.steps if isinstance(self.steps, Verification) else None
 
-    def simulate_steps(self) -> Verification | str:
-        """Play the steps of every plant, at their worst draws too; return why not where that cannot be done."""
-        return simulate_steps(self.controller, self.models, self.parameters, self._draws())
+    def play_steps(self) -> Certificate:
+        """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
+        steps = simulate_steps(self.controller, self.models, self.parameters, self._draws())
+        cycles = {
+            name: seek_limit_cycles(self.controller, self.models[name], self.parameters)
+            + (list_step_cycles(steps, name) if isinstance(steps, Verification) else ())
+            for name, margin in self.friction.items()
+            if not margin.proved
+        }
+        return replace(self, steps=steps, cycles=cycles)
+
+    def _require_cycles(self) -> list[Requirement]:
+        """Return the limit cycles that last; those that steps end in are required of the steps."""
+        return [
+            Requirement(
+                name=FRICTION_CYCLE, limit=0.0, value=np.inf if cycle.simulated_N is None else cycle.simulated_N,
+                met=False, where=f"{name}: {cycle}",
+            )
+            for name, cycles in self.cycles.items()
+            for cycle in cycles
+            if cycle.predicted is not None and cycle.lasts
+        ]  # fmt: skip
 
     def _draws(self) -> dict[str, list[ParameterSet]]:
         """Return the worst draws of each plant, of those with friction sliding and stuck, without what is nominal."""
@@ -353,7 +379,7 @@ class Certificate:
                 friction=prove_frictions(controller, models, parameters),
                 remarks=tuple(stored.remarks),
             )
-            certificate = replace(certificate, steps=certificate.simulate_steps())
+            certificate = certificate.play_steps()
             played = stored.simulation
             if played is None:
                 return certificate
@@ -375,7 +401,9 @@ class Certificate:
                 for name, figures in self.plants.items()
             },
             "friction": {
-                name: {"sector_stable": True if margin.proved else None} | _list_fields(margin)
+                name: {"sector_stable": True if margin.proved else self._find_instability(name)}
+                | _list_fields(margin)
+                | {"limit_cycles": [cycle.to_dict() for cycle in self.cycles.get(name, ())]}
                 for name, margin in self.friction.items()
             },
             "monte_carlo": _list_fields(self.monte_carlo),
@@ -404,8 +432,8 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        friction = (f"{name}: {margin}" for name, margin in self.friction.items())
-        peak = self.controller.spec.max_reference_peak
+        friction = [f"{name}: {margin}{self._describe_cycles(name)}" for name, margin in self.friction.items()]
+        peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
 
@@ -418,6 +446,18 @@ class Certificate:
         }  # fmt: skip
         bounds = self.brackets[name].to_dict() if name in self.brackets else {}
         return _list_fields(worst.witness) | {"largest": largest} | bounds
+
+    def _find_instability(self, name: str) -> bool | None:
+        """Return False where an oscillation lasts in a simulation, None where nothing is proved either way."""
+        return False if any(cycle.lasts for cycle in self.cycles.get(name, ())) else None
+
+    def _describe_cycles(self, name: str) -> str:
+        if name not in self.cycles:
+            return ""
+        if self._find_instability(name) is False:
+            return "; it oscillates"  # a requirement that is not met says how
+        cycles = "; ".join(map(str, self.cycles[name]))
+        return f"; {cycles or 'no limit cycle is predicted, and no simulated step ends in one'}"
 
     def __repr__(self) -> str:
         lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from seaopt.bench import Chirp, Excitation
 from seaopt.control import Controller
+from seaopt.control.laws.limits import BY_NAME
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
@@ -230,7 +231,7 @@ def step_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]
     """
     spec = controller.spec
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / spec.bandwidth_hz)
-    peak = spec.max_reference_peak
+    peak = spec.allowed(BY_NAME["max_reference_peak"])
     steps: list[Scenario] = []
     for name, force in _size_steps(controller).items():
         if plant.moves:

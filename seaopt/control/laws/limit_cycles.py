@@ -1,0 +1,169 @@
+r"""Limit cycles of dry friction, predicted by its describing function, where stability is not proved.
+
+Friction is what its curve :math:`\varphi` has above its flattest slope (the rest is in the plant). A velocity
+:math:`V \sin \omega t` meets a force whose fundamental is :math:`N(V) V \sin \omega t`,
+
+.. math:: N(V) = \frac{1}{\pi V} \int_0^{2\pi} \varphi(V \sin\theta) \sin\theta \, d\theta,
+
+by quadrature of the declared curve. With H the sampled loop from friction effort to velocity at the fundamental, no
+aliases (see `seaopt.control.loops.absolute_stability`), a cycle needs :math:`1 + N(V) H(j\omega) = 0`: H is real and
+negative where its phase crosses, and N(V) = -1/H there. It is stable where a larger amplitude damps it (Loeb; Gelb,
+Vander Velde, Multiple-Input Describing Functions, 1968): the pole moves by :math:`dN / (N^2 H')` on the imaginary axis.
+
+A describing function knows the fundamental alone. It is good where the loop filters harmonics and the cycle slides
+through; cycles that stick for a while at each turn (hunting of an integral against static friction) can be missed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.optimize import brentq
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.friction_proof import take_friction_out
+from seaopt.control.loops.absolute_stability import FrictionLoop
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import friction_slopes
+from seaopt.records import record
+
+ANGLES = 512  # of the quadrature
+AMPLITUDES = np.geomspace(1e-7, 1e2, 271)  # m/s or rad/s
+LOWEST_HZ, FREQUENCIES = 1e-2, 3000
+DERIVATIVE = 1e-5  # relative step of frequency and amplitude
+
+
+@record
+class LimitCycle:
+    """A limit cycle that the describing function of friction predicts.
+
+    Parameters
+    ----------
+    frequency_hz : float
+    force_N : float
+        Amplitude of the measured output.
+    velocity : float
+        Amplitude of the velocity that the friction acts on, m/s or rad/s.
+    stable : bool
+        The loop comes back to it; an unstable one bounds what a loop recovers from.
+    state : tuple of float
+        The plant's states at the cycle's largest friction velocity.
+
+    """
+
+    frequency_hz: float
+    force_N: float
+    velocity: float
+    stable: bool
+    state: tuple[float, ...]
+
+
+def describe_friction(
+    plant: Plant, params: ParameterSet, name: str, amplitude: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, " m"]:
+    """Return the describing function N (N s/m) of a friction above its flattest slope, at velocity amplitudes.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=1e-4)
+    >>> v = np.array([1e-6, 0.1])
+    >>> n = describe_friction(stand, rubbing, "F_f", v)
+    >>> n.round(0), 4 * 50 / (np.pi * 0.1)  # stuck f_c/v_s; sliding like Coulomb's 4 f_c/(pi V)
+    (array([499988.,    637.]), 636.6197723675814)
+
+    """
+    values = plant.complete(params)
+    flattest = friction_slopes(plant, values)[0][list(plant.friction).index(name)]
+    v = ca.SX.sym("v")
+    curve = ca.Function("friction", [v], [ca.SX(plant.friction[name].force(v, values.by_attribute))])
+    theta = (np.arange(ANGLES) + 0.5) * 2 * np.pi / ANGLES
+    wave = amplitude[:, None] * np.sin(theta)
+    force = np.array(curve(wave.reshape(1, -1))).reshape(wave.shape) - flattest * wave
+    return 2.0 * np.mean(force * np.sin(theta), axis=1) / amplitude
+
+
+def predict_limit_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[LimitCycle, ...]:
+    """Return the limit cycles that the describing function of a plant's friction predicts, the fastest last.
+
+    Parameters
+    ----------
+    controller : Controller
+        Its measurement path closes the loop; the reference stands still.
+    plant, params
+        The plant with its friction. Where several of its frictions change with velocity nothing is predicted.
+
+    """
+    loop = take_friction_out(controller, plant, params)
+    if loop is None or np.count_nonzero(loop.slopes) != 1:
+        return ()
+    port = int(np.flatnonzero(loop.slopes)[0])
+    name = list(plant.friction)[port]
+    gains = describe_friction(plant, params, name, AMPLITUDES)
+    cycles: list[LimitCycle] = []
+    for f in _find_crossings(loop, port):
+        h, y, x = _respond(loop, port, f * np.array([1.0, 1.0 + DERIVATIVE]))
+        slope = (h[1] - h[0]) / (2j * np.pi * f * DERIVATIVE)
+        wanted = float(-1.0 / h[0].real)
+        for velocity in _find_amplitudes(gains, wanted):
+            around = np.array([velocity * (1 - DERIVATIVE), velocity * (1 + DERIVATIVE)])
+            rise = float(np.diff(describe_friction(plant, params, name, around))[0])
+            friction = wanted * velocity
+            cycles.append(
+                LimitCycle(
+                    frequency_hz=f, force_N=float(abs(y[0]) * friction), velocity=velocity,
+                    stable=bool(rise * np.real(1.0 / slope) < 0.0),
+                    state=tuple(float(value) for value in np.real(-x[0] * friction)),
+                )
+            )  # fmt: skip
+    return tuple(cycles)
+
+
+def _find_crossings(loop: FrictionLoop, port: int) -> list[float]:
+    """Return the frequencies (Hz) at which the friction's loop is real and negative."""
+    nyquist = 0.5 / loop.plant.sample_time_s
+    modes = np.abs(np.imag(np.linalg.eigvals(loop.a))) / (2 * np.pi)
+    close = (modes[:, None] * np.linspace(0.8, 1.25, 91)).ravel()
+    grid = np.concatenate([np.geomspace(LOWEST_HZ, 0.999 * nyquist, FREQUENCIES), close])
+    grid = np.unique(grid[(grid > LOWEST_HZ) & (grid < nyquist)])
+    response = _respond(loop, port, grid)[0]
+    side, negative = np.sign(np.imag(response)), np.real(response) < 0.0
+
+    def off_axis(f: float) -> float:
+        return float(np.imag(_respond(loop, port, np.array([f]))[0][0]))
+
+    crossings: list[float] = []
+    for i in np.flatnonzero((side[:-1] * side[1:] < 0) & negative[:-1] & negative[1:]):
+        root: Any = brentq(off_axis, grid[i], grid[i + 1])
+        crossings.append(float(root))
+    return crossings
+
+
+def _find_amplitudes(gains: Float[np.ndarray, " m"], wanted: float) -> list[float]:
+    """Return the amplitudes at which the describing function is a value, on straight lines in logarithms."""
+    level = np.log(np.maximum(gains, 1e-300)) - np.log(wanted)
+    return [
+        float(AMPLITUDES[i] * (AMPLITUDES[i + 1] / AMPLITUDES[i]) ** (level[i] / (level[i] - level[i + 1])))
+        for i in np.flatnonzero(np.sign(level[:-1]) * np.sign(level[1:]) < 0)
+    ]
+
+
+def _respond(
+    loop: FrictionLoop, port: int, f: Float[np.ndarray, " m"]
+) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"], Complex[np.ndarray, "m n"]]:
+    """Return velocity, measured output and states of a friction effort of 1 N at frequencies (Hz), the fundamentals."""
+    period, s = loop.plant.sample_time_s, 2j * np.pi * f
+    causes = np.column_stack([loop.friction[:, port], loop.motor]).astype(complex)
+    inner = s[:, None, None] * np.eye(loop.motor.size) - loop.a
+    by_friction, by_motor = np.moveaxis(np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape))), 2, 0)
+    law = loop.law.response(f, period)
+    closed = law / (1.0 + loop.plant.response(f) * law) * np.exp(-s * period * loop.plant.delay_samples)
+    hold = -np.expm1(-s * period) / s * np.exp(-s * loop.delay_s)
+    sensed = by_friction @ loop.measured + loop.through[port]
+    effort = -hold * closed * sensed / period
+    x = by_friction + by_motor * effort[:, None]
+    return x @ loop.velocity[port], sensed + (by_motor @ loop.measured) * effort, x

@@ -1,0 +1,129 @@
+"""Limit cycles of friction looked for by simulation, where stability is not proved, for the certificate.
+
+A cycle that the describing function predicts is started from: the plant in the predicted state, pushed beyond it, law
+and commands at rest, a reference of zero. What is left after many periods has found itself, whatever was predicted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
+from seaopt.control.laws.realisation import runnable
+from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
+from seaopt.errors import SimulationError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.robustness.verification.judgement import NOMINAL
+from seaopt.robustness.verification.oscillation import find_oscillation
+from seaopt.robustness.verification.verification import Verification
+
+PUSH = 1.5  # times the predicted cycle, where a run starts
+PERIODS, LEAST_S, LONGEST_S = 60.0, 1.0, 30.0  # of the predicted cycle, that a run lasts
+JUDGED = 0.4  # of a run, at its end
+FLOOR = 0.05  # of the predicted force: a smaller oscillation is one that dies out
+
+
+@record
+class FrictionCycle:
+    """A limit cycle: predicted, and what the simulation that starts there does.
+
+    Parameters
+    ----------
+    predicted : LimitCycle or None
+        By the describing function; None where only a simulation found it.
+    simulated_N, simulated_hz : float or None
+        Amplitude of the measured output and frequency of what remains; None where it dies out.
+    runs_away : bool
+        The simulated oscillation grows without end.
+    found_by : str
+        Where the simulation started: there, or with which step.
+
+    """
+
+    predicted: LimitCycle | None
+    simulated_N: float | None
+    simulated_hz: float | None
+    runs_away: bool = False
+    found_by: str = "there"
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the simulation keeps oscillating."""
+        return self.simulated_N is not None or self.runs_away
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cycle as it stands in robustness.json."""
+        return {
+            "predicted": None if self.predicted is None else asdict(self.predicted),
+            "simulated": {"force_N": self.simulated_N, "frequency_hz": self.simulated_hz} if self.simulated_N else None,
+            "runs_away": self.runs_away,
+            "found_by": self.found_by,
+        }
+
+    def __str__(self) -> str:
+        parts: list[str] = []
+        if self.predicted is not None:
+            kind = "a stable" if self.predicted.stable else "an unstable"
+            size = f"{self.predicted.force_N:.3g} N at {self.predicted.frequency_hz:.3g} Hz"
+            parts.append(f"the describing function predicts {kind} oscillation of {size}")
+        if self.runs_away:
+            parts.append(f"simulated from {self.found_by} it grows without end")
+        elif self.simulated_N is not None:
+            parts.append(f"simulated from {self.found_by}: {self.simulated_N:.3g} N at {self.simulated_hz:.3g} Hz")
+        else:
+            parts.append(f"simulated from {self.found_by} it dies out")
+        return "; ".join(parts)
+
+
+def seek_limit_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[FrictionCycle, ...]:
+    """Return the limit cycles that friction may make, predicted and simulated, at rest at zero.
+
+    A plant that cannot be simulated has none here; its steps say why.
+    """
+    try:
+        return tuple(_simulate(controller, plant, params, c) for c in predict_limit_cycles(controller, plant, params))
+    except SimulationError:
+        return ()
+
+
+def list_step_cycles(runs: Verification, plant: str) -> tuple[FrictionCycle, ...]:
+    """Return the oscillations that steps on a plant end in, at its nominal parameters."""
+    return tuple(
+        FrictionCycle(
+            predicted=None,
+            simulated_N=row.limit_cycle_N,
+            simulated_hz=row.limit_cycle_hz,
+            found_by=f"the {row.scenario}",
+        )
+        for row in runs.rows
+        if row.plant == plant and row.draw == NOMINAL and row.limit_cycle_N is not None
+    )
+
+
+def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle: LimitCycle) -> FrictionCycle:
+    period = controller.sample_time_s
+    loop = SampledLoop(
+        plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
+    )
+    lasting = min(max(PERIODS / cycle.frequency_hz, LEAST_S), LONGEST_S)
+    values = plant.complete(params).drop_conditions()
+    start = at_rest(loop, 1, PUSH * np.array(cycle.state))
+    run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
+    force = run.outputs[loop.measured][0]
+    if not np.all(np.isfinite(force)):
+        return FrictionCycle(predicted=cycle, simulated_N=None, simulated_hz=None, runs_away=True)
+    end = force[-int(JUDGED * force.size) :]
+    line = find_oscillation(end, period, floor=FLOOR * cycle.force_N, lowest_hz=0.3 * cycle.frequency_hz)
+    if line is None or not (line.sustained or line.growing):
+        return FrictionCycle(predicted=cycle, simulated_N=None, simulated_hz=None)
+    return FrictionCycle(
+        predicted=cycle, simulated_N=None if line.growing else line.amplitude,
+        simulated_hz=None if line.growing else line.frequency_hz, runs_away=line.growing,
+    )  # fmt: skip

@@ -1,0 +1,132 @@
+"""Limit cycles of friction: textbook ones, and those that a simulator of the tests' own has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import TransferFunction
+from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
+from seaopt.plants.friction import friction_states
+from seaopt.plants.roles import Friction
+from seaopt.robustness.verification.limit_cycles import seek_limit_cycles
+from tests.stick_slip import Mass, simulate
+
+RELAY = 2.0
+
+
+@pytest.fixture(scope="module")
+def rubbing(thor):
+    return thor.update(k=120e3, m_l=0.9, l=0.005, N_p=1, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, eta=0.86, f_c=25, v_s=0.004)
+
+
+@pytest.fixture(scope="module")
+def blind(stand, rubbing):
+    """Return a law that was tuned where the friction sticks, as if it were a damper; sliding its Ms is 7."""
+    spec = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, delay_samples=2)
+    return replace(so.tune(friction_states(stand)["stuck"], rubbing, spec), design=(stand, rubbing))
+
+
+def scaled(controller, factor, **spec):
+    laws = {
+        name: TransferFunction(num=factor * getattr(controller, name).num, den=getattr(controller, name).den)
+        for name in ("reference", "measurement")
+    }
+    return replace(controller, **laws, spec=replace(controller.spec, **spec))
+
+
+def third_order_lag(steepness):
+    """1/(s + 1)^3 from the friction's effort to its velocity, friction a smoothed relay of 2."""
+    return so.Plant(
+        name="relay and lag", states={"v": "N", "a": "N", "b": "N"}, inputs={"I": "A"}, outputs={"v": "N"},
+        parameters={"level": so.Parameter(name="level", value=RELAY, unit="N")},
+        f=lambda t, x, u, p: {"v": x.a - x.v, "a": x.b - x.a, "b": u.I - x.b - u.relay},
+        h=lambda t, x, u, p: {"v": x.v},
+        friction={"relay": Friction(
+            velocity=lambda x, p: x.v, force=lambda v, p: p.level * ca.tanh(v * steepness),
+            slopes=lambda p: (0.0, p.level * steepness),
+        )},
+    )  # fmt: skip
+
+
+def test_a_relay_with_a_third_order_lag_oscillates_at_the_square_root_of_three(blind):
+    """The textbook's example: the lag is 1/8 at 180 degrees, so that the amplitude is 4 M/(8 pi)."""
+    nothing = TransferFunction(num=np.array([0.0]), den=np.array([1.0]))
+    plant = third_order_lag(1e5)
+    spec = so.ControllerSpec(measured="v", bandwidth_hz=25)
+    open_loop = replace(blind, measurement=nothing, reference=nothing, spec=spec, design=(plant, so.ParameterSet()))
+    (cycle,) = predict_limit_cycles(open_loop, plant, so.ParameterSet())
+    assert cycle.stable
+    assert cycle.frequency_hz == pytest.approx(np.sqrt(3.0) / (2 * np.pi), rel=1e-4)
+    assert cycle.velocity == pytest.approx(4 * RELAY / (8 * np.pi), rel=1e-2)
+    assert cycle.force_N == pytest.approx(cycle.velocity, rel=1e-6)
+    (found,) = seek_limit_cycles(open_loop, third_order_lag(1e3), so.ParameterSet())
+    assert found.lasts
+    f = np.linspace(0.2, 0.35, 15001)  # Tsypkin's condition, with every harmonic: sum of Im G(jnw)/n over odd n
+    lag = [(1.0 / (1.0 + 2j * np.pi * n * f) ** 3) for n in range(1, 40, 2)]
+    exact = int(np.argmin(np.abs(sum(np.imag(g) / n for n, g in zip(range(1, 40, 2), lag, strict=True)))))
+    assert found.simulated_hz == pytest.approx(f[exact], rel=0.005)
+    assert found.simulated_N == pytest.approx(4 * RELAY / np.pi * np.abs(lag[0][exact]), rel=0.02)
+
+
+def test_the_describing_function_is_the_declared_curves(thor):
+    """Stribeck's, by SciPy's quadrature, above the slope that falls most."""
+    from scipy.integrate import quad
+
+    plant = so.plants.high_impedance(parts=["stribeck"])
+    params = plant.complete(thor).update(f_c=20.0, f_s=30.0, v_st=0.01, v_s=1e-3)
+    v = np.linspace(0.0, 0.05, 400001)
+    curve = (20.0 + 10.0 * np.exp(-((v / 0.01) ** 2))) * np.tanh(v / 1e-3)
+    flattest = np.min(np.diff(curve)) / v[1]
+    for amplitude in (1e-4, 5e-3, 0.2):
+
+        def integrand(theta, amplitude=amplitude):
+            at = amplitude * np.sin(theta)
+            force = (20.0 + 10.0 * np.exp(-((at / 0.01) ** 2))) * np.tanh(at / 1e-3)
+            return (force - flattest * at) * np.sin(theta)
+
+        expected = 4.0 / np.pi / amplitude * quad(integrand, 0.0, np.pi / 2, limit=400, epsrel=1e-9)[0]
+        found = describe_friction(plant, params, "F_f", np.array([amplitude]))[0]
+        assert found == pytest.approx(expected, rel=2e-2)
+
+
+def test_an_unstable_cycle_bounds_what_friction_holds(blind, stand, rubbing):
+    """Sliding the loop grows; below the predicted cycle friction stops it, above it does not, in either simulator."""
+    wild = scaled(blind, 1.5)
+    (cycle,) = predict_limit_cycles(wild, stand, rubbing)
+    assert not cycle.stable
+    mass = Mass.of({name: rubbing[name].value for name in rubbing})
+    first = cycle.velocity * np.array([0.6, 2.0])
+    runs = simulate([mass] * 2, [wild.to_dict()] * 2, np.zeros((2, 300)), substeps=20, velocity=first)
+    still, grown = np.max(np.abs(runs.force[:, -50:]), axis=1)
+    assert still < 0.01 * cycle.force_N and grown > 10.0 * cycle.force_N
+    spectrum = np.abs(np.fft.rfft(runs.force[1, :120] * np.hanning(120), 4096))
+    assert np.argmax(spectrum) / 4.096 == pytest.approx(cycle.frequency_hz, rel=0.05)
+    (found,) = seek_limit_cycles(wild, stand, rubbing)
+    assert found.runs_away
+
+
+def test_a_cycle_that_the_current_holds_fails_the_certificate(blind, stand, rubbing):
+    wild = scaled(blind, 1.5, current_limit_A=10.0)
+    certificate = so.certify(wild, {"stand": stand}, rubbing)
+    friction = certificate.to_dict()["friction"]["stand"]
+    assert friction["sector_stable"] is False
+    cycle = friction["limit_cycles"][0]
+    assert cycle["simulated"]["frequency_hz"] == pytest.approx(cycle["predicted"]["frequency_hz"], rel=0.1)
+    (row,) = [row for row in certificate.requirements if row.name == "friction_cycle_N"]
+    assert not row.met and row.value == cycle["simulated"]["force_N"]
+
+
+def test_near_the_edge_nothing_is_predicted_and_stability_is_proved(blind, stand, rubbing):
+    """1.2 times the gain: the sliding loop's spectral radius is .991."""
+    edge = scaled(blind, 1.2)
+    radius = np.max(np.abs(edge.close(friction_states(stand)["sliding"], rubbing).eigenvalues()))
+    assert 0.99 < radius < 0.995
+    assert seek_limit_cycles(edge, stand, rubbing) == ()
+    certificate = so.certify(edge, {"stand": stand}, rubbing)
+    assert certificate.to_dict()["friction"]["stand"]["sector_stable"] is True
+    assert certificate.cycles == {}
