@@ -34,6 +34,7 @@ _CAPTIONS = {
     "ranking": "Residuals of the fits that are compared, octave by octave",
     "loop": "The closed loop on every plant",
     "simulation": "Force and current of each scenario; grey: link 2 is held; yellow: the judged window of a failed run",
+    "bandwidth": "Bandwidth against amplitude",
     "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
     "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -106,6 +107,33 @@ def large_signal_figure(sweeps: Sequence[LargeSignal]) -> Figure:
     return figure
 
 
+def bandwidth_figure(sweeps: Sequence[LargeSignal]) -> Figure:
+    """Draw bandwidth against amplitude, one curve per plant: simulated as points, predicted as a line."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    figure, axes = panels(1, 1, 3.2)
+    axis = axes[0, 0]
+    for sweep, colour in zip(sweeps, itertools.cycle(PLANT_COLOURS), strict=False):
+        points, line = (
+            np.array([np.nan if hz is None else hz for hz in values])
+            for values in (sweep.bandwidth_hz, sweep.predicted_hz)
+        )
+        axis.loglog(sweep.amplitude_N, line, color=colour, linewidth=1.3, label=f"{sweep.plant}, predicted")
+        axis.loglog(sweep.amplitude_N, points, "o", color=colour, markersize=4, label=f"{sweep.plant}, simulated")
+        saturated = np.any(sweep.saturated, axis=1)
+        axis.loglog(sweep.amplitude_N[saturated], points[saturated], "s", color=colour, markersize=7, fillstyle="none")
+        if sweep.friction_N:
+            axis.axvline(sweep.friction_N, color=colour, linestyle=":", linewidth=0.9)
+    for one in (axis.xaxis, axis.yaxis):
+        one.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        one.set_minor_formatter(NullFormatter())
+    axis.set_xlabel("amplitude of the reference [N]; dotted: dry friction; squares: the current saturates in the sweep")
+    axis.set_ylabel("bandwidth [Hz]")
+    axis.legend(frameon=False, fontsize="small")
+    return figure
+
+
 def stability_figure(stability: StabilityMap) -> Figure:
     """Draw where the loop is stable against a mass on a spring, a panel per damper."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -147,6 +175,7 @@ def verification_figures(
         played = dict.fromkeys(row.plant for row in verification.rows)
         out |= {f"simulation_{name}": verification_figure(verification, name) for name in played}
     if large:
+        out["bandwidth"] = bandwidth_figure(large)
         out["amplitude"] = large_signal_figure(large)
     if coupled is not None:
         out["environments"] = stability_figure(coupled)

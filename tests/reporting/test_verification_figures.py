@@ -27,9 +27,9 @@ def test_the_page_names_what_failed_and_shows_every_figure(stand, swing, thor, t
     coupled = coupled_stability(controller, stand, thor, points=4, dampings_N_s_per_m=(0.0, 50.0, 100.0))
     page = so.write_report([controller, found, large, coupled], tmp_path / "r.html").read_text(encoding="utf-8")
     assert {item.name for item in (tmp_path / "figures").glob("*.png")} == {
-        "loop.png", "simulation_swing.png", "amplitude.png", "environments.png",
+        "loop.png", "simulation_swing.png", "bandwidth.png", "amplitude.png", "environments.png",
     }  # fmt: skip
-    assert page.count("<svg") == 4
+    assert page.count("<svg") == 5
     assert "&lt;knock&gt;" in page and "<knock>" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
     assert "Simulation: failed" in page and "are allowed" in page
     assert "Not played: &lt;knock&gt; on stand" in page

@@ -16,6 +16,7 @@ from seaopt.errors import ControlError, SeaoptError
 from seaopt.formatting import format_band, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import has_friction
 from seaopt.records import record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
@@ -53,7 +54,7 @@ class Simulated:
     verification : Verification or None
         None if a plant cannot be simulated.
     large_signal : tuple of LargeSignal
-        One per plant, the design plant first; empty without a current limit.
+        One per plant, the design plant first; empty without a current limit and friction.
     passivity, environments : Passivity and StabilityMap, or None
         None for a plant without a port at link 2.
     left_out : mapping of what to reason
@@ -255,7 +256,8 @@ def _list_sweeps(
     """Return what is swept: a name, plant and parameters, and what to call the sweep if it fails."""
     assert controller.design is not None
     design, values = controller.design
-    if controller.spec.current_limit_A is None:  # one reason for all of them
+    rub = any(has_friction(plant, parameters) for plant in plants.values())
+    if controller.spec.current_limit_A is None and not rub:  # one reason for all of them
         return [(design.name, (design, values), "large signals")]
     known = next((name for name, plant in plants.items() if plant is design), design.name)
     on = {known: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != known}
@@ -267,7 +269,10 @@ def _sweep(controller: Controller, name: str, plant: Plant, parameters: Paramete
 
 
 def _format_large(sweep: LargeSignal) -> str:
-    pairs = zip(sweep.amplitude_N, sweep.bandwidth_hz, strict=True)
+    pairs = list(zip(sweep.amplitude_N, sweep.bandwidth_hz, strict=True))
+    if sweep.friction_N:  # stuck, widest, saturated; the others are in the report
+        widest = max(pairs, key=lambda pair: pair[1] or 0.0)
+        pairs = [pair for pair in pairs if pair in (pairs[0], widest, pairs[-1])]
     return ", ".join(f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.3g} N" for amplitude, hz in pairs)
 
 

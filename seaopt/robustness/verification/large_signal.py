@@ -1,4 +1,4 @@
-r"""The bandwidth that remains at large amplitudes, where the current saturates, by a stepped sine.
+r"""Bandwidth against amplitude, from stuck through sliding to saturation, by a stepped sine, and predicted.
 
 A sine :math:`F_\mathrm{ref} = A \sin 2\pi f t` is kept until the loop has settled; the first harmonic of the force over
 whole periods is the describing-function gain at (f, A). As long as nothing saturates it is the linear response, up
@@ -7,7 +7,8 @@ to the amplitude
 .. math:: A_\mathrm{max}(f) = \frac{F_\mathrm{sat}}{|C_r S|} = F_\mathrm{sat} \frac{|P|}{|T_r|},
 
 the saturation map: the motor force that a tracked reference takes, T/P, is a property of the plant, whatever the
-controller.
+controller. Below the dry friction the force follows through a plant that sticks, or creeps, and reaches less far.
+The same gains are predicted by describing functions (`amplitude_prediction`).
 """
 
 from __future__ import annotations
@@ -20,19 +21,25 @@ from jaxtyping import Bool, Complex, Float
 
 from seaopt.control import Controller
 from seaopt.control.laws.realisation import runnable
+from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError
 from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import find_dry_friction, take_sliding
 from seaopt.records import record
+from seaopt.robustness.verification.amplitude_prediction import predict_gain
 
 MEASURED_PERIODS, SETTLING_PERIODS = 6, 12
 LEAST_SETTLING_S = 0.6
 AMPLITUDES = (0.1, 0.5, 1.0, 2.0, 4.0)  # of the force that the limit allows at the bandwidth
 SWEEP_POINTS = 14
 STATIC_HZ = 1e-3  # stands for 0 Hz
+LEAST_FRICTION, MOST_FRICTION, FRICTION_AMPLITUDES = 0.1, 50.0, 9  # times the dry friction: from stuck to sliding
+SLOWEST_STUCK = 15.0  # times slower than the bandwidth: where sweeps begin on a plant with friction
+PREDICTED_POINTS = 80
 
 
 @record(eq=False)
@@ -53,7 +60,12 @@ class LargeSignal:
     onset_N : array, shape (f,)
         A_max of the linear loop.
     bandwidth_hz : tuple of float or None, one per amplitude
-        Highest frequency at which the gain is not yet 3 dB below the linear loop's at 0 Hz; None: not within the sweep.
+        Frequency at which the gain falls 3 dB below the linear loop's at 0 Hz, where a link moves for the last time;
+        None: not within the sweep.
+    predicted_hz : tuple of float or None, one per amplitude
+        The same by describing functions.
+    friction_N : float
+        The dry friction, as an effort at the spring; zero where there is none.
 
     """
 
@@ -64,6 +76,8 @@ class LargeSignal:
     saturated: Bool[np.ndarray, "a f"]
     onset_N: Float[np.ndarray, " f"]
     bandwidth_hz: tuple[float | None, ...]
+    predicted_hz: tuple[float | None, ...]
+    friction_N: float
 
     def to_dict(self) -> dict[str, Any]:
         """Return amplitudes, bandwidths and the saturation map, for robustness.json."""
@@ -71,13 +85,19 @@ class LargeSignal:
             "plant": self.plant,
             "amplitude_N": self.amplitude_N.tolist(),
             "bandwidth_hz": list(self.bandwidth_hz),
+            "predicted_hz": list(self.predicted_hz),
+            "friction_N": self.friction_N,
             "saturation_map": {"frequency_hz": self.frequency_hz.tolist(), "amplitude_N": self.onset_N.tolist()},
         }
 
     def __repr__(self) -> str:
-        lines = [f"Large-signal bandwidth on {self.plant}"]
-        for amplitude, band, hit in zip(self.amplitude_N, self.bandwidth_hz, self.saturated, strict=True):
+        dry = f", dry friction {self.friction_N:.4g} N" if self.friction_N else ""
+        lines = [f"Bandwidth against amplitude on {self.plant}{dry}"]
+        for amplitude, band, predicted, hit in zip(
+            self.amplitude_N, self.bandwidth_hz, self.predicted_hz, self.saturated, strict=True
+        ):
             bandwidth = "not within the sweep" if band is None else f"{band:.4g} Hz"
+            bandwidth += "" if predicted is None else f" (predicted {predicted:.4g} Hz)"
             from_hz = f", saturates from {self.frequency_hz[np.argmax(hit)]:.4g} Hz" if np.any(hit) else ""
             lines.append(f"  {amplitude:.4g} N: {bandwidth}{from_hz}")
         return "\n".join(lines)
@@ -98,14 +118,14 @@ def large_signal(
     Parameters
     ----------
     controller : Controller
-        With a current limit.
+        With a current limit, unless the plant has friction.
     plant, parameters
         The plant that it runs on.
     amplitudes_N : tuple of float, optional
-        Multiples of what the limit allows at the bandwidth if left out.
+        Multiples of what the limit allows at the bandwidth if left out; with friction from a tenth of it upwards.
     frequencies_hz : tuple of float, optional
-        From a fifth to twice the bandwidth if left out; each is moved to the nearest with whole periods in whole
-        samples.
+        From a fifth of the bandwidth to twice if left out, with friction from a fifteenth; each is moved to the nearest
+        with whole periods in whole samples.
 
     Returns
     -------
@@ -114,8 +134,8 @@ def large_signal(
     Raises
     ------
     ControlError
-        The controller has no current limit, its linear loop on the plant is unstable, or an amplitude or frequency is
-        out of range.
+        The controller has no current limit and the plant no friction, the linear loop is unstable, or an amplitude or
+        frequency is out of range.
 
     Examples
     --------
@@ -128,15 +148,18 @@ def large_signal(
 
     """
     limit, period, band = controller.spec.current_limit_A, controller.sample_time_s, controller.spec.bandwidth_hz
-    if limit is None:
+    values = plant.complete(parameters)
+    friction = sum(find_dry_friction(plant, values).values())
+    if limit is None and not friction:
         raise ControlError("the controller has no current_limit_A, so that nothing saturates; give one in its spec")
-    if not controller.close(plant, parameters).figures().stable:
+    linear = controller.close(take_sliding(plant, values), values)
+    if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
     )
     if frequencies_hz is None:
-        wanted = np.geomspace(band / 5, 2 * band, SWEEP_POINTS)
+        wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
     else:
         wanted = np.array(frequencies_hz, float)
     if not (np.all(wanted > 0.0) and np.all(np.diff(wanted) > 0.0) and np.all(wanted < 0.25 / period)):
@@ -145,10 +168,10 @@ def large_signal(
         )
     lengths = np.round(MEASURED_PERIODS / (wanted * period)).astype(int)
     f = MEASURED_PERIODS / (lengths * period)
-    onset = _compute_onset(controller, plant, parameters, f)
-    static = float(np.abs(controller.close(plant, parameters).tracking(np.array([STATIC_HZ])))[0])
-    at_band = float(_compute_onset(controller, plant, parameters, np.array([float(band)]))[0])
-    amplitude = np.array(amplitudes_N, float) if amplitudes_N is not None else np.array(AMPLITUDES) * at_band
+    onset = _compute_onset(controller, linear, f)
+    static = float(np.abs(linear.tracking(np.array([STATIC_HZ])))[0])
+    at_band = float(_compute_onset(controller, linear, np.array([float(band)]))[0])
+    amplitude = np.array(amplitudes_N if amplitudes_N is not None else _choose_amplitudes(at_band, friction), float)
     if not (amplitude.size and np.all(amplitude > 0.0)):
         raise ControlError(f"amplitudes_N = {amplitudes_N} are not positive; give some")
     gain = np.zeros((amplitude.size, f.size), dtype=complex)
@@ -159,29 +182,44 @@ def large_signal(
         run = run_loop(loop, [parameters] * amplitude.size, amplitude[:, None] * np.sin(phase))
         force, current = run.outputs[loop.measured][:, -length:], run.current[:, -length:]
         gain[:, column] = 2j * np.mean(force * np.exp(-1j * phase[-length:]), axis=1) / amplitude
-        saturated[:, column] = np.max(np.abs(current), axis=1) >= limit * (1 - 1e-9)
+        saturated[:, column] = np.max(np.abs(current), axis=1) >= (math.inf if limit is None else limit * (1 - 1e-9))
+    dense = np.geomspace(f[0], f[-1], PREDICTED_POINTS)
+    predicted = np.abs(predict_gain(controller, plant, values, dense, amplitude))
     return LargeSignal(
         plant=plant.name, frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
-        bandwidth_hz=tuple(_find_bandwidth(f, np.abs(row), static) for row in gain),
+        bandwidth_hz=tuple(_find_bandwidth(f, np.abs(row), static, plant.moves) for row in gain),
+        predicted_hz=tuple(_find_bandwidth(dense, row, static, plant.moves) for row in predicted),
+        friction_N=friction,
     )  # fmt: skip
 
 
-def _compute_onset(
-    controller: Controller, plant: Plant, parameters: ParameterSet, f: Float[np.ndarray, " f"]
-) -> Float[np.ndarray, " f"]:
+def _choose_amplitudes(at_band: float, friction: float) -> Float[np.ndarray, " a"]:
+    """Return amplitudes (N) from stuck to saturation, of what is there of the two."""
+    saturating = np.array(AMPLITUDES) * at_band
+    if not friction:
+        return saturating
+    last = saturating[-1] if math.isfinite(at_band) else MOST_FRICTION * friction
+    return np.geomspace(min(LEAST_FRICTION * friction, 0.1 * last), last, FRICTION_AMPLITUDES)
+
+
+def _compute_onset(controller: Controller, loop: Loop, f: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """Return the amplitude (N) at which the linear loop's current saturates; infinite without a limit."""
     limit = controller.spec.current_limit_A
-    assert limit is not None
-    loop = controller.close(plant, parameters)
-    motor = np.abs(loop.reference.response(f, controller.sample_time_s) * loop.sensitivity(f))
-    return limit / controller.command.per_effort / motor
+    effort = np.abs(loop.tracking(f) / loop.plant.response(f))
+    return np.full(f.size, np.inf) if limit is None else limit / controller.command.per_effort / effort
 
 
-def _find_bandwidth(f: Float[np.ndarray, " f"], gain: Float[np.ndarray, " f"], static: float) -> float | None:
-    """Return where the gain last falls through 3 dB below the static one, on straight lines in logarithms."""
+def _find_bandwidth(
+    f: Float[np.ndarray, " f"], gain: Float[np.ndarray, " f"], static: float, moves: bool
+) -> float | None:
+    """Return where the gain falls through 3 dB below the static one, on straight lines in logarithms.
+
+    It is the first fall, and the last where the link moves: below its tracking band such a plant does not follow.
+    """
     level = np.log(np.maximum(gain, 1e-300)) - math.log(HALF_POWER * static)
     falls = np.flatnonzero((level[:-1] >= 0.0) & (level[1:] < 0.0))
-    if not falls.size or level[-1] >= 0.0:
+    if not falls.size or (moves and level[-1] >= 0.0) or (not moves and level[0] < 0.0):
         return None
-    k = int(falls[-1])
+    k = int(falls[-1 if moves else 0])
     share = level[k] / (level[k] - level[k + 1])
     return float(np.exp(np.log(f[k]) + share * (np.log(f[k + 1]) - np.log(f[k]))))

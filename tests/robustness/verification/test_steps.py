@@ -10,6 +10,8 @@ import pytest
 import seaopt as so
 from seaopt.control import TransferFunction
 from seaopt.plants.friction import friction_states
+from seaopt.robustness.verification.amplitude_prediction import predict_gain
+from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.scenarios import step_scenarios
 from seaopt.robustness.verification.verification import verify
 from tests.stick_slip import Mass, simulate
@@ -84,3 +86,20 @@ def test_a_run_away_is_told_once_and_allows_nothing_absurd(blind, stand, rubbing
     assert (told.value, "unstable" in told.where) == (4.0, True)
     sizes = [step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]]
     assert min(sizes) > 1.0
+
+
+def test_bandwidth_against_amplitude_is_that_of_an_independent_simulator(blind, stand, rubbing):
+    """Stuck and sliding: sines on the tests' own simulator, as simulated and as predicted."""
+    smooth = replace(blind, spec=replace(SPEC, current_limit_A=None))
+    amplitude, f = np.array([5.0, 40.0, 1000.0]), 500.0 / 22  # Hz: 132 samples are three periods
+    sweep = large_signal(smooth, stand, rubbing, amplitudes_N=tuple(amplitude), frequencies_hz=(f,))
+    assert sweep.friction_N == pytest.approx(25.0)
+    wave = np.exp(2j * np.pi * sweep.frequency_hz[0] * 1e-3 * np.arange(800))
+    mass = Mass.of({name: rubbing[name].value for name in rubbing})
+    runs = simulate([mass] * 3, [smooth.to_dict()] * 3, amplitude[:, None] * wave.imag, substeps=20)
+    last = slice(800 - round(6 * 1e3 / sweep.frequency_hz[0]), 800)
+    expected = 2.0 * np.abs(np.mean(runs.force[:, last] * wave.conj()[last], axis=1)) / amplitude
+    assert np.abs(sweep.gain[:, 0]) == pytest.approx(expected, rel=0.02)
+    predicted = np.abs(predict_gain(smooth, stand, rubbing, sweep.frequency_hz, amplitude))[:, 0]
+    assert predicted == pytest.approx(expected, rel=0.05)
+    assert expected[2] > 1.5 * expected[0]

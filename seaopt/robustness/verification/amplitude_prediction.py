@@ -1,0 +1,117 @@
+r"""The response to a sine of finite amplitude, predicted by describing functions of friction and of saturation.
+
+Friction above its flattest slope is replaced by :math:`N(V)` (`seaopt.control.laws.limit_cycles`), the current limit by
+
+.. math:: \sigma(x) = \frac{2}{\pi} \Big( \arcsin x + x \sqrt{1 - x^2} \Big), \qquad x = F_\mathrm{sat} / U \le 1,
+
+each at the amplitude that it meets, of velocity V and of motor effort U. With the law's effort
+:math:`\sigma (C_r r - C_y y)` and the fundamental alone of what is held in between, V follows from
+
+.. math:: V\,|1 + N(V) H_\sigma| = |T_{v\sigma}|\, A
+
+for every :math:`\sigma`, H from friction effort and T from reference to velocity, and :math:`\sigma` from its own
+function of U. Where several V solve this, the smallest is taken: the loop comes from rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control import Controller
+from seaopt.control.laws.friction_proof import take_friction_out
+from seaopt.control.laws.limit_cycles import AMPLITUDES, describe_friction
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
+
+SATURATION_GAINS = np.geomspace(1.0, 1e-2, 80)
+
+
+def predict_gain(
+    controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"],
+    amplitude: Float[np.ndarray, " a"],
+) -> Complex[np.ndarray, "a f"]:  # fmt: skip
+    """Return force over reference at amplitudes (N) and frequencies (Hz), the fundamental alone.
+
+    Where several frictions change with the velocity, each is taken for sliding.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
+    >>> controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    >>> stuck, sliding = np.abs(predict_gain(controller, stand, rubbing, np.array([15.0]), np.array([0.1, 1e4])))[:, 0]
+    >>> bool(stuck < sliding)
+    True
+
+    """
+    values = plant.complete(params)
+    loop = controller.close(take_sliding(plant, values), values)
+    p, s = loop.plant.response(f), loop.sensitivity(f)
+    c_y, c_r = loop.open_loop(f) / p, loop.tracking(f) / (p * s)
+    limit = controller.spec.current_limit_A
+    most = np.inf if limit is None else limit / controller.command.per_effort
+    friction = _Friction.of(controller, plant, values, f)
+    gains = SATURATION_GAINS if limit is not None else SATURATION_GAINS[:1]
+    sigma = gains[:, None, None]
+    closed = 1.0 / (1.0 + sigma * p * c_y)  # (s, 1, f)
+    a = amplitude[None, :, None]
+    w = friction.effort(sigma, closed, c_r, c_y, a)  # (s, a, f)
+    asked = closed * (c_r * a - c_y * friction.on_output * w)
+    force = p * sigma * asked + friction.on_output * w
+    share = np.minimum(most / np.maximum(np.abs(asked), 1e-300), 1.0)
+    met = 2.0 / np.pi * (np.arcsin(share) + share * np.sqrt(1.0 - share**2))
+    first = np.argmax(met >= sigma, axis=0)  # from no saturation downwards
+    return np.take_along_axis(force, first[None], axis=0)[0] / amplitude[:, None]
+
+
+class _Friction:
+    """The friction of a plant as a port of its loop, at frequencies; none where nothing changes with the velocity."""
+
+    def __init__(
+        self, on_output: Complex[np.ndarray, " f"], mobility: Complex[np.ndarray, " f"],
+        by_motor: Complex[np.ndarray, " f"], gains: Float[np.ndarray, " v"],
+    ) -> None:  # fmt: skip
+        self.on_output, self.mobility, self.by_motor, self.gains = on_output, mobility, by_motor, gains
+
+    @classmethod
+    def of(cls, controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"]) -> _Friction:
+        loop = take_friction_out(controller, plant, params)
+        nothing = np.zeros(f.size, dtype=complex)
+        if loop is None or np.count_nonzero(loop.slopes) != 1:
+            return cls(nothing, nothing, nothing, np.zeros(AMPLITUDES.size))
+        port = int(np.flatnonzero(loop.slopes)[0])
+        s, period = 2j * np.pi * f, loop.plant.sample_time_s
+        causes = np.column_stack([loop.friction[:, port], loop.motor]).astype(complex)
+        inner = s[:, None, None] * np.eye(loop.motor.size) - loop.a
+        by_friction, by_motor = np.moveaxis(
+            np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape))), 2, 0
+        )
+        late = s * (period * loop.plant.delay_samples + loop.delay_s)
+        hold = -np.expm1(-s * period) / (s * period) * np.exp(-late)
+        return cls(
+            on_output=by_friction @ loop.measured + loop.through[port], mobility=by_friction @ loop.velocity[port],
+            by_motor=by_motor @ loop.velocity[port] * hold,
+            gains=describe_friction(plant, params, list(plant.friction)[port], AMPLITUDES),
+        )  # fmt: skip
+
+    def effort(
+        self, sigma: Float[np.ndarray, "s 1 1"], closed: Complex[np.ndarray, "s 1 f"], c_r: Complex[np.ndarray, " f"],
+        c_y: Complex[np.ndarray, " f"], amplitude: Float[np.ndarray, "1 a 1"],
+    ) -> Complex[np.ndarray, "s a f"]:  # fmt: skip
+        """Return the fundamental of the friction's effort on the plant."""
+        h = self.mobility - self.by_motor * sigma * closed * c_y * self.on_output
+        t = self.by_motor * sigma * closed * c_r
+        if not np.any(self.gains):
+            return np.zeros(np.broadcast_shapes(t.shape, amplitude.shape), dtype=complex)
+        v = AMPLITUDES[:, None, None, None]
+        # Rising, so that the smallest V is taken where several will do.
+        needed = np.maximum.accumulate(v * np.abs(1.0 + self.gains[:, None, None, None] * h), axis=0)[:, :, 0]
+        asked = np.abs(t) * amplitude
+        above = np.clip(np.count_nonzero(needed[:, :, None] < asked, axis=0), 1, AMPLITUDES.size - 1)
+        rows, _, columns = np.ogrid[: above.shape[0], :1, : above.shape[2]]
+        low, high = (np.log(needed[above - step, rows, columns]) for step in (1, 0))
+        share = np.clip((np.log(np.maximum(asked, 1e-300)) - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
+        gain = (1.0 - share) * self.gains[above - 1] + share * self.gains[above]
+        return -gain * t * amplitude / (1.0 + gain * h)
