@@ -10,6 +10,7 @@ tuner but the plant's continuous matrices and the law's definition. Options: --c
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -90,8 +91,9 @@ class Judge:
         if observer is not None:
             polynomial = np.polynomial.polynomial.polyval
             self.kept = polynomial(self.q, observer.nominal.kept)
-            inverse = observer.nominal.inverse
-            self.inverse = polynomial(self.q, inverse.num) / polynomial(self.q, inverse.den)
+            self.inverse = math.prod(
+                polynomial(self.q, part.num) / polynomial(self.q, part.den) for part in observer.nominal.inverse
+            )
 
     def hold(self, model, gain):
         n = model.A.shape[0]
@@ -229,8 +231,8 @@ def stable(case: Case, controller: so.Controller, numbers) -> bool:
         observer=None if observer is None else replace(observer, T_q=one["Q"]),
         notch=Notch(frequency_hz=one["f"], width=one["w"], depth=one["g"]) if "f" in one else None,
     )  # fmt: skip
-    law = gains.transfer_functions(case.spec.structure, case.spec.sample_time_s)
-    loops = [Loop(plant=controller.plant(p, case.params), reference=law[0], measurement=law[1]) for p in case.plants]
+    law = gains.law(case.spec.structure, case.spec.sample_time_s)
+    loops = [Loop(plant=controller.plant(p, case.params), law=law) for p in case.plants]
     return all(np.max(np.abs(loop.eigenvalues())) < 1.0 for loop in loops)
 
 
@@ -299,7 +301,7 @@ def beside_mixsyn(bandwidth_hz: float = 30.0, ms: float = 1.6, noise_gain: float
     print(f"{'':12}{'Hz':>7}{'Ms':>7}{'noise gain':>12}{'|S| < -3 dB to':>16}{'int |S| dlnf':>14}{'order':>7}"
           f"{'fastest pole':>14}{'cpu s':>7}")  # fmt: skip
     print(f"{'so.tune pid':12}{a.bandwidth_hz:7.2f}{a.ms:7.3f}{a.noise_gain:12.1f}{a.sensitivity_bandwidth_hz:13.2f} Hz"
-          f"{rejected[0]:14.3f}{found.measurement.den.size - 1:7d}{'discrete':>14}{tuned_s:7.2f}")  # fmt: skip
+          f"{rejected[0]:14.3f}{found.law.c.size:7d}{'discrete':>14}{tuned_s:7.2f}")  # fmt: skip
     print(f"{'mixsyn':12}{f[under[0]] if under.size else np.nan:7.2f}{np.abs(sensitivity).max():7.3f}"
           f"{np.abs(k * sensitivity).max():12.1f}{slow:13.2f} Hz{rejected[1]:14.3f}{law.nstates:7d}"
           f"{np.abs(law.poles()).max():14.3g}{made_s:7.2f}, corner {low:.3g} Hz")  # fmt: skip

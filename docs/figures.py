@@ -171,13 +171,12 @@ def anti_windup() -> None:
     plant, params = so.plants.high_impedance(), so.plants.thor()
     gain = command_of(plant, params, "F1").per_effort
     a, b, c, _ = sample(plant, params, "F1", gain, 1e-3, 1).delayed()
-    pair = GAINS.transfer_functions("pid", 1e-3)
     time = np.arange(4000) * 1e-3
     figure, axes = new(["force", "current"], "F1 over what 9 A hold", "time [s]")
     axes[1].set_ylabel("current [A]")
     roots = {"k_r/k_i = 3.2 s": None, "sqrt(T_i T_d) = 0.16 s": 0.158, "none": 1e9}
     for (label, tracking), colour in zip(roots.items(), ("#0072b2", "#d55e00", "#777777"), strict=True):
-        law = realise(*pair, sample_time_s=1e-3, per_effort=gain, current_limit_A=9.0, tracking_time_s=tracking)
+        law = realise(GAINS.law("pid", 1e-3), per_effort=gain, current_limit_A=9.0, tracking_time_s=tracking)
         x, state, forces, currents = np.zeros(b.size), law.reset(), [], []
         for t in time:
             force = float(c @ x)
@@ -195,14 +194,14 @@ def passivity() -> None:
     plant, params = so.plants.high_impedance(), so.plants.thor()
     port = port_of(plant, params, "F1", command_of(plant, params, "F1").per_effort)
     f = np.geomspace(0.1, 499, 2000)
-    _, c_y = GAINS.transfer_functions("pid", 1e-3)
+    c_y = GAINS.law("pid", 1e-3).measurement_response(f)
     figure, axes = new(["port impedance", "cosine of its angle"], "|Z| [N s/m]")
     axes[1].set_ylabel("Re Z / |Z|")
     without = np.zeros(f.size, dtype=complex)
     laws = {
         "no control": without,
-        "pid, held, one sample late": c_y.response(f, 1e-3) * hold_response(f, 1e-3, 1),
-        "the same, two samples late": c_y.response(f, 1e-3) * hold_response(f, 1e-3, 2),
+        "pid, held, one sample late": c_y * hold_response(f, 1e-3, 1),
+        "the same, two samples late": c_y * hold_response(f, 1e-3, 2),
     }
     for (label, law), colour in zip(laws.items(), ("#777777", "#0072b2", "#d55e00"), strict=True):
         z = port.response(f).impedance(law)

@@ -7,6 +7,7 @@ from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.margins import DiskMargin, Margins, margins, nu_gap
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -26,9 +27,9 @@ from seaopt.control.tuning.tuner import tune
 
 __all__ = [
     "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "LawState", "Loop", "LoopFigures",
-    "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity", "RunnableLaw", "SampledLoop",
-    "TransferFunction", "close_loop", "command_of", "corners", "draw", "estimate_noise", "estimator", "export",
-    "export_mpc", "force_mpc", "margins", "nu_gap", "passivity", "passivity_rows", "realise", "run_loop", "runnable",
-    "sample", "sweep", "tune",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "Law", "LawState", "Loop",
+    "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity", "RunnableLaw",
+    "SampledLoop", "TransferFunction", "close_loop", "command_of", "corners", "draw", "estimate_noise", "estimator",
+    "export", "export_mpc", "force_mpc", "margins", "nu_gap", "passivity", "passivity_rows", "realise", "run_loop",
+    "runnable", "sample", "sweep", "tune",
 ]  # fmt: skip

@@ -38,15 +38,15 @@ import time
 os.sched_getaffinity = lambda process: {0, 1}  # two threads on any machine
 import numpy as np
 import seaopt as so
-from seaopt.control import TransferFunction
+from seaopt.control import Law, TransferFunction
 from seaopt.control.laws.realisation import realise
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 
 den = np.array([1.0, -1.5, 0.5])
+tops = [19.001, -35.9995, 16.9995], [18.001, -34.4995, 16.4995]
+pair = [TransferFunction(num=np.array(num), den=den) for num in tops]
 law = realise(
-    TransferFunction(num=np.array([19.001, -35.9995, 16.9995]), den=den),
-    TransferFunction(num=np.array([18.001, -34.4995, 16.4995]), den=den),
-    sample_time_s=1e-3, per_effort=1 / 240.3318, current_limit_A=9.0,
+    Law.from_transfer_functions(*pair, sample_time_s=1e-3), per_effort=1 / 240.3318, current_limit_A=9.0,
 )
 loop = SampledLoop(plant=so.plants.moving_output(), law=law, measured="F1", delay_samples=1)
 params = [so.plants.thor().update(I_p=value) for value in np.linspace(0.2, 0.6, 16)]

@@ -79,7 +79,7 @@ def export(
     ControlError
         The controller is not feasible or not stable on its design plant, or an argument is out of range.
     FileError
-        The content is malformed, its gains do not give its coefficients, or the folder cannot be written.
+        The content is malformed or contradicts its law, or the folder cannot be written.
 
     Examples
     --------
@@ -164,9 +164,7 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
 
 def _law(stored: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
     return realise(
-        stored["reference"],
-        stored["measurement"],
-        sample_time_s=stored["sample_time_s"],
+        stored["law"],
         per_effort=stored["command"].per_effort,
         current_limit_A=stored["spec"].current_limit_A if current_limit_A is None else current_limit_A,
         tracking_time_s=tracking_time_s,
@@ -214,7 +212,7 @@ def _numbers(
     def row(values: Iterable[float]) -> str:
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
-    rest = law.rest()
+    rest, transfer_functions = law.rest(), stored["law"].transfer_functions()
     largest = float(LARGEST_NUMBER[precision])
     return {
         "a": [row(values) for values in law.a] or [number(0.0)],
@@ -237,8 +235,8 @@ def _numbers(
             for key, value in stored["gains"].items()
         ],
         "transfer_functions": [
-            {"name": key, "num": row(stored[key].num), "den": row(stored[key].den)}
-            for key in ("reference", "measurement")
+            {"name": key, "num": row(tf.num), "den": row(tf.den)}
+            for key, tf in zip(("reference", "measurement"), transfer_functions, strict=True)
         ],
     }
 

@@ -13,6 +13,7 @@ from seaopt.control.laws.limits import Limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver
 from seaopt.control.laws.verdict import list_broken_figures, list_design_figures
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -41,20 +42,20 @@ _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 @record(eq=False)
 class Controller:
-    """F_m = C_r F_ref - C_y F_meas, commanded as the input of the plant that makes that effort.
+    """A law from reference and measured force to an effort, commanded as the input of the plant that makes that effort.
 
     Parameters
     ----------
     structure : str
         "pd", "pid" or "pid_dob".
     gains : mapping
-        For reading; the law is `reference` and `measurement`.
+        For reading; what counts is `law`.
     sample_time_s : float
         Seconds.
     delay_samples : int
         Whole samples from measurement to output, besides the hold.
-    reference, measurement : TransferFunction
-        C_r and C_y.
+    law : Law
+        From (reference, measured) to effort.
     command : Command
         The commanded input for an effort, of the design plant.
     spec : ControllerSpec
@@ -83,8 +84,7 @@ class Controller:
     gains: Mapping[str, float]
     sample_time_s: float
     delay_samples: int
-    reference: TransferFunction
-    measurement: TransferFunction
+    law: Law
     command: Command
     spec: ControllerSpec
     achieved: LoopFigures
@@ -95,6 +95,16 @@ class Controller:
     observer: DisturbanceObserver | None = None
     blocked_by: tuple[str, ...] = ()
     largest_bandwidth_hz: float | None = None
+
+    @property
+    def reference(self) -> TransferFunction:
+        """C_r of F_m = C_r F_ref - C_y F_meas: the law multiplied out, for reading."""
+        return self.law.transfer_functions()[0]
+
+    @property
+    def measurement(self) -> TransferFunction:
+        """C_y of F_m = C_r F_ref - C_y F_meas: the law multiplied out, for reading."""
+        return self.law.transfer_functions()[1]
 
     @property
     def explanation(self) -> str:
@@ -157,7 +167,7 @@ class Controller:
         At rest smoothed friction looks like a damper that is gone in motion; `seaopt.plants.friction` has both plants.
         """
         sliding = self.plant(take_sliding(plant, params), params)
-        return Loop(plant=sliding, reference=self.reference, measurement=self.measurement)
+        return Loop(plant=sliding, law=self.law)
 
     def force_limit(self, frequency_hz: float) -> float | None:
         """Return the largest amplitude of F_ref (N) at a frequency that `current_limit_A` allows on the design plant.
@@ -168,23 +178,25 @@ class Controller:
             return None
         loop = self.close(*self.design)
         f = np.array([float(frequency_hz)])
-        force = np.abs(loop.reference.response(f, self.sample_time_s) * loop.sensitivity(f))[0]
+        force = np.abs(loop.law.reference_response(f) * loop.sensitivity(f))[0]
         return float(self.spec.current_limit_A / self.command.per_effort / force)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/2)."""
-        achieved = {field.name: getattr(self.achieved, field.name) for field in fields(LoopFigures)}
+        reference, measurement = self.law.transfer_functions()
         return {
             "schema": CONTROLLER_SCHEMA,
             "structure": self.structure,
             "gains": dict(self.gains),
             "sample_time_s": self.sample_time_s,
             "delay_samples": self.delay_samples,
-            "reference": {"num": self.reference.num, "den": self.reference.den},
-            "measurement": {"num": self.measurement.num, "den": self.measurement.den},
+            "measured": [self.spec.measured],
+            "law": self.law.to_dict(),
+            "reference": {"num": reference.num, "den": reference.den},
+            "measurement": {"num": measurement.num, "den": measurement.den},
             "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
             "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
-            "achieved": {name: value for name, value in achieved.items() if name not in _NOT_ACHIEVED},
+            "achieved": _list_achieved(self.achieved),
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
@@ -206,7 +218,7 @@ class Controller:
             "Q": {"num": q.num, "den": q.den},
             "Q_over_P_n": {"num": inverse.num, "den": inverse.den},
             "kept": nominal.kept,
-            "inverse": {"num": nominal.inverse.num, "den": nominal.inverse.den},
+            "inverse": [{"num": part.num, "den": part.den} for part in nominal.inverse],
         }
 
     @classmethod
@@ -218,17 +230,17 @@ class Controller:
         Raises
         ------
         FileError
-            A field is missing or malformed, or gains and coefficients differ.
+            A field is missing or malformed, or one contradicts the law: gains, reference, measurement, achieved.
 
         """
-        from seaopt.control.laws.stored import read_controller  # deferred: pydantic
+        from seaopt.control.laws.stored import check_achieved, read_controller  # deferred: pydantic
 
         stored = read_controller(content)
-        law = {name: stored[name] for name in ("reference", "measurement")}
-        ts, gain = stored["sample_time_s"], stored["command"].per_effort
+        gain, spec = stored["command"].per_effort, stored["spec"]
         sliding = take_sliding(plant, params)
-        sampled = sample(sliding, params, stored["spec"].measured, gain, ts, stored["delay_samples"])
-        achieved = Loop(plant=sampled, **law).figures()
+        sampled = sample(sliding, params, spec.measured, gain, stored["sample_time_s"], stored["delay_samples"])
+        achieved = Loop(plant=sampled, law=stored["law"]).figures()
+        check_achieved(content.get("achieved"), _list_achieved(achieved))
         broken = list_broken_figures(stored["spec"], achieved) if stored["feasible"] else []
         if broken:
             stored |= {"feasible": False, "active_constraints": tuple(broken), "blocked_by": tuple(broken)}
@@ -265,9 +277,7 @@ class Controller:
             return []
         plant, params = self.design
         _, *stuck = split_friction({"": plant}, params).values()
-        loops = [
-            Loop(plant=self.plant(one, params), reference=self.reference, measurement=self.measurement) for one in stuck
-        ]
+        loops = [Loop(plant=self.plant(one, params), law=self.law) for one in stuck]
         return [
             "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
             f"{format_number(figures.bandwidth_hz, missing='none')} Hz, Ms {figures.ms:.4g}, Mt {figures.mt:.4g}"
@@ -331,6 +341,12 @@ def _format_allowed(limit: Limit, allowed: float | None) -> str:
         return ""
     sense = "" if limit.sense == "equal to" else f"{limit.sense} "
     return f"{sense}{allowed:g} {limit.unit}".rstrip()
+
+
+def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
+    """Return the figures that controller.json states."""
+    values = {field.name: getattr(figures, field.name) for field in fields(LoopFigures)}
+    return {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
 
 
 def _milliseconds(time_s: float | None) -> float | None:

@@ -43,7 +43,7 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
     loop = take_friction_out(controller, plant, params)
     if loop is None:
         return None
-    closed = Loop(plant=loop.plant, reference=controller.reference, measurement=controller.measurement)
+    closed = Loop(plant=loop.plant, law=controller.law)
     if np.max(np.abs(closed.eigenvalues())) >= STABLE:
         zeros = (0.0,) * loop.slopes.size
         return FrictionMargin(factor=0.0, slopes=zeros, frequency_hz=0.0, multiplier="none: unstable without friction")
@@ -67,5 +67,5 @@ def take_friction_out(controller: Controller, plant: Plant, params: ParameterSet
         a=a, motor=motor, friction=on_states, velocity=velocity, measured=output,
         through=on_outputs[list(plant.outputs).index(measured)], slopes=steepest - flattest,
         plant=sample(sliding, values, measured, gain, controller.sample_time_s, controller.delay_samples),
-        law=controller.measurement, delay_s=conditions.get(DELAY, 0.0),
+        law=controller.law, delay_s=conditions.get(DELAY, 0.0),
     )  # fmt: skip

@@ -160,7 +160,7 @@ def _respond(
     causes = np.column_stack([loop.friction[:, port], loop.motor]).astype(complex)
     inner = s[:, None, None] * np.eye(loop.motor.size) - loop.a
     by_friction, by_motor = np.moveaxis(np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape))), 2, 0)
-    law = loop.law.response(f, period)
+    law = loop.law.measurement_response(f)
     closed = law / (1.0 + loop.plant.response(f) * law) * np.exp(-s * period * loop.plant.delay_samples)
     hold = -np.expm1(-s * period) / s * np.exp(-s * loop.delay_s)
     sensed = by_friction @ loop.measured + loop.through[port]

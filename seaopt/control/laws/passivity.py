@@ -45,10 +45,10 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.crossings import add_minima, find_crossings
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import Frequencies, PortModel, Response, hold_response, port_of, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant, hold
-from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -180,7 +180,7 @@ def passivity(
             f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
         )
     port = port_of(take_sliding(plant, params), params, controller.spec.measured, controller.command.per_effort)
-    law = controller.measurement
+    law = controller.law
     impedance, angle = _make_curves(port, law, ts, controller.delay_samples)
     f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))
     stable = is_held_stable(port, law, ts, controller.delay_samples)
@@ -201,7 +201,7 @@ def passivity(
 
 
 def measure_port(
-    port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
+    port: PortModel, law: Law, sample_time_s: float, delay_samples: int, band_hz: tuple[float, float]
 ) -> PortFigures:
     """Return the least Re Z/abs(Z) in a band, refined to rounding, where it is, and whether the held loop is stable."""
     _, angle = _make_curves(port, law, sample_time_s, delay_samples)
@@ -251,7 +251,7 @@ def passivity_rows(
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
 
-def is_held_stable(port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int) -> bool:
+def is_held_stable(port: PortModel, law: Law, sample_time_s: float, delay_samples: int) -> bool:
     """Tell whether nothing grows in the sampled loop with link 2 held."""
     a, b, c, d = port.link_held()
     delay_s = np.array([port.delay_s])
@@ -260,19 +260,15 @@ def is_held_stable(port: PortModel, law: TransferFunction, sample_time_s: float,
         a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=sample_time_s, delay_samples=delay_samples,
         static_gain=np.nan,
     )  # fmt: skip
-    poles = Loop(plant=plant, reference=law, measurement=law).eigenvalues()
+    poles = Loop(plant=plant, law=law).eigenvalues()
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
 
 
-def _make_curves(
-    port: PortModel, law: TransferFunction, sample_time_s: float, delay_samples: int
-) -> tuple[Curve, Curve]:
+def _make_curves(port: PortModel, law: Law, sample_time_s: float, delay_samples: int) -> tuple[Curve, Curve]:
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
     def impedance(f: Frequencies) -> Response:
-        return port.response(f).impedance(
-            law.response(f, sample_time_s) * hold_response(f, sample_time_s, delay_samples)
-        )
+        return port.response(f).impedance(law.measurement_response(f) * hold_response(f, sample_time_s, delay_samples))
 
     def angle(f: Frequencies) -> Frequencies:
         z = impedance(f)
@@ -281,12 +277,10 @@ def _make_curves(
     return impedance, angle
 
 
-def _make_grid(
-    port: PortModel, law: TransferFunction, sample_time_s: float, low_hz: float, high_hz: float
-) -> Frequencies:
+def _make_grid(port: PortModel, law: Law, sample_time_s: float, low_hz: float, high_hz: float) -> Frequencies:
     """Return frequencies that resolve the modes of plant and law."""
-    roots = np.roots(np.trim_zeros(law.den, "b"))
-    poles = np.log(roots.astype(complex)) / sample_time_s
+    roots = law.poles
+    poles = np.log(roots[np.abs(roots) > TINY]) / sample_time_s
     at, width = port.modes_hz()
     at = np.concatenate([at, np.abs(poles.imag) / (2 * np.pi)])
     width = np.concatenate([width, np.abs(poles.real) / (2 * np.pi)])

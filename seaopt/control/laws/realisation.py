@@ -32,17 +32,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Complex, Float
-from scipy.linalg import block_diag
+from jaxtyping import Float
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.minimal import EPS, SplitLaw, balance, put_over_one_denominator, split
-from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.loops.law import Law
 from seaopt.errors import ControlError
 from seaopt.records import record
 
 Vector = Float[np.ndarray, " n"]
-RESPONSE_TOLERANCE = 1e-6  # how well the state space must have the response of its transfer functions
 
 
 @record(eq=False)
@@ -121,14 +118,6 @@ class RunnableLaw:
         inner = np.eye(n - m) - self.a[m:, m:]
         out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
         return out[0], out[1]
-
-    def response(self, f: Float[np.ndarray, " k"]) -> tuple[Complex[np.ndarray, " k"], Complex[np.ndarray, " k"]]:
-        """Return C_r and C_y at frequencies in Hz, above zero."""
-        z = np.exp(2j * np.pi * f * self.sample_time_s)
-        inner = z[:, None, None] * np.eye(self.c.size) - self.a
-        causes = np.column_stack([self.b_reference, self.b_measurement]).astype(complex)
-        out = self.c @ np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape)))
-        return out[:, 0] + self.d_reference, out[:, 1] + self.d_measurement
 
     def reset(self, reference: float = 0.0, measurement: float = 0.0, current_A: float = 0.0) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
@@ -214,9 +203,7 @@ def runnable(
     """
     limit = controller.spec.current_limit_A if current_limit_A is None else current_limit_A
     return realise(
-        controller.reference,
-        controller.measurement,
-        sample_time_s=controller.sample_time_s,
+        controller.law,
         per_effort=controller.command.per_effort,
         current_limit_A=limit,
         tracking_time_s=tracking_time_s,
@@ -224,22 +211,14 @@ def runnable(
 
 
 def realise(
-    reference: TransferFunction,
-    measurement: TransferFunction,
-    *,
-    sample_time_s: float,
-    per_effort: float = 1.0,
-    current_limit_A: float | None = None,
-    tracking_time_s: float | None = None,
+    law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None
 ) -> RunnableLaw:
-    """Return F = C_r F_ref - C_y F_meas as a state-space law of least order with limit and anti-windup.
+    """Return a law of one measured signal with limit and anti-windup.
 
     Parameters
     ----------
-    reference, measurement : TransferFunction
-        C_r and C_y, of any order.
-    sample_time_s : float
-        Seconds.
+    law : Law
+        From (reference, measured) to effort; of two transfer functions: `Law.from_transfer_functions`.
     per_effort : float
         The command for one unit of effort: A/N or A/(N m).
     current_limit_A : float, optional
@@ -250,64 +229,49 @@ def realise(
     Raises
     ------
     ControlError
-        A number is out of range, the law by itself is unstable other than by integrators, or its poles lie too close
-        together for double precision.
+        A number is out of range, or the law by itself is unstable other than by integrators.
 
     """
     for name, value in (
-        ("sample_time_s", sample_time_s),
+        ("sample_time_s", law.sample_time_s),
         ("per_effort", per_effort),
         ("current_limit_A", current_limit_A),
         ("tracking_time_s", tracking_time_s),
     ):
         if value is not None and not value > 0.0:
             raise ControlError(f"{name} = {value:g} is not positive; give a positive number")
-    parts = [split(name, tf) for name, tf in (("reference", reference), ("measurement", measurement))]
-    m = max(part.chain.size for part in parts)
-    gains = np.zeros((m, 2))
-    for column, part in enumerate(parts):
-        gains[: part.chain.size, column] = part.chain
-    through = (float(reference.num[0]), float(measurement.num[0]))
-    a, b, c = balance(*put_over_one_denominator(parts), max(map(abs, through)))
-    tracking = _compute_tracking_time(parts, sample_time_s) if tracking_time_s is None and m else tracking_time_s
-    share = sample_time_s / (tracking + sample_time_s) if tracking is not None else 0.0
-    b = np.vstack([gains, b])
-    law = RunnableLaw(
-        a=np.asarray(block_diag(np.eye(m) + np.eye(m, k=1), a)),
-        b_reference=b[:, 0].copy(),
-        b_measurement=b[:, 1].copy(),
-        c=np.concatenate([np.eye(1, m)[0], c]),
-        d_reference=through[0],
-        d_measurement=through[1],
-        anti_windup=np.array([math.comb(m, j) * share**j for j in range(1, m + 1)] + [0.0] * c.size),
+    poles = law.poles[law.integrators :]
+    radius = float(np.max(np.abs(poles), initial=0.0))
+    if radius >= 1.0:
+        raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; tune a stable one")
+    m = law.integrators
+    tracking = _compute_tracking_time(law) if tracking_time_s is None and m else tracking_time_s
+    share = law.sample_time_s / (tracking + law.sample_time_s) if tracking is not None else 0.0
+    return RunnableLaw(
+        a=law.a,
+        b_reference=law.b[:, 0].copy(),
+        b_measurement=-law.b[:, 1],
+        c=law.c,
+        d_reference=float(law.d[0]),
+        d_measurement=-float(law.d[1]),
+        anti_windup=np.array([math.comb(m, j) * share**j for j in range(1, m + 1)] + [0.0] * (law.c.size - m)),
         integrators=m,
         tracking_time_s=tracking if m else None,
-        sample_time_s=sample_time_s,
+        sample_time_s=law.sample_time_s,
         per_effort=per_effort,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
     )
-    _check_response(law, reference, measurement)
-    return law
 
 
-def _check_response(law: RunnableLaw, reference: TransferFunction, measurement: TransferFunction) -> None:
-    """Refuse a law whose response is not that of its transfer functions, but for their coefficients' rounding."""
-    f = np.geomspace(1e-4, 0.49, 25) / law.sample_time_s
-    q = np.exp(-2j * np.pi * f * law.sample_time_s)
-    for response, tf in zip(law.response(f), (reference, measurement), strict=True):
-        bottom = np.polynomial.polynomial.polyval(q, tf.den)
-        wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
-        rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
-        allowed = RESPONSE_TOLERANCE * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
-        if not np.all(np.abs(response - wanted) <= allowed):
-            raise ControlError(
-                "the law's slow poles are too close together to tell from integrators in double precision; "
-                "sample more slowly, or make them faster"
-            )
-
-
-def _compute_tracking_time(parts: list[SplitLaw], sample_time_s: float) -> float:
+def _compute_tracking_time(law: Law) -> float:
     """Return T_s abs(a_1/a_0) of C_r, of C_y where the reference is not integrated; a sample at least."""
-    most = max(part.chain.size for part in parts)
-    a_0, a_1 = next(part.series for part in parts if part.chain.size == most)[:2]
-    return sample_time_s * max(abs(float(a_1 / a_0)), 1.0)
+    m = law.integrators
+    column = 0 if law.b[m - 1, 0] else 1
+    a_0 = law.b[m - 1, column]
+    a, b, c = law.rest
+    # The coefficient of w^(m-1), w = 1/(z - 1): the next one of the chain, or what is left at 0 Hz.
+    following = (
+        law.b[m - 2, column] if m > 1
+        else law.d[column] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, column])
+    )  # fmt: skip
+    return law.sample_time_s * max(abs(float(following / a_0) - m), 1.0)

@@ -11,13 +11,17 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
 from seaopt.files import plain
 
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
-GAINS_AGREE = 1e-9  # of the largest coefficient
+AGREES = 1e-6  # what is for reading gives the law's response to this share, and to the rounding of its coefficients
+FIGURES_AGREE = 1e-4  # a bandwidth where abs(F/F_ref) is flat is known to the root of rounding
+COMPARED = np.geomspace(1e-4, 0.49, 60)  # frequencies at which it is compared, of the sample rate
+ROUNDINGS = 1024 * float(np.finfo(float).eps)
 TUNE_AGAIN = "tune again"
 
 Finite = Annotated[FiniteFloat, Strict()]
@@ -41,7 +45,30 @@ class StoredTransferFunction(ResultTable):
         return TransferFunction(num=np.array(self.num), den=np.array(self.den))
 
 
-class StoredLaw(StoredTransferFunction):
+class StoredLaw(ResultTable):
+    """The law: a state space from (reference, measured) to effort."""
+
+    A: list[list[Finite]]
+    B: list[list[Finite]]
+    C: list[list[Finite]]
+    D: list[list[Finite]]
+
+    def build(self, sample_time_s: float) -> Law:
+        """Return the law."""
+        n, k = len(self.A), len(self.D[0]) if self.D else 0
+        shapes = {"A": (n, n), "B": (n, k), "C": (1, n), "D": (1, 2)}
+        matrices: dict[str, np.ndarray] = {}
+        for name, shape in shapes.items():
+            rows = getattr(self, name)
+            if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
+                raise _contradict(f"law.{name}", f"is not a matrix of {shape[0]} x {shape[1]}")
+            matrices[name] = np.array(rows, dtype=float).reshape(shape)
+        return Law(
+            a=matrices["A"], b=matrices["B"], c=matrices["C"][0], d=matrices["D"][0], sample_time_s=sample_time_s
+        )
+
+
+class StoredReading(StoredTransferFunction):
     """One of the law's two transfer functions."""
 
     den: Annotated[Coefficients, AfterValidator(_begin_with_one)]
@@ -51,7 +78,7 @@ class StoredObserver(ResultTable):
     """A disturbance observer: the two parts of its nominal plant, and the time constant of Q."""
 
     kept: Coefficients
-    inverse: StoredTransferFunction
+    inverse: list[StoredTransferFunction]
     T_q: Finite
 
 
@@ -80,8 +107,9 @@ class StoredController(ResultTable):
     gains: dict[str, Finite]
     sample_time_s: Finite
     delay_samples: Whole
-    reference: StoredLaw
-    measurement: StoredLaw
+    law: StoredLaw
+    reference: StoredReading
+    measurement: StoredReading
     command: StoredCommand
     spec: StoredSpec
     feasible: Flag
@@ -108,13 +136,16 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     if not abs(table.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
         stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
         raise _contradict("sample_time_s", stated)
-    law = {"reference": table.reference.build(), "measurement": table.measurement.build()}
+    law = table.law.build(spec.sample_time_s)
     observer = None
     if table.observer is not None:
-        nominal = Nominal(kept=np.array(table.observer.kept), inverse=table.observer.inverse.build())
+        inverse = tuple(part.build() for part in table.observer.inverse)
+        nominal = Nominal(kept=np.array(table.observer.kept), inverse=inverse)
         observer = DisturbanceObserver(nominal=nominal, T_q=table.observer.T_q)
-    _check_agreement(table.gains, observer, spec, law)
-    return law | {
+    _check_gains(table.gains, observer, spec, law)
+    _check_reading(table, law)
+    return {
+        "law": law,
         "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
         "delay_samples": table.delay_samples, "command": Command(**table.command.model_dump()), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
@@ -134,13 +165,13 @@ def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:
         raise FileError(f"controller.json: spec: {error}; {TUNE_AGAIN}") from error
 
 
-def _check_agreement(
+def _check_gains(
     gains: Mapping[str, float],
     observer: DisturbanceObserver | None,
     spec: ControllerSpec,
-    law: Mapping[str, TransferFunction],
+    law: Law,
 ) -> None:
-    """Refuse gains that do not give the coefficients."""
+    """Refuse gains that do not give the law."""
     needed = {*LAW_GAINS, *(NOTCH_GAINS if "notch_depth" in gains else ()), *(("T_q",) if observer is not None else ())}
     if set(gains) != needed:
         raise _contradict("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")
@@ -152,14 +183,53 @@ def _check_agreement(
         Notch(**{name.removeprefix("notch_"): gains[name] for name in NOTCH_GAINS}) if "notch_depth" in gains else None
     )
     law_gains = Gains(**{name: gains[name] for name in LAW_GAINS}, observer=observer, notch=notch)
-    made_of_gains = law_gains.transfer_functions(spec.structure, spec.sample_time_s)
-    for name, made in zip(("reference", "measurement"), made_of_gains, strict=True):
-        for part in ("num", "den"):
-            stated, expected = getattr(law[name], part), getattr(made, part)
-            if stated.shape != expected.shape or not np.all(
-                np.abs(stated - expected) <= GAINS_AGREE * np.max(np.abs(expected), initial=0.0)
-            ):
-                raise _contradict(f"{name}.{part}", "is not what gains, observer and spec give")
+    made = law_gains.law(spec.structure, spec.sample_time_s)
+    f = COMPARED * spec.sample_rate_hz
+    stated, expected = law.responses(f), made.responses(f)
+    if made.integrators != law.integrators or not np.all(np.abs(stated - expected) <= AGREES * np.abs(expected)):
+        raise _contradict("law", "is not what gains, observer and spec give")
+
+
+def _check_reading(table: StoredController, law: Law) -> None:
+    """Refuse transfer functions that are not the law multiplied out."""
+    f = COMPARED / law.sample_time_s
+    q = np.exp(-2j * np.pi * COMPARED)
+    for name, tf, expected in (
+        ("reference", table.reference.build(), law.reference_response(f)),
+        ("measurement", table.measurement.build(), law.measurement_response(f)),
+    ):
+        num, den = (np.polynomial.polynomial.polyval(q, p) for p in (tf.num, tf.den))
+        # C den = num, to the rounding of either polynomial's coefficients.
+        rounding = ROUNDINGS * (np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(expected))
+        if not np.all(np.abs(expected * den - num) <= AGREES * np.abs(num) + rounding):
+            raise _contradict(name, "is not the law multiplied out")
+
+
+def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
+    """Refuse figures, those of controller.json's `achieved`, that are not the ones that its law has.
+
+    Raises
+    ------
+    FileError
+        One of them is not.
+
+    """
+    if not isinstance(stated, Mapping):
+        raise FileError(f"controller.json: achieved is missing or not a table; {TUNE_AGAIN}")
+    for name, figure in figures.items():
+        value = stated.get(name)
+        if not _agree(value, figure):
+            raise _contradict(f"achieved.{name}", f"is {value!r}, and the law has {figure!r} on the design plant")
+
+
+def _agree(stated: Any, figure: Any) -> bool:
+    """Tell whether a figure is as stated; what is not finite stands in JSON as nothing."""
+    try:
+        one, other = (np.array(np.nan if value is None else value, dtype=float) for value in (stated, figure))
+    except (TypeError, ValueError):
+        return False
+    one, other = (np.where(np.isfinite(values), values, np.nan) for values in (one, other))
+    return one.shape == other.shape and np.allclose(one, other, rtol=FIGURES_AGREE, atol=0.0, equal_nan=True)
 
 
 def _contradict(name: str, what: str) -> FileError:

@@ -1,8 +1,8 @@
-r"""The control law: two transfer functions in q = z^-1.
+r"""The control law of every structure, as gains, as its parts at frequencies, and as a state space.
 
-.. math:: F_m = C_r(q) F_\mathrm{ref} - C_y(q) F_\mathrm{meas}
+.. math:: F_m = C_r(q) F_\mathrm{ref} - C_y(q) F_\mathrm{meas}, \qquad q = z^{-1} .
 
-Every structure is written as these two,
+With
 
 .. math::
     F_m &= k_r F_\mathrm{ref} - k_p F_\mathrm{meas}
@@ -30,7 +30,17 @@ inverse rings. Delay and :math:`B_u` stay in Q, so that the inverse is exact, st
     Q = Q_0 \, q^{1+d} \frac{B_u(q)}{B_u(1)}, \qquad \frac{Q}{P_n} = Q_0 \frac{A(q)}{B_s(q) B_u(1)}, \qquad
     Q_0 = \Big(\frac{T_s}{T_q + T_s - q T_q}\Big)^2 .
 
-:math:`Q(1) = 1`: the observer integrates, and k_i may be 0 beside it.
+:math:`Q(1) = 1`: the observer integrates, and k_i may be 0 beside it. With :math:`\delta = 1 - q`,
+:math:`p = T_q/(T_q + T_s)` and :math:`q^{1+d} B_u(q)/B_u(1) = \sum_i \kappa_i q^i`, whose coefficients add up to 1,
+the integrator comes out by hand, and so does what is left:
+
+.. math:: 1 - Q = \frac{\delta\, E(q)}{(1 - p q)^2}, \qquad
+          E = (1-p)^2 \sum_j \Big(\sum_{i>j} \kappa_i\Big) q^j + 2 p (1-p) + p^2 \delta, \qquad
+          F_m = v + \frac{(1-p)^2}{\delta E} \Big(\sum_i \kappa_i q^i\, v
+                - \frac{A}{B_s B_u(1)} F_\mathrm{meas}\Big) .
+
+`Gains.law` puts the parts together so (`seaopt.control.laws.assembly`): in the inputs error and reference, where what
+stands on the reference alone has one integrator less, so that the loop rests at its reference to the last bit.
 
 **Notch**, in series with all of it: a biquad :math:`(s^2 + 2 g \zeta \omega s + \omega^2)/(s^2 + 2 \zeta \omega s +
 \omega^2)` by Tustin's rule, prewarped to be exact at :math:`\omega`; :math:`\zeta` is its width, g its depth.
@@ -40,13 +50,17 @@ At fixed T_f, T_q and notch, C_r and C_y are affine in (k_p, k_i, k_d, k_r, c k_
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import asdict
+from itertools import zip_longest
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
+from seaopt.control.laws.assembly import Assembly
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
@@ -57,6 +71,7 @@ REFERENCE_WEIGHTS: tuple[ReferenceWeights, ...] = ("tuned", "error", "measuremen
 STRUCTURES: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
+SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
 HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal lags are 3 dB down
 
 
@@ -98,13 +113,13 @@ class Nominal:
     ----------
     kept : array
         q^(1+d) B_u(q)/B_u(1), coefficients in ascending powers of q.
-    inverse : TransferFunction
-        A(q)/(B_s(q) B_u(1)).
+    inverse : tuple of TransferFunction
+        A(q)/(B_s(q) B_u(1)) as a product of factors of second order at most: multiplied out it would lose digits.
 
     """
 
     kept: Float[np.ndarray, " n"]
-    inverse: TransferFunction
+    inverse: tuple[TransferFunction, ...]
 
     @classmethod
     def of(cls, plant: DigitalPlant) -> Nominal:
@@ -114,11 +129,25 @@ class Nominal:
         lead = int(np.argmax(np.abs(b) > 1e-9 * np.max(np.abs(b))))
         zeros = np.roots(b[lead:]).astype(complex)
         inverted = (np.abs(zeros) < LARGEST_INVERTED) & (np.real(zeros) > 0.0)
-        stable, left = (np.atleast_1d(np.real(np.poly(group))) for group in (zeros[inverted], zeros[~inverted]))
+        left = np.atleast_1d(np.real(np.poly(zeros[~inverted])))
+        pairs = zip_longest(*(_factors(roots) for roots in (np.linalg.eigvals(plant.a), zeros[inverted])))
+        inverse = [TransferFunction(num=_or_one(top), den=_or_one(below)) for top, below in pairs]
+        gain = 1.0 / (b[lead] * np.sum(left))
+        if np.isfinite(plant.static_gain) and plant.static_gain:  # which is known better than what b and left give
+            gain = 1.0 / (plant.static_gain * cls(kept=left, inverse=tuple(inverse)).static_inverse)
+        inverse.append(TransferFunction(num=np.array([gain]), den=np.ones(1)))
         return cls(
-            kept=np.concatenate([np.zeros(lead + plant.delay_samples), left / np.sum(left)]),
-            inverse=TransferFunction(num=a / (b[lead] * np.sum(left)), den=stable),
+            kept=np.concatenate([np.zeros(lead + plant.delay_samples), left / np.sum(left)]), inverse=tuple(inverse)
         )
+
+    @property
+    def static_inverse(self) -> float:
+        """Its inverse at 0 Hz."""
+        return math.prod(float(np.sum(part.num) / np.sum(part.den)) for part in self.inverse)
+
+    def inverse_response(self, f: Float[np.ndarray, " m"], sample_time_s: float) -> Complex[np.ndarray, " m"]:
+        """Return A/(B_s B_u(1)) at frequencies in Hz."""
+        return np.prod([part.response(f, sample_time_s) for part in self.inverse], axis=0)
 
 
 @record(eq=False)
@@ -143,14 +172,35 @@ class DisturbanceObserver:
         return HALF_POWER_OF_Q / (2 * math.pi * self.T_q)
 
     def filters(self, sample_time_s: float) -> tuple[TransferFunction, TransferFunction]:
-        """Return Q and Q/P_n."""
-        pole = self.T_q / (self.T_q + sample_time_s)
-        lags, gain = np.convolve([1.0, -pole], [1.0, -pole]), (1.0 - pole) ** 2
-        inverse = self.nominal.inverse
+        """Return Q and Q/P_n, multiplied out."""
+        pole, short = self._pole(sample_time_s)
+        lags, gain, inverse = np.convolve([1.0, -pole], [1.0, -pole]), short**2, self.nominal.inverse
+        num, den = (functools.reduce(np.convolve, [getattr(part, end) for part in inverse]) for end in ("num", "den"))
         return (
             TransferFunction(num=gain * self.nominal.kept, den=lags),
-            TransferFunction(num=gain * inverse.num, den=np.convolve(lags, inverse.den)),
+            TransferFunction(num=gain * num, den=np.convolve(lags, den)),
         )
+
+    def correct(self, law: Assembly, surplus: float, sample_time_s: float) -> Assembly:
+        """Return (law - Q/P_n measurement)/(1 - Q), of the inputs error and reference.
+
+        `surplus` is what acts on the reference alone at 0 Hz, less 1/P_n: where it is zero, so is its integral.
+        """
+        pole, short = self._pole(sample_time_s)
+        kept, seen = self.nominal.kept, Assembly.of_gains(np.array([1.0, -1.0]))  # - measurement = error - reference
+        for part in self.nominal.inverse:
+            seen = seen.through(part)
+        e = np.zeros(max(kept.size - 1, 2))
+        e[: kept.size - 1] = short**2 * np.cumsum(kept[:0:-1])[::-1]
+        at_one = float(np.sum(e)) + 2 * pole * short
+        e[:2] += [2 * pole * short + pole**2, -(pole**2)]
+        rest = TransferFunction(num=short**2 / e[:1], den=e / e[0])
+        estimate = law.through(TransferFunction(num=kept, den=np.ones(1))).plus(seen).through(rest)
+        return law.plus(estimate.integrated(np.array([estimate.static[0], short**2 / at_one * surplus])))
+
+    def _pole(self, sample_time_s: float) -> tuple[float, float]:
+        """Return p and 1 - p."""
+        return self.T_q / (self.T_q + sample_time_s), sample_time_s / (self.T_q + sample_time_s)
 
 
 @record
@@ -196,44 +246,38 @@ class Gains:
             out |= {f"notch_{name}": value for name, value in asdict(self.notch).items()}
         return out
 
-    def transfer_functions(
-        self, structure: Structure, sample_time_s: float
-    ) -> tuple[TransferFunction, TransferFunction]:
-        """Return C_r and C_y over their common denominator.
-
-        It is (1 - alpha q) of a pd and (1 - q) (1 - alpha q) of a pid; observer and notch multiply it.
-        """
-        alpha = self.T_f / (self.T_f + sample_time_s)
-        lag = np.array([1.0, -alpha])
-        integrates = structure == "pid" or (structure == "pid_dob" and self.k_i != 0.0)
-        difference = np.array([1.0, -1.0])
-        den = np.convolve(difference, lag) if integrates else lag
-        unit = den
-        rate = self.k_d / (self.T_f + sample_time_s) * (
-            np.convolve(difference, difference) if integrates else difference
-        )  # fmt: skip
-        whole = self.k_i * sample_time_s / 2 * np.convolve([1.0, 1.0], lag) if integrates else np.zeros(1)
-        measurement = _add(self.k_p * unit, rate, whole)
-        reference = _add(self.k_r * unit, self.c * rate, whole)
+    def law(self, structure: Structure, sample_time_s: float) -> Law:
+        """Return the law as a state space from reference and measurement; `Law.balanced` is what runs."""
+        alone = self.k_r - self.k_p  # the two inputs are the error and the reference, on which these act alone
+        short = sample_time_s / (self.T_f + sample_time_s)
+        lag = TransferFunction(num=np.array([1.0, -1.0]), den=np.array([1.0, -self.T_f / (self.T_f + sample_time_s)]))
+        law = Assembly.of_gains(np.array([self.k_p, alone])).plus(
+            Assembly.of_gains(self.k_d * short / sample_time_s * np.array([1.0, self.c - 1.0])).through(lag)
+        )
+        if structure != "pd" and self.k_i:  # (1 + q)/(1 - q) = 2/delta - 1
+            half = self.k_i * sample_time_s / 2 * np.array([1.0, 0.0])
+            law = law.plus(Assembly.of_gains(2 * half).integrated(2 * half)).plus(Assembly.of_gains(-half))
         if self.observer is not None:
-            q, inverse = self.observer.filters(sample_time_s)
-            through = inverse.den  # holds the lags of Q
-            rest = np.convolve(_add(q.den, -q.num), self.observer.nominal.inverse.den)
-            measurement = _add(np.convolve(measurement, through), np.convolve(inverse.num, den))
-            reference, den = np.convolve(reference, through), np.convolve(den, rest)
+            inverse = self.observer.nominal.static_inverse
+            surplus = alone - inverse
+            rounding = SURPLUS_ROUNDING * (abs(self.k_p) + abs(alone) + abs(inverse))
+            law = self.observer.correct(law, surplus if abs(surplus) > rounding else 0.0, sample_time_s)
         if self.notch is not None:
             over, under = self.notch.biquad(sample_time_s)
-            reference, measurement, den = (
-                np.convolve(*p) for p in ((reference, over), (measurement, over), (den, under))
-            )
-        return tuple(TransferFunction(num=num / den[0], den=den / den[0]) for num in (reference, measurement))  # type: ignore[return-value]
+            law = law.through(TransferFunction(num=over / under[0], den=under / under[0]))
+        return law.law(sample_time_s)
 
 
-def _add(*polynomials: Float[np.ndarray, " _"]) -> Float[np.ndarray, " m"]:
-    out = np.zeros(max(p.size for p in polynomials))
-    for p in polynomials:
-        out[: p.size] += p
-    return out
+def _factors(roots: Complex[np.ndarray, " n"]) -> list[Float[np.ndarray, " _"]]:
+    """Return real polynomials of second order at most with these roots, those of the slowest first."""
+    pairs = [np.real(np.poly([root, np.conj(root)])) for root in roots[np.imag(roots) > 0.0]]
+    real = np.sort(np.real(roots[np.imag(roots) == 0.0]))[::-1]
+    factors = pairs + [np.atleast_1d(np.poly(real[i : i + 2])) for i in range(0, real.size, 2)]
+    return sorted(factors, key=np.sum)
+
+
+def _or_one(polynomial: Float[np.ndarray, " n"] | None) -> Float[np.ndarray, " m"]:
+    return np.ones(1) if polynomial is None else polynomial
 
 
 class LawTerms(NamedTuple):

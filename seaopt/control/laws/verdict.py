@@ -120,8 +120,8 @@ def _reached(spec: ControllerSpec, verdict: Verdict, loop: Loop) -> str:
     assert curve is not None and curve.until_hz is not None
     until, grid = curve.until_hz(verdict.allowed, spec.bandwidth_hz), loop.grid()
     f = np.append(grid[grid < until], until)
-    p, ts = loop.plant.response(f), loop.plant.sample_time_s
-    c_y, c_r = loop.measurement.response(f, ts), loop.reference.response(f, ts)
+    p, (c_r, response) = loop.plant.response(f), loop.law.responses(f)
+    c_y = -response
     values = np.abs(curve.numerator(p, c_y, c_r, p * c_y)) / np.abs(1.0 + p * c_y)
     extreme = f"falls to {np.min(values):.4f}" if curve.floor else f"reaches {np.max(values):.4f}"
     return f"{curve.symbol} {extreme} below {until:g} Hz, {curve.level(verdict.allowed):.4f} allowed"

@@ -40,8 +40,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import polygamma
 
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 ALIASES = 30  # on either side; what is beyond is bounded
@@ -78,8 +78,8 @@ class FrictionLoop:
         The steepest slope of each friction curve, N s/m (N m s/rad).
     plant : DigitalPlant
         The same plant, sampled, from u to y, with its delay.
-    law : TransferFunction
-        C_y.
+    law : Law
+        Its C_y closes the loop.
     delay_s : float
         Of the motor effort, besides the whole samples of `plant`.
 
@@ -93,7 +93,7 @@ class FrictionLoop:
     through: Float[np.ndarray, " p"]
     slopes: Float[np.ndarray, " p"]
     plant: DigitalPlant
-    law: TransferFunction
+    law: Law
     delay_s: float = 0.0
 
 
@@ -190,7 +190,7 @@ def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
     period, n = loop.plant.sample_time_s, loop.motor.size
     z = np.exp(1j * theta)
     f = theta / (2 * np.pi * period)
-    law = loop.law.response(f, period)
+    law = loop.law.measurement_response(f)
     through = loop.plant.response(f)
     gain = law / (1.0 + through * law) * z**-loop.plant.delay_samples
     s = 1j * (theta[:, None] + 2 * np.pi * np.arange(-ALIASES, ALIASES + 1)) / period

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes
 from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 GRID_LOWEST_HZ = 1e-3
@@ -78,15 +78,14 @@ class LoopFigures:
 
 @record(eq=False)
 class Loop:
-    """A plant closed by C_r (reference) and C_y (measurement)."""
+    """A plant closed by a law, F_m = C_r F_ref - C_y F."""
 
     plant: DigitalPlant
-    reference: TransferFunction
-    measurement: TransferFunction
+    law: Law
 
     def open_loop(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return L at frequencies in Hz."""
-        return self.plant.response(f) * self.measurement.response(f, self.plant.sample_time_s)
+        return self.plant.response(f) * self.law.measurement_response(f)
 
     def sensitivity(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return S = 1/(1 + L)."""
@@ -94,16 +93,18 @@ class Loop:
 
     def tracking(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return F/F_ref."""
-        reference = self.reference.response(f, self.plant.sample_time_s)
-        return self.plant.response(f) * reference * self.sensitivity(f)
+        reference, measurement = self.law.responses(f)
+        plant = self.plant.response(f)
+        return plant * reference / (1.0 - plant * measurement)
 
     def noise(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return -F_m/noise = C_y S."""
-        return self.measurement.response(f, self.plant.sample_time_s) * self.sensitivity(f)
+        measurement = self.law.measurement_response(f)
+        return measurement / (1.0 + self.plant.response(f) * measurement)
 
     def system(self) -> ClosedLoop:
         """Return plant, hold, delay and controller as one system."""
-        return close(self.plant.delayed(), self.reference, self.measurement)
+        return close(self.plant.delayed(), self.law)
 
     def eigenvalues(self) -> Complex[np.ndarray, " n"]:
         """Return the closed loop's eigenvalues."""

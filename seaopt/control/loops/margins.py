@@ -189,7 +189,7 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     if not all(np.all(np.isfinite(loop.eigenvalues())) for loop in (first, second)):
         return 1.0, None
     loops = (first, second)
-    laws = [loop.about(np.linalg.eigvals(loop.measurement.state_space()[0]).astype(complex)) for loop in loops]
+    laws = [loop.about(loop.law.poles) for loop in loops]
     f = np.unique(np.concatenate([_low_frequencies(loops), *(loop.grid() for loop in loops), *laws]))
     for _ in range(40):
         turning = _turning(first, second, f)

@@ -34,12 +34,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import StateSpace
-from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
 SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
-SAME_ROOT = 1e-7
 CROSSING_DISTANCE = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction of the angle
 STRAIGHT_RESIDUE = 1e-6  # of its value at both ends: less is left at the zero of the line through them if f is straight
 MAX_ZERO_STEPS = 100
@@ -64,7 +63,7 @@ class ClosedLoop:
     opened
         The poles of plant and law, which are the zeros of S.
     blocks
-        The matrices of plant and law whose eigenvalues those are.
+        The matrices of plant and law whose eigenvalues those are, but for the law's integrators.
 
     """
 
@@ -98,7 +97,8 @@ class ClosedLoop:
         The first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
         7.2.2).
         """
-        return np.concatenate([_resolution(block) for block in self.blocks])
+        plant, rest = (_resolution(block) for block in self.blocks)
+        return np.concatenate([plant, np.zeros(self.opened.size - plant.size - rest.size), rest])
 
     def slopes(self, theta: Float[np.ndarray, " m"]) -> Float[np.ndarray, "5 m"]:
         """Return half the derivative of -1/abs(curve)^2 along the angle.
@@ -161,7 +161,7 @@ class ClosedLoop:
         return m, k
 
 
-def close(plant: StateSpace, reference: TransferFunction, measurement: TransferFunction) -> ClosedLoop:
+def close(plant: StateSpace, law: Law) -> ClosedLoop:
     """Return the loop of a plant (with its delay) and the law u = C_r r - C_y m.
 
     A plant that is not finite, of absurd parameters, has every pole at infinity: its loop is not stable.
@@ -169,7 +169,8 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     from scipy.linalg import matrix_balance, schur
 
     ap, bp, cp, dp = plant
-    ak, bk, ck, dk = law_state_space(reference, measurement)
+    sign = np.array([1.0, -1.0])
+    ak, bk, ck, dk = law.a, law.b * sign, law.c, law.d * sign
     # u and m = y + n satisfy u = c_k x_k + d_r r - d_y m, m = c_p x_p + d_p u + n.
     n, m = bp.size, ck.size
     loop = 1.0 / (1.0 + dp * dk[1])
@@ -189,7 +190,7 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     if not np.max(np.abs(whole)) < LARGEST_ENTRY:
         gone = np.diag(opened)
         return ClosedLoop(
-            a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, ak)
+            a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, law.rest[0])
         )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
@@ -198,10 +199,10 @@ def close(plant: StateSpace, reference: TransferFunction, measurement: TransferF
     if all(np.all(np.isfinite(matrix)) for matrix in balanced):
         a, b, c = balanced
     triangle, basis = (np.asarray(matrix) for matrix in schur(a, output="complex")[:2])
-    opened = np.concatenate([np.linalg.eigvals(ap), np.linalg.eigvals(ak)]).astype(complex)
+    opened = np.concatenate([np.linalg.eigvals(ap), law.poles]).astype(complex)
     return ClosedLoop(
         a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened,
-        blocks=(ap, ak),
+        blocks=(ap, law.rest[0]),
     )  # fmt: skip
 
 
@@ -217,39 +218,6 @@ def _resolution(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
         errors = ROUNDINGS * np.linalg.norm(balanced) / np.abs(np.sum(left.conj() * right, axis=0))
     order = np.argmin(np.abs(np.linalg.eigvals(a)[:, None] - values), axis=1)
     return errors[order]
-
-
-def law_state_space(
-    reference: TransferFunction, measurement: TransferFunction
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n 2"], Float[np.ndarray, " n"], Float[np.ndarray, " 2"]]:
-    """Return C_r and C_y on shared states: x+ = a x + b (r, -m), u = c x + d (r, -m), in observer form."""
-    den, num_r, num_y = _common(reference, measurement)
-    n = max(den.size, num_r.size, num_y.size) - 1
-    den, num_r, num_y = (np.pad(row, (0, n + 1 - row.size)) for row in (den, num_r, num_y))
-    a, c = np.zeros((n, n)), np.zeros(n)
-    if n:
-        a[:, 0] -= den[1:]
-        a[:-1, 1:] = np.eye(n - 1)
-        c[0] = 1.0
-    b = np.column_stack([num[1:] - num[0] * den[1:] for num in (num_r, num_y)])
-    return a, b, c, np.array([num_r[0], num_y[0]])
-
-
-def _common(
-    reference: TransferFunction, measurement: TransferFunction
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " k"], Float[np.ndarray, " l"]]:
-    """Return both laws over one denominator, in which a pole of both (an integrator) stands once."""
-    den_r, den_y = np.trim_zeros(reference.den, "b"), np.trim_zeros(measurement.den, "b")
-    if np.array_equal(den_r, den_y):
-        return den_y, reference.num, measurement.num
-    left_r, left_y = list(np.roots(den_r)), list(np.roots(den_y))
-    for root in tuple(left_y):
-        twin = min(left_r, key=lambda other: abs(other - root), default=np.inf)
-        if abs(twin - root) < SAME_ROOT:
-            left_r.remove(twin)
-            left_y.remove(root)
-    rest_r, rest_y = np.real(np.poly(left_r)), np.real(np.poly(left_y))
-    return np.convolve(den_y, rest_r), np.convolve(reference.num, rest_y), np.convolve(measurement.num, rest_r)
 
 
 def find_arcs(pencils: Sequence[Pencil]) -> list[Float[np.ndarray, " _"]]:

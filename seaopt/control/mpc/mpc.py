@@ -18,15 +18,16 @@ and the step says so.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import command_of
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
-from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
@@ -239,8 +240,8 @@ class ForceMPC:
             past=line[1:], innovation=innovation,
         )  # fmt: skip
 
-    def unlimited(self) -> tuple[TransferFunction, TransferFunction]:
-        """Return what the controller is as long as no limit is active, I = C_r F_ref - C_y F_meas in A/N."""
+    def unlimited(self) -> Law:
+        """Return what the controller is as long as no limit is active: from reference and measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.spec.current_limit_A
         n, delay = len(self.kalman.A), self.spec.delay_samples
         past = max(delay, 1)  # of which the last command is one
@@ -264,9 +265,7 @@ class ForceMPC:
              respond(np.zeros(size), 0.0, 1.0)]
         )  # fmt: skip
         a, c = whole[:size, :size], whole[size, :size]
-        reference = _transfer_function(a, whole[:size, size], c, float(whole[size, size]))
-        measurement = _transfer_function(a, -whole[:size, size + 1], c, -float(whole[size, size + 1]))
-        return reference, measurement
+        return Law(a=a, b=whole[:size, size:], c=c, d=whole[size, size:], sample_time_s=self.spec.sample_time_s)
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:
         """Return the loop around a plant while no limit is active; its figures are in newtons of motor force.
@@ -274,10 +273,10 @@ class ForceMPC:
         A plant with friction slides, as in `Controller.close`.
         """
         scale = command_of(*self.design, self.spec.measured).per_effort
-        reference, measurement = (TransferFunction(num=law.num / scale, den=law.den) for law in self.unlimited())
+        law = self.unlimited()
         spec, sliding = self.spec, take_sliding(plant, params)
         digital = sample(sliding, params, spec.measured, scale, spec.sample_time_s, spec.delay_samples)
-        return Loop(plant=digital, reference=reference, measurement=measurement)
+        return Loop(plant=digital, law=replace(law, b=law.b / scale, d=law.d / scale))
 
     def __repr__(self) -> str:
         s, slew = self.spec, self.spec.current_slew_A_per_s
@@ -382,11 +381,3 @@ def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
             f"{spec.largest_force_N:g}; raise the one or lower the other"
         )
     return gain
-
-
-def _transfer_function(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
-) -> TransferFunction:
-    """Return c (zI - a)^-1 b + d in powers of z^-1: det(zI - a + b c) - det(zI - a) is its numerator without d."""
-    den = np.real(np.poly(a))
-    return TransferFunction(num=np.real(np.poly(a - np.outer(b, c))) - den + d * den, den=den)

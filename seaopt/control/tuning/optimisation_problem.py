@@ -27,6 +27,7 @@ from seaopt.control.laws.limits import BY_NAME, LIMITS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
@@ -160,14 +161,19 @@ class Task:
             observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[4])),
         )  # fmt: skip
 
+    def law_of(self, x: LawNumbers) -> Law:
+        """Return the law of a vector, not balanced."""
+        return self.gains(x).law(self.spec.structure, self.spec.sample_time_s)
+
     def loop(self, x: LawNumbers, plant: int = 0) -> Loop:
         """Return the loop around one plant."""
-        reference, measurement = self.gains(x).transfer_functions(self.spec.structure, self.spec.sample_time_s)
-        return Loop(plant=self.plants[plant], reference=reference, measurement=measurement)
+        return Loop(plant=self.plants[plant], law=self.law_of(x))
 
     def is_stable(self, x: LawNumbers) -> bool:
         """Tell whether every plant's loop is stable, by its eigenvalues."""
-        return all(np.max(np.abs(self.loop(x, i).eigenvalues())) < 1.0 for i in range(len(self.plants)))
+        law = self.law_of(x)
+        loops = (Loop(plant=plant, law=law) for plant in self.plants)
+        return all(np.max(np.abs(loop.eigenvalues())) < 1.0 for loop in loops)
 
     def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:
         """Return the responses of the plants, or of some of them, at frequencies."""
@@ -175,7 +181,7 @@ class Task:
         kept = inverse = np.zeros(f.size, dtype=complex)
         if self.nominal is not None:
             kept = np.polynomial.polynomial.polyval(q, self.nominal.kept)
-            inverse = self.nominal.inverse.response(f, self.spec.sample_time_s)
+            inverse = self.nominal.inverse_response(f, self.spec.sample_time_s)
         rows = tuple(range(len(self.plants)) if rows is None else rows)
         p = np.array([self.plants[row].response(f) for row in rows])
         port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
@@ -255,12 +261,11 @@ class Task:
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""
-        port, spec, band = None, self.spec, self.spec.passive_band_hz
+        port, spec, band, law = None, self.spec, self.spec.passive_band_hz, self.law_of(x).balanced()
         if self.port is not None and band is not None:
-            _, law = self.gains(x).transfer_functions(spec.structure, spec.sample_time_s)
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
         return [
-            MeasuredLoop(name=name, figures=self.loop(x, i).figures(), port=None if i else port)
+            MeasuredLoop(name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port)
             for i, name in enumerate(self.names)
         ]
 

@@ -288,14 +288,12 @@ def make_controller(
     spec, gains = task.spec, task.gains(x)
     verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
-    reference, measurement = gains.transfer_functions(spec.structure, spec.sample_time_s)
     return Controller(
         structure=spec.structure,
         gains=gains.by_name(),
         sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
-        reference=reference,
-        measurement=measurement,
+        law=task.law_of(x).balanced(),
         command=command_of(*design, spec.measured),
         spec=spec,
         achieved=loops[0].figures,

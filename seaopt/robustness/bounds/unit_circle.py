@@ -4,19 +4,20 @@ Over a box and an arc, :math:`z = e^{i(\theta_0 + \delta e_\theta)}`, numerator 
 
 .. math:: S = \frac{N}{D}, \qquad N = d_c(z)\, \phi, \quad D = d_c(z)\, \phi + n_c(z)\, z^{-d} \nu,
 
-with the law :math:`n_c / d_c` and the plant :math:`\nu / \phi`, are Taylor models. Their quotient :math:`S_2` to second
-order is exact up to :math:`(N - S_2 D) / D`, which is of third order. If D cannot be zero there, the loop has no pole
-on the arc for any parameters of the box.
+with the law :math:`n_c / d_c` (both in powers of :math:`1 - 1/z`) and the plant :math:`\nu / \phi`, are Taylor models.
+Their quotient :math:`S_2` to second order is exact up to :math:`(N - S_2 D) / D`, which is of third order. If D cannot
+be zero there, the loop has no pole on the arc for any parameters of the box.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from seaopt.control import Controller
+from seaopt.control import Controller, Law
 from seaopt.records import record
 from seaopt.robustness.bounds.impulse import ImpulseTransfer
 from seaopt.robustness.bounds.region import Boxes
@@ -122,11 +123,11 @@ class ArcModel:
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # where D may be zero, which `_divide` handles
 def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, ball: int, arcs: Arcs) -> ArcBounds:
     """Return bounds on the arcs; `ball` coordinates of a box count only where they are in the unit ball."""
-    law, box = controller.measurement, arcs.box
-    below = _expand_powers(law.den, np.zeros(box.size, dtype=int), arcs, plant.denominator.c.shape[1])
+    (num, den), box = _expand_law(controller.law), arcs.box
+    below = _expand_powers(den, np.zeros(box.size, dtype=int), arcs, plant.denominator.c.shape[1])
     delay = controller.delay_samples + plant.whole[box]
-    above = _expand_powers(law.num, delay, arcs, below.shape[1])
-    older = _expand_powers(law.num, delay + 1, arcs, below.shape[1])
+    above = _expand_powers(num, delay, arcs, below.shape[1])
+    older = _expand_powers(num, delay + 1, arcs, below.shape[1])
     open_loop = (_pack(plant.denominator, box), below)
     parts = [open_loop, (_pack(plant.head, box), above), (_pack(plant.tail, box), older)]
     n, d = _sum_models([open_loop]), _sum_models(parts)
@@ -147,7 +148,7 @@ def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, bal
 
 def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.ndarray, " b"]:
     """Tell which boxes' D keeps its degree: 1 + d d_c is not zero without delay, and no pole comes from infinity."""
-    last = plant.head[:, -1] * float(controller.measurement.num[0])
+    last = plant.head[:, -1] * -float(controller.law.d[1])
     return (controller.delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
 
 
@@ -164,21 +165,56 @@ def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
     return np.moveaxis(np.concatenate([model.a[: 1 + k], h]), 0, 1)[box], remainder[box]
 
 
+def _expand_law(law: Law) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return numerator and denominator of C_y in ascending powers of 1 - 1/z.
+
+    In these, as in w, nothing cancels near z = 1, where the law's slow poles and its integrators lie.
+    """
+    m, (a, b, c) = law.integrators, law.rest
+    delta, q = np.array([0.0, 1.0]), np.array([1.0, -1.0])
+
+    def characteristic(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " m"]:
+        poles = np.linalg.eigvals(matrix)
+        return np.real(multiply(*(np.array([1.0 - pole, pole]) for pole in poles)))
+
+    def multiply(*factors: np.ndarray) -> np.ndarray:
+        return functools.reduce(np.convolve, factors, np.ones(1))
+
+    slow = characteristic(a)
+    drive = b[:, 1]
+    scale = max(float(np.linalg.norm(drive) * np.linalg.norm(c)), 1e-300)
+    moved = (characteristic(a - np.outer(drive / scale, c)) - slow) * scale
+    num = multiply(*[delta] * m, moved + law.d[1] * slow)
+    for j, gain in enumerate(law.b[:m, 1], start=1):
+        num = num + gain * multiply(*[q] * j, *[delta] * (m - j), slow)
+    return -num, multiply(*[delta] * m, slow)
+
+
 def _expand_powers(
     law: Float[np.ndarray, " m"], delay: Int[np.ndarray, " p"], arcs: Arcs, count: int
 ) -> Complex[np.ndarray, "p j 5"]:
-    r"""Return law(1/z) z^-delay w^j for every j: value, first and second order, bounds on the remainder and on all.
+    r"""Return law(1 - 1/z) z^-delay w^j for every j: value, first and second order, bounds on the remainder and on all.
 
-    Each is a product of functions of the angle, whose derivatives up to the third are bounded over the arc.
+    Each is a product of functions of the angle, whose derivatives up to the third are bounded over the arc: of
+    :math:`p(\delta) q^D`, :math:`q = 1/z`, :math:`\delta = 1 - q`, with :math:`\delta' = iq`, these are
+    :math:`i q^D (q p' - D p)`, :math:`q^D (-q^2 p'' + (2D + 1) q p' - D^2 p)`, and at most
+    :math:`|p^{(3)}| + 3(D + 1)|p''| + (3D^2 + 3D + 1)|p'| + D^3 |p|`.
     """
     z, half = np.exp(1j * arcs.middle), arcs.half
-    order = -(np.arange(law.size) + delay[:, None])
-    terms = law * z[:, None] ** order
-    derivatives = [np.sum(terms * (1j * order) ** k, axis=1) for k in range(3)]
-    third = np.sum(np.abs(law * order**3.0), axis=1)
+    w, turn = np.expm1(1j * arcs.middle), z[:, None]
+    q, delta = 1.0 / z, w / z
+    slopes = [law, *(np.polynomial.polynomial.polyder(law, k) for k in (1, 2, 3))]
+    p0, p1, p2, _ = (np.polynomial.polynomial.polyval(delta, slope) for slope in slopes)
+    late = q**delay
+    derivatives = [
+        late * p0, 1j * late * (q * p1 - delay * p0),
+        late * (-(q**2) * p2 + (2 * delay + 1) * q * p1 - delay**2 * p0),
+    ]  # fmt: skip
+    sizes = [np.polynomial.polynomial.polyval(np.abs(delta) + half, np.abs(slope)) for slope in slopes]
+    third = sizes[3] + 3 * (delay + 1) * sizes[2] + (3 * delay**2 + 3 * delay + 1) * sizes[1] + delay**3 * sizes[0]
     first = [derivative[:, None] for derivative in derivatives]
     first_bounds = [bound[:, None] for bound in _bound_derivatives(derivatives, third, half)]
-    w, j, turn = (z - 1.0)[:, None], np.arange(count), z[:, None]
+    w, j = w[:, None], np.arange(count)
     once, twice = (j * w ** np.maximum(j - 1, 0), j * (j - 1) * w ** np.maximum(j - 2, 0))
     second = [w**j, 1j * once * turn, -(once * turn + twice * turn**2)]
     far = np.abs(w) + half[:, None]
@@ -193,7 +229,7 @@ def _expand_powers(
     (a0, a1, a2, a3), (b0, b1, b2, b3) = first_bounds, second_bounds
     jerk = a3 * b0 + 3.0 * a2 * b1 + 3.0 * a1 * b2 + a0 * b3
     step = half[:, None]
-    remainder = jerk * step**3 / 6.0 + PRODUCT_ROUNDING * np.sum(np.abs(law)) * b0
+    remainder = jerk * step**3 / 6.0 + PRODUCT_ROUNDING * sizes[0][:, None] * b0
     slope, curve = slope * step, 0.5 * curve * step**2
     size = np.abs(value) + np.abs(slope) + np.abs(curve) + remainder
     return np.stack([value, slope, curve, remainder, size], axis=2)

@@ -32,7 +32,7 @@ def design_requirements(controller: Controller, states: Mapping[str, Plant], val
     port = None
     if band is not None and controller.design is not None:
         held = port_of(states[name], values, spec.measured, controller.command.per_effort)
-        port = measure_port(held, controller.measurement, controller.sample_time_s, controller.delay_samples, band)
+        port = measure_port(held, controller.law, controller.sample_time_s, controller.delay_samples, band)
     verdicts = judge(spec, MeasuredLoop(name=name, figures=achieved, port=port), "design plant")
     for other, loop in stuck:
         verdicts += judge(spec, MeasuredLoop(name=other, figures=loop), "design plant", stuck=True)

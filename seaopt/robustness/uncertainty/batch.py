@@ -19,7 +19,7 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.loops.response import LARGEST_ENTRY, law_state_space
+from seaopt.control.loops.response import LARGEST_ENTRY
 from seaopt.control.loops.sampled_plant import DELAY, LinearPlants, conditions, hold, linearise, read_conditions
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -169,7 +169,8 @@ def compute_products(
     d: Float[np.ndarray, " n"],
 ) -> Products:  # fmt: skip
     """Return S of every plant behind its hold, from the eigenvalues of the open and of the closed loop."""
-    ac, bc, cc, dc = law_state_space(controller.reference, controller.measurement)
+    law = controller.law
+    ac, bc, cc, dc = law.a, -law.b[:, 1], law.c, -law.d[1]
     count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
     n, m = nx + k, cc.size
     plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
@@ -182,13 +183,13 @@ def compute_products(
         through = np.zeros(count)
     else:
         drive = b
-    scale = 1.0 / (1.0 + through * dc[1])
+    scale = 1.0 / (1.0 + through * dc)
     closed = np.zeros((count, n + m, n + m))
-    closed[:, :n, :n] = plant - (dc[1] * scale)[:, None, None] * drive[:, :, None] * sense[:, None, :]
+    closed[:, :n, :n] = plant - (dc * scale)[:, None, None] * drive[:, :, None] * sense[:, None, :]
     closed[:, :n, n:] = scale[:, None, None] * drive[:, :, None] * cc
-    closed[:, n:, :n] = -scale[:, None, None] * bc[:, 1, None] * sense[:, None, :]
-    closed[:, n:, n:] = ac - (scale * through)[:, None, None] * np.outer(bc[:, 1], cc)
-    fixed = np.concatenate([np.linalg.eigvals(ac), np.zeros(k)])
+    closed[:, n:, :n] = -scale[:, None, None] * bc[:, None] * sense[:, None, :]
+    closed[:, n:, n:] = ac - (scale * through)[:, None, None] * np.outer(bc, cc)
+    fixed = np.concatenate([law.poles, np.zeros(k)])
     opened = np.concatenate([np.linalg.eigvals(a), np.broadcast_to(fixed, (count, m + k))], axis=1)
     return Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)
 

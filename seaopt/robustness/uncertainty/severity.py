@@ -174,8 +174,4 @@ def _loop_slopes(
     left = np.linalg.solve(np.swapaxes(inner, 1, 2), sampled.c[:, :, None].astype(complex))[:, :, 0]
     driven = np.einsum("nkij,nj->nki", sampled.da, right) + sampled.db
     of_plant = np.einsum("ni,nki->nk", left, driven) + np.einsum("nki,ni->nk", sampled.dc, right) + sampled.dd
-    law = controller.measurement
-    q = 1.0 / z
-    return (
-        of_plant * (np.polyval(law.num[::-1], q) / np.polyval(law.den[::-1], q) * q**controller.delay_samples)[:, None]
-    )
+    return of_plant * (-controller.law.evaluate(z - 1.0)[1] * z**-controller.delay_samples)[:, None]

@@ -20,6 +20,8 @@ from seaopt.records import record
 from seaopt.robustness.verification.playback import Stage, apply_load
 from seaopt.robustness.verification.scenarios import Scenario
 
+REAL = 1e-12  # rad a sample: an eigenvalue of a smaller angle is real but for rounding
+
 
 @record(eq=False)
 class LinearView:
@@ -47,7 +49,8 @@ class LinearView:
             return ""
         if not math.isfinite(radius):
             return "unstable: the linear loop has an eigenvalue that is not finite"
-        hz = abs(np.angle(fastest)) / (2 * np.pi * period)
+        angle = abs(np.angle(fastest))
+        hz = angle / (2 * np.pi * period) if angle > REAL else 0.0
         grows = f", doubling in {math.log(2) * period / math.log(radius):.3g} s" if radius > 1.0 + 1e-12 else ""
         return f"unstable: the linear loop's spectral radius is {radius:.6g}, at {hz:.4g} Hz{grows}"
 

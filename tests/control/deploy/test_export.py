@@ -14,12 +14,14 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
-from seaopt.control import Gains, TransferFunction
+from seaopt.control import Gains, Loop
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.simulation.native import find_compiler
+from tests.control.loops.test_law import RATES, gains_at
+from tests.laws import law_of, scaled
 
 STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
 TS = 1e-3
@@ -39,8 +41,8 @@ def compiler():
     return found
 
 
-def with_law(controller, c_r, c_y):
-    return replace(controller, reference=c_r, measurement=c_y, design=None)
+def with_law(controller, law):
+    return replace(controller, law=law, design=None)
 
 
 def high_order(controller):
@@ -51,12 +53,11 @@ def high_order(controller):
     num = np.array([3.0])
     for factor in ([1, -0.99], [1, -0.98], [1, -0.9], [1, -0.4], [1, -1.8, 0.9]):
         num = np.convolve(num, factor)
-    return with_law(controller, *(TransferFunction(num=k * num, den=den) for k in (1.2, 1.0)))
+    return with_law(controller, law_of(num, den, (1.2 * num, den)))
 
 
 def gain_only(controller):
-    one = TransferFunction(num=np.array([40.0]), den=np.array([1.0]))
-    return with_law(controller, one, one)
+    return with_law(controller, law_of([40.0]))
 
 
 class Compiled:
@@ -112,6 +113,23 @@ def test_compiled_c_is_the_python_law(which, precision, compiler, tuned, signals
     tolerance = 9.0 * (1e-12 if precision == "double" else 1e-5)
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
     assert np.abs(found).max() <= 9.0
+
+
+@pytest.mark.parametrize("rate_hz", RATES)
+def test_the_loop_of_compiled_c_rests_at_its_reference(rate_hz, compiler, tuned, stand, thor, tmp_path):
+    """An observer and an integral: two integrators, at 500 N to 1e-9 with the stand by scipy's hold, a sample late."""
+    gains, plant = gains_at(rate_hz, thor, stand)
+    law = gains.law("pid_dob", 1 / rate_hz).balanced()
+    controller = with_law(replace(tuned, sample_time_s=1 / rate_hz), law)
+    compiled = Compiled(compiler, tmp_path, controller, "double")
+    model = stand.linearize(thor)
+    a, b, c, _, _ = cont2discrete((model.A, model.B[:, :1], model.C[:1], np.zeros((1, 1))), 1 / rate_hz, "zoh")
+    x, waiting = np.zeros(2), 0.0
+    radius = np.max(np.abs(Loop(plant=plant, law=law).eigenvalues()))
+    for _ in range(int(np.log(1e-12) / np.log(radius))):
+        current = compiled.step(500.0, c[0] @ x)
+        x, waiting = a @ x + b[:, 0] * waiting, current
+    assert c[0] @ x == pytest.approx(500.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("flags", [["-Wconversion", "-Wdouble-promotion", "-Wshadow"], ["-x", "c++", "-std=c++11"]])
@@ -300,9 +318,14 @@ def test_a_malformed_controller_json_is_refused(field, value, tuned, tmp_path):
 
 
 EDITS = [
-    (("measurement", "num", 0), 99.0, "measurement.num is not what gains, observer and spec give"),
-    (("reference", "den", 1), -1.9, "reference.den is not what"),
-    (("gains", "k_p"), 1.0, "num is not what"),
+    (("measurement", "num", 0), 99.0, "measurement is not the law multiplied out"),
+    (("reference", "den", 1), -1.9, "reference is not the law"),
+    (("gains", "k_p"), 1.0, "law is not what gains, observer and spec give"),
+    (("law", "D", 0, 0), 1.0, "law is not what"),
+    (("law", "B", 0, 1), -1e-3, "law is not what"),
+    (("law", "A", 0, 0), 1.0 - 1e-12, "law is not what"),
+    (("law", "C"), [[1.0]], "law.C is not a matrix of 1 x 2"),
+    (("law",), None, "law = None"),
     (("gains", "k_x"), 1.0, "gains has T_f, c, k_d, k_i, k_p, k_r, k_x where"),
     (("delay_samples",), 2.5, "delay_samples = 2.5"),
     (("sample_time_s",), 0.002, "sample_time_s is 0.002, which is not 1/spec.sample_rate_hz"),
@@ -333,6 +356,21 @@ def test_an_edited_controller_json_is_refused_by_export_and_by_reading(place, va
     assert not list(tmp_path.iterdir())
 
 
+def test_figures_that_the_law_does_not_have_are_refused(tuned):
+    for name, value in (("ms", 1.3), ("bandwidth_hz", None), ("tracking_band_hz", [1.0, 2.0]), ("noise_gain", 1e9)):
+        content = json.loads(to_json(tuned.to_dict()))
+        content["achieved"][name] = value
+        with pytest.raises(FileError, match=f"achieved.{name} is"):
+            so.Controller.from_dict(content, *tuned.design)
+
+
+def test_a_controller_json_without_its_law_is_to_be_tuned_again(tuned, tmp_path):
+    content = json.loads(to_json(tuned.to_dict()))
+    del content["law"]
+    with pytest.raises(FileError, match="key law is missing; tune again"):
+        export(content, tmp_path)
+
+
 def test_figures_are_computed_again_where_the_design_plant_is_known(tuned, tmp_path):
     lying = replace(tuned, achieved=replace(tuned.achieved, ms=1.01))
     header = export(lying, tmp_path)[0].read_text()
@@ -341,9 +379,8 @@ def test_figures_are_computed_again_where_the_design_plant_is_known(tuned, tmp_p
     assert "As stated by controller.json, not computed again: bandwidth 30 Hz, Ms 1.01" in (
         export(content, tmp_path)[0].read_text()
     )
-    unstable = TransferFunction(num=99.0 * tuned.measurement.num, den=tuned.measurement.den)
     with pytest.raises(ControlError, match="not stable on its design plant"):
-        export(replace(tuned, measurement=unstable), tmp_path)
+        export(replace(tuned, law=scaled(tuned.law, 1.0, 99.0)), tmp_path)
 
 
 def test_a_target_that_is_a_file_is_told(tuned, tmp_path):
@@ -354,12 +391,12 @@ def test_a_target_that_is_a_file_is_told(tuned, tmp_path):
 
 def test_a_pid_whose_integral_is_slow_is_coarse_in_float(compiler, tuned, tmp_path):
     """At 1 kN an increment under 3e-5 N is lost: an error of 0.02 N stands with k_i = 1.3, and double takes it up."""
-    slow = Gains(k_p=3.2, k_i=1.3, k_d=0.0, T_f=1e-3, k_r=4.2).transfer_functions("pid", TS)
+    slow = Gains(k_p=3.2, k_i=1.3, k_d=0.0, T_f=1e-3, k_r=4.2).law("pid", TS)
     errors = []
     for precision in ("double", "float"):
         folder = tmp_path / precision
         folder.mkdir()
-        compiled = Compiled(compiler, folder, with_law(tuned, *slow), precision, current_limit_A=90.0)
+        compiled = Compiled(compiler, folder, with_law(tuned, slow), precision, current_limit_A=90.0)
         compiled.reset(1000.0, 1000.0, 2000.0 * tuned.command.per_effort)
         before = compiled.law.x[0]
         for _ in range(1000):

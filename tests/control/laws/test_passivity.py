@@ -15,6 +15,7 @@ from seaopt.control.laws.passivity import passivity, passivity_rows
 from seaopt.control.loops.port import hold_response, port_of
 from seaopt.errors import ControlError
 from seaopt.plants import high_impedance, moving_output, two_link
+from tests.laws import law_of, measurement_matrices
 
 TS = 1e-3
 F = np.geomspace(0.01, 499, 60)
@@ -34,10 +35,7 @@ def tuned():
 
 def controller_of(sample_time_s=TS, delay_samples=1, **gains):
     law = Gains(**{"k_p": 3.0, "k_i": 1.0, "k_d": 0.03, "T_f": sample_time_s, "k_r": 4.0, **gains})
-    reference, measurement = law.transfer_functions("pid", sample_time_s)
-    return replace(
-        tuned(), reference=reference, measurement=measurement, sample_time_s=sample_time_s, delay_samples=delay_samples
-    )
+    return replace(tuned(), law=law.law("pid", sample_time_s), sample_time_s=sample_time_s, delay_samples=delay_samples)
 
 
 IMPEDANCES = {  # each from the equations of motion of design.md, link 1 at rest, F_m = -c F1
@@ -111,7 +109,7 @@ def test_the_real_part_is_the_power_that_a_sampled_loop_takes(f_hz, tolerance, t
     """Simulated with its sampler, hold and delay; at 100 Hz the loop gives power away. Tolerances are of abs(Z)."""
     controller = controller_of(k_i=20.0)
     f = np.array([f_hz])
-    law = controller.measurement.response(f, TS) * hold_response(f, TS, 1)
+    law = controller.law.measurement_response(f) * hold_response(f, TS, 1)
     z = port_of(stand, thor, "F1", controller.command.per_effort).response(f).impedance(law)[0]
     taken = power(controller, thor, f_hz, periods=2 * f_hz)
     assert taken == pytest.approx(z.real, abs=tolerance * abs(z))
@@ -154,7 +152,7 @@ def attached(controller, params, mass, stiffness, damping=0.0):
     a[2:4, :2], a[2:4, 2:4] = -np.linalg.solve(inertia, stiff), -np.linalg.solve(inertia, damp)
     a[2:4, 4] = np.linalg.solve(inertia, [1.0, 0.0])
     hop = expm(a * controller.sample_time_s)
-    ac, bc, cc, dc = controller.measurement.state_space()
+    ac, bc, cc, dc = measurement_matrices(controller.law)
     n, d = bc.size, controller.delay_samples
     assert d == 1
     closed = np.zeros((4 + d + n, 4 + d + n))  # plant, the command on its way, law
@@ -182,7 +180,7 @@ def test_a_loop_that_breaks_the_rule_is_unstable_with_the_right_spring(thor, sta
     assert controller.close(stand, thor).figures().stable
     assert found.violated_hz == found.low_hz
     f = np.array([found.least_hz])
-    law = controller.measurement.response(f, TS) * hold_response(f, TS, 1)
+    law = controller.law.measurement_response(f) * hold_response(f, TS, 1)
     z = port_of(stand, thor, "F1", controller.command.per_effort).response(f).impedance(law)[0]
     w = 2 * np.pi * found.least_hz
     mass, stiffness = (-z.imag / w, 0.0) if z.imag < 0 else (1e-3, z.imag * w)
@@ -210,7 +208,7 @@ def test_a_violation_between_grid_points_is_found(thor, stand):
     pole = np.exp((-2 * np.pi * 5e-4 + 2j * np.pi * 12.3456) * TS)
     den = np.array([1.0, -2 * pole.real, abs(pole) ** 2])
     law = TransferFunction(num=3.0 * den + np.array([0.0, 3e-5, -3e-5]), den=den)
-    controller = replace(tuned(), reference=law, measurement=law)
+    controller = replace(tuned(), law=law_of(law.num, law.den))
     found = passivity(controller, stand, thor, high_hz=60.0)
     f = np.linspace(12.33, 12.36, 100_001)
     s = 2j * np.pi * f
@@ -285,8 +283,7 @@ def spun(params, law, delay=1):
 @pytest.mark.parametrize("gain", [-3.0, -1.05, 0.0, 1.0, 5.0, 10.0, 20.0, 30.0])
 def test_a_loop_that_grows_with_the_link_held_is_passive_nowhere(gain, thor, stand):
     """Re Z >= 0 below 26 Hz under k_p = 30 says nothing: an eigenvalue is at 1.027."""
-    law = TransferFunction(num=np.array([gain]), den=np.array([1.0]))
-    controller = replace(tuned(), reference=law, measurement=law)
+    controller = replace(tuned(), law=law_of([gain]))
     grows = bool(np.max(np.abs(spun(thor, gain))) > 1.0)
     for plant in (stand, moving_output()):  # what link 2 is does not matter
         found = passivity(controller, plant, thor)

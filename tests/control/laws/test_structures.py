@@ -45,7 +45,7 @@ def test_the_observer_is_the_written_one(stand, thor):
     v = ref + 2.0 * e + integral + 0.03 * rate - lfilter(q_over_p.num, q_over_p.den, meas)
     for k in range(300):
         out[k] = v[k] + lfilter(q.num, q.den, out[: k + 1])[k]
-    c_r, c_y = gains.transfer_functions("pid_dob", TS)
+    c_r, c_y = gains.law("pid_dob", TS).transfer_functions()
     np.testing.assert_allclose(lfilter(c_r.num, c_r.den, ref) - lfilter(c_y.num, c_y.den, meas), out, rtol=1e-6)
 
 
@@ -83,7 +83,7 @@ def judged(controller, plants, params):
         s = 1 / (1 + open_loop)
         rows.append((abs(s).max(), abs(open_loop * s).max(), 2 / abs(2 * s - 1).max(), abs(noise).max()))
         model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], TS)
-        law = control.ss(control.tf(loop.measurement.num, loop.measurement.den, TS))
+        law = control.ss(control.tf(controller.measurement.num, controller.measurement.den, TS))
         late = control.ss(control.tf([1], [1] + [0] * controller.delay_samples, TS))
         stable &= bool(np.abs(control.feedback(model * late * law, 1).poles()).max() < 1)
         if len(rows) == 1:
@@ -147,7 +147,7 @@ def test_a_plant_that_answers_later_is_kept_too(stand, thor, delay_s):
     controller = so.tune(stand, thor, spec, {"late": (stand, late)})
     assert controller.feasible
     f = np.geomspace(0.01, 100.0, 4000)
-    once = controller.plant(stand, thor).response(f) * controller.measurement.response(f, controller.sample_time_s)
+    once = controller.plant(stand, thor).response(f) * controller.law.measurement_response(f)
     turned = np.abs(1 / (1 + once * np.exp(-2j * np.pi * f * delay_s))).max()
     assert 1.0 < turned <= 1.8 * 1.01  # but for the images of a delay of no whole samples
 

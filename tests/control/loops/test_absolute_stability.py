@@ -10,7 +10,7 @@ import seaopt as so
 from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.control.loops import absolute_stability as proof
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.loops.transfer_function import TransferFunction
+from tests.laws import law_of, measurement_matrices
 
 STIFFNESS, MASS, DAMPING, PERIOD, DELAY = 120e3, 18.9, 395.0, 1e-3, 2
 A = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
@@ -28,7 +28,7 @@ def pid(k_p, k_d, k_i=0.6, T_f=1.3e-3):
     lag, difference = np.array([1.0, -alpha]), np.array([1.0, -1.0])
     den = np.convolve(difference, lag)
     num = k_p * den + k_d / (T_f + PERIOD) * np.convolve(difference, difference)
-    return TransferFunction(num=num + k_i * PERIOD / 2 * np.convolve([1.0, 1.0], lag), den=den)
+    return law_of(num + k_i * PERIOD / 2 * np.convolve([1.0, 1.0], lag), den, sample_time_s=PERIOD)
 
 
 def loop_of(law, slope=1.0):
@@ -52,7 +52,7 @@ def closed_loop_matrices(law, substeps):
     mean = expm(np.block([[A, np.eye(2)], [np.zeros((2, 4))]]) * h)[:2, 2:] / h
     whole = expm(np.block([[A, B[:, None], np.zeros((2, 1))], [np.zeros((1, 3)), 1.0], [np.zeros((1, 4))]]) * h)
     mean_effort = whole[:2, 3] / h
-    law_a, law_b, law_c, law_d = law.state_space()
+    law_a, law_b, law_c, law_d = measurement_matrices(law)
     n, waiting = law_a.shape[0], DELAY
     size = 2 + waiting + n
     first = np.zeros((size, size))  # what happens at the sample: u_k = -C_y y_k joins the queue
@@ -105,7 +105,7 @@ def test_every_viscous_friction_within_the_margin_is_stable(seed):
     law = pid(rng.uniform(0.1, 4.0), rng.uniform(0.0, 0.04), k_i=rng.uniform(0.3, 200.0))
     loop = loop_of(law, slope=6250.0)
     margin = proof.friction_margin(loop)
-    if np.max(np.abs(so.control.Loop(plant=loop.plant, reference=law, measurement=law).eigenvalues())) >= 1.0:
+    if np.max(np.abs(so.control.Loop(plant=loop.plant, law=law).eigenvalues())) >= 1.0:
         return  # the proof is for loops that are stable without friction
     assert margin.factor > 0.0
     for share in np.linspace(0.0, 0.999, 25):
@@ -114,7 +114,7 @@ def test_every_viscous_friction_within_the_margin_is_stable(seed):
         plant = DigitalPlant(
             a=block[:2, :2], b=block[:2, 2], c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0
         )
-        closed = so.control.Loop(plant=plant, reference=law, measurement=law)
+        closed = so.control.Loop(plant=plant, law=law)
         assert np.max(np.abs(closed.eigenvalues())) < 1.0 + 1e-9, share
 
 

@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import DigitalPlant, Gains, Loop, TransferFunction, command_of, sample
+from seaopt.control import DigitalPlant, Gains, Loop, command_of, sample
 from seaopt.control.loops.response import find_zeros
+from tests.laws import law_of, measurement_matrices
 
 
 def loop_of(structure="pid", plant=None, params=None, delay=1, ts=1e-3, **gains):
     plant, params = plant or so.plants.high_impedance(), params or so.plants.thor()
     law = Gains(**{"k_p": 3.2, "k_i": 1.3, "k_d": 0.033, "T_f": 1e-3, "k_r": 1.0 + gains.get("k_p", 3.2), **gains})
-    reference, measurement = law.transfer_functions(structure, ts)
     digital = sample(plant, params, "F1", command_of(plant, params, "F1").per_effort, ts, delay)
-    return Loop(plant=digital, reference=reference, measurement=measurement)
+    return Loop(plant=digital, law=law.law(structure, ts))
 
 
 def test_the_sampled_plant_is_scipys_zero_order_hold(swing, thor):
@@ -50,7 +50,7 @@ def test_the_law_is_the_written_one():
             out.append(k_r * ref[k] - 3.0 * meas[k] + integral + 0.03 * rate)
         from scipy.signal import lfilter
 
-        c_r, c_y = law.transfer_functions("pid", ts)
+        c_r, c_y = law.law("pid", ts).transfer_functions()
         found = lfilter(c_r.num, c_r.den, ref) - lfilter(c_y.num, c_y.den, meas)
         np.testing.assert_allclose(found, out, rtol=1e-9)
         assert c_y.den[0] == 1.0
@@ -62,8 +62,7 @@ def independent(loop, f):
     p = np.array([loop.plant.c @ np.linalg.inv(x * np.eye(len(loop.plant.b)) - loop.plant.a) @ loop.plant.b for x in z])
     p = (p + loop.plant.d) * z**-loop.plant.delay_samples
     value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
-    c_y = value(loop.measurement.num) / value(loop.measurement.den)
-    c_r = value(loop.reference.num) / value(loop.reference.den)
+    c_r, c_y = (value(tf.num) / value(tf.den) for tf in loop.law.transfer_functions())
     return p * c_y, p * c_r / (1 + p * c_y), c_y / (1 + p * c_y)
 
 
@@ -96,7 +95,8 @@ def test_margins_are_python_controls_on_a_stable_loop(stand, thor):
     z = control.tf("z")
     z.dt = 1e-3
     plant = control.ss2tf(control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3))
-    c = control.tf(loop.measurement.num, loop.measurement.den, 1e-3)
+    c_y = loop.law.transfer_functions()[1]
+    c = control.tf(c_y.num, c_y.den, 1e-3)
     open_loop = plant * c * control.tf([1], [1, 0], 1e-3)
     gm, pm, _, _, wpc, _ = control.stability_margins(open_loop, method="poly")
     figures = loop.figures()
@@ -133,8 +133,7 @@ def test_a_light_mode_between_grid_points_is_found():
         ts,
     )
     plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=0, static_gain=1e-6)
-    one = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
-    loop = Loop(plant=plant, reference=one, measurement=one)
+    loop = Loop(plant=plant, law=law_of([1.0]))
     f = np.linspace(77.1, 77.15, 400_001)
     exact = np.abs(1 / (1 + independent(loop, f)[0])).max()
     assert loop.figures().ms == pytest.approx(exact, rel=1e-4)
@@ -148,7 +147,7 @@ def test_stability_is_what_a_simulation_shows(name, request, thor):
     for factor in (1.0, 4.0, 7.0, 9.0, 14.0):
         loop = loop_of("pd", plant, thor, k_p=3.2 * factor, k_d=0.033 * factor)
         a, b, c, _ = loop.plant.delayed()
-        ac, bc, cc, dc = loop.measurement.state_space()
+        ac, bc, cc, dc = measurement_matrices(loop.law)
         x, xc = np.full(len(b), 1e-3), np.zeros(len(bc))
         sizes = []
         for _ in range(6000):

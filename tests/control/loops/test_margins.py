@@ -12,14 +12,15 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete, tf2ss
 
 import seaopt as so
-from seaopt.control import DigitalPlant, Loop, TransferFunction
+from seaopt.control import DigitalPlant, Loop
 from seaopt.control.loops import peaks
 from seaopt.control.loops.margins import margins, nu_gap
 from seaopt.errors import ControlError
 from tests.control.loops.test_loop import loop_of
+from tests.laws import law_of, measurement_matrices
 
 INTEGRATING = [("pid", 22, 1.6), ("pid_dob", 22, 1.6), ("pid_dob", 30, 2.0)]
-ONE = TransferFunction(num=np.array([1.0]), den=np.array([1.0]))
+ONE = law_of([1.0])
 
 
 @cache
@@ -30,7 +31,7 @@ def known(structure):
 
 
 def gained(factor):
-    return TransferFunction(num=np.array([float(factor)]), den=np.array([1.0]))
+    return law_of([factor])
 
 
 def modal(modes, ts=1e-3, delay=0, law=ONE):
@@ -45,7 +46,7 @@ def modal(modes, ts=1e-3, delay=0, law=ONE):
     plant = DigitalPlant(
         a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=delay, static_gain=sum(m[2] for m in modes)
     )
-    return Loop(plant=plant, reference=law, measurement=law)
+    return Loop(plant=plant, law=law)
 
 
 def independent(loop, f):
@@ -54,7 +55,8 @@ def independent(loop, f):
     rhs = np.broadcast_to(plant.b[:, None].astype(complex), (f.size, plant.b.size, 1))
     x = np.linalg.solve(z[:, None, None] * np.eye(plant.b.size) - plant.a, rhs)[..., 0]
     value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
-    return (x @ plant.c + plant.d) * z**-plant.delay_samples * value(loop.measurement.num) / value(loop.measurement.den)
+    c_y = loop.law.transfer_functions()[1]
+    return (x @ plant.c + plant.d) * z**-plant.delay_samples * value(c_y.num) / value(c_y.den)
 
 
 def poles_of(loop, factor=1.0, extra=0):
@@ -63,7 +65,7 @@ def poles_of(loop, factor=1.0, extra=0):
         a=loop.plant.a, b=loop.plant.b, c=loop.plant.c, d=loop.plant.d, sample_time_s=1.0,
         delay_samples=loop.plant.delay_samples + extra, static_gain=1.0,
     ).delayed()  # fmt: skip
-    ac, bc, cc, dc = loop.measurement.state_space()
+    ac, bc, cc, dc = measurement_matrices(loop.law)
     inner = 1.0 + factor * d * dc
     u_x, u_k = -factor * dc * c / inner, -factor * cc / inner
     closed = np.block([
@@ -114,8 +116,8 @@ def test_a_gain_margin_downwards():
     ts = 1e-2
     a, b = np.array([[1, ts], [0, 1]]), np.array([ts**2 / 2, ts])
     plant = DigitalPlant(a=a, b=b, c=np.array([1.0, 0]), d=0.0, sample_time_s=ts, delay_samples=0, static_gain=np.inf)
-    lead = TransferFunction(num=np.convolve([40.0, -38.4], [1.0, -0.995]), den=np.convolve([1.0, -0.4], [1.0, -1.0]))
-    loop = Loop(plant=plant, reference=lead, measurement=lead)
+    lead = law_of(np.convolve([40.0, -38.4], [1.0, -0.995]), np.convolve([1.0, -0.4], [1.0, -1.0]))
+    loop = Loop(plant=plant, law=lead)
     found = margins(loop)
     for db in (found.gain_up_db, found.gain_down_db):
         assert np.max(np.abs(poles_of(loop, 10 ** (db / 20)))) == pytest.approx(1.0, abs=1e-9)
@@ -147,7 +149,7 @@ def test_an_integrator_is_no_crossing(structure, bandwidth_hz, ms, name, request
 def test_a_zero_on_the_circle_is_no_crossing(num):
     """At z = 1, at z = -1 and at both; python-control's factors are the others."""
     for gain in np.linspace(-0.3, 0.3, 13):
-        loop = modal([(20, 0.7, 1.0)], law=TransferFunction(num=gain * np.array(num), den=np.array([1.0])))
+        loop = modal([(20, 0.7, 1.0)], law=law_of(gain * np.array(num)))
         for hz, factor in margins(loop).gain_crossings:
             value = independent(loop, np.array([hz]))[0]
             assert value == pytest.approx(-1.0 / factor, rel=1e-6)
@@ -162,7 +164,8 @@ def test_an_unstable_loop_that_python_control_calls_comfortable(stand, thor):
     s = 1 / (1 + independent(loop, f))
     assert 2 / np.abs(2 * s - 1).max() > 0.5
     model = control.ss(loop.plant.a, loop.plant.b[:, None], loop.plant.c[None], [[loop.plant.d]], 1e-3)
-    law = control.ss(control.tf(loop.measurement.num, loop.measurement.den, 1e-3))
+    c_y = loop.law.transfer_functions()[1]
+    law = control.ss(control.tf(c_y.num, c_y.den, 1e-3))
     open_loop = model * control.ss(control.tf([1], [1, 0], 1e-3)) * law
     assert control.disk_margins(open_loop, 2 * np.pi * f)[0] > 0.5
     found = margins(loop)
@@ -220,10 +223,10 @@ def test_no_feedback_has_no_crossings():
 def test_laws_with_denominators_of_their_own_share_an_integrator():
     """C_r over (1 - q) alone and C_y over (1 - q)(1 - q/2): the integrator is one, and the loop is stable."""
     loop = modal([(10.0, 0.7, 1.0)])
-    reference = TransferFunction(num=np.array([0.02]), den=np.array([1.0, -1.0]))
-    measurement = TransferFunction(num=np.array([0.02, -0.01]), den=np.convolve([1.0, -1.0], [1.0, -0.5]))
-    figures = Loop(plant=loop.plant, reference=reference, measurement=measurement).figures()
-    same = Loop(plant=loop.plant, reference=reference, measurement=reference).figures()
+    reference = [0.02], [1.0, -1.0]
+    law = law_of([0.02, -0.01], np.convolve([1.0, -1.0], [1.0, -0.5]), reference)
+    figures = Loop(plant=loop.plant, law=law).figures()
+    same = Loop(plant=loop.plant, law=law_of(*reference)).figures()
     assert figures.stable
     assert figures.reference_peak == pytest.approx(same.reference_peak, rel=1e-8)
 
@@ -304,7 +307,7 @@ def rational(num, den, ts=1e-3):
     a, b, c, d, _ = cont2discrete((a, b, c, d), ts)
     gain = num[-1] / den[-1] if den[-1] else np.inf
     plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=d[0, 0], sample_time_s=ts, delay_samples=0, static_gain=gain)
-    return Loop(plant=plant, reference=ONE, measurement=ONE)
+    return Loop(plant=plant, law=ONE)
 
 
 @pytest.mark.parametrize(
@@ -389,7 +392,7 @@ def velocity(hz, zeta, gain, ts=1e-3, delay=1):
     a, b, c, _, _ = cont2discrete((a, b, c, np.zeros((1, 1))), ts)
     plant = DigitalPlant(a=a, b=b[:, 0], c=c[0], d=0.0, sample_time_s=ts, delay_samples=delay, static_gain=0.0)
     law = gained(-gain * 2 * zeta)
-    return Loop(plant=plant, reference=law, measurement=law)
+    return Loop(plant=plant, law=law)
 
 
 @pytest.mark.parametrize("zeta", [1e-2, 1e-3, 1e-5])
@@ -413,7 +416,7 @@ def test_an_undamped_mode_is_no_crossing(hz):
     """On the circle to rounding: 1 + L has no zero there for any factor but none at all."""
     loop = velocity(hz, 0.0, 0.0, delay=int(hz < 100))
     law = gained(1e-3)
-    loop = Loop(plant=loop.plant, reference=law, measurement=law)
+    loop = Loop(plant=loop.plant, law=law)
     found = margins(loop)
     up, down = (1e9 if x is None else 10 ** (x / 20) for x in (found.gain_up_db, found.gain_down_db))
     assert found.disks

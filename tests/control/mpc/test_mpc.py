@@ -132,7 +132,7 @@ def test_without_limits_it_is_its_transfer_functions(stand, thor, delay):
     mpc = made(stand, thor, delay_samples=delay, current_limit_A=1000.0, current_slew_A_per_s=None)
     reference = np.repeat(np.random.default_rng(1).uniform(-300, 300, 6), 50)
     run = close_loop(mpc.command, mpc.start, stand, thor, reference, delay_samples=delay)
-    c_r, c_y = mpc.unlimited()
+    c_r, c_y = mpc.unlimited().transfer_functions()
     expected = lfilter(c_r.num, c_r.den, reference) - lfilter(c_y.num, c_y.den, run.force)
     assert np.max(np.abs(run.current - expected)) < 0.02 * np.max(np.abs(expected))
 

@@ -8,24 +8,23 @@ from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import TransferFunction
 from seaopt.control.laws.realisation import realise
 from seaopt.control.running.closed_loop import LoopState, SampledLoop, run_loop
 from seaopt.control.running.force_run import close_loop
 from seaopt.errors import SimulationError
 from seaopt.simulation import native
+from tests.laws import law_of, scaled
 
 TS = 1e-3
-LAW = {  # k_p = 3, k_i = 2, k_d = 0.03, T_f = 1 ms and unit feedforward, written out: (1 - q)(1 - q/2)
-    "reference": TransferFunction(num=np.array([19.001, -35.9995, 16.9995]), den=np.array([1.0, -1.5, 0.5])),
-    "measurement": TransferFunction(num=np.array([18.001, -34.4995, 16.4995]), den=np.array([1.0, -1.5, 0.5])),
-}
+# k_p = 3, k_i = 2, k_d = 0.03, T_f = 1 ms and unit feedforward, written out: (1 - q)(1 - q/2)
+NUM_R, NUM_Y, DEN = [19.001, -35.9995, 16.9995], [18.001, -34.4995, 16.4995], [1.0, -1.5, 0.5]
+LAW = law_of(NUM_Y, DEN, reference=(NUM_R, DEN))
 GAIN = 1 / 240.3318
 
 
 def law(limit=9.0, **changes):
-    options = {"sample_time_s": TS, "per_effort": GAIN, "current_limit_A": limit, **changes}
-    return realise(LAW["reference"], LAW["measurement"], **options)
+    options = {"per_effort": GAIN, "current_limit_A": limit, **changes}
+    return realise(LAW, **options)
 
 
 @pytest.fixture
@@ -115,7 +114,7 @@ def test_without_limits_it_is_the_linear_loop(stand, thor, delay):
     a, b, c, _, _ = cont2discrete((model.A, model.B * GAIN, model.C[:1], np.zeros((1, 1))), TS, "zoh")
     x, queue, forces = np.zeros(2), [0.0] * delay, []
     e, u = [0.0, 0.0], [0.0, 0.0]
-    num_r, num_y = LAW["reference"].num, LAW["measurement"].num
+    num_r, num_y = NUM_R, NUM_Y
     y = [0.0, 0.0]
     for _ in range(n):
         forces.append((c @ x)[0])
@@ -206,10 +205,7 @@ def test_a_run_goes_on_where_another_ended(swing, thor):
 def test_peaks_between_samples_are_seen(thor):
     """A free ringing at 160 Hz, six samples a period: the largest of the samples is not the top."""
     plant = so.plants.two_link("fixed", "mass")
-    silent = realise(
-        *(TransferFunction(num=np.zeros(1), den=np.ones(1)) for _ in range(2)), sample_time_s=3.1e-3,
-        per_effort=GAIN,
-    )  # fmt: skip
+    silent = realise(law_of([0.0], sample_time_s=3.1e-3), per_effort=GAIN)
     params = plant.defaults.update(m_2=1e6, b_r=0.0, J=1e-3)
     loop = SampledLoop(plant=plant, law=silent, measured="F1", delay_samples=1)
     state = LoopState(x=np.array([[0.0, 0.0, 1e-4, 0.0]]), z=np.zeros((1, 1)))
@@ -244,10 +240,7 @@ def test_a_stiff_draw_beside_a_soft_one_does_not_run_away(stand, thor, damping):
 
 def test_a_loop_that_runs_away_is_left_where_it_does(stand, thor):
     """An unstable loop without limit: the largest eigenvalue says when the largest float is passed, or its 1e-7th."""
-    wild = realise(
-        *(TransferFunction(num=100.0 * tf.num, den=tf.den) for tf in LAW.values()), sample_time_s=TS,
-        per_effort=GAIN,
-    )  # fmt: skip
+    wild = realise(scaled(LAW, 100.0), per_effort=GAIN)
     loop = SampledLoop(plant=stand, law=wild, measured="F1", delay_samples=1)
     run = run_loop(loop, [thor, thor.update(J=3.4e-6)], np.full(2000, 50.0))
     model = stand.linearize(thor)

@@ -44,7 +44,7 @@ def test_rows_are_what_a_recomputation_gives(stand, swing, thor):
     assert row.disturbance == pytest.approx(max(integral), rel=1e-2)
     assert row.noise_gain == pytest.approx(np.abs(independent(loops[0], f)[2]).max(), rel=1e-3)
     at = np.array([20.0])
-    motor = abs(controller.reference.response(at, 1e-3) * loops[0].sensitivity(at))[0]
+    motor = abs(controller.law.reference_response(at) * loops[0].sensitivity(at))[0]
     assert row.force_limit_N == pytest.approx(9.0 / controller.command.per_effort / motor, rel=1e-6)
 
 

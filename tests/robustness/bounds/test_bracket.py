@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import chi2
 
 import seaopt as so
-from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
 from seaopt.robustness import Bracket, Budget, Uncertainty, batch_figures, bracket, combine_uncertainty
 from seaopt.robustness.bounds.region import build_region
 from seaopt.robustness.uncertainty.draws import LEVEL
 from seaopt.robustness.uncertainty.worst import find_worst, measure_worst
+from tests.laws import law_of
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +101,8 @@ def first_order(controller, params):
         },
         f=lambda t, x, u, p: {"x": (p.K * u.I - x.x) / p.tau}, h=lambda t, x, u, p: {"F1": x.x},
     )  # fmt: skip
-    law = TransferFunction(num=np.array([3.0]), den=np.array([1.0]))
     return plant, replace(
-        controller, reference=law, measurement=law, delay_samples=0,
+        controller, law=law_of([3.0]), delay_samples=0,
         command=replace(controller.command, per_effort=1.0),
         spec=so.ControllerSpec(bandwidth_hz=30),
     )  # fmt: skip

@@ -11,12 +11,12 @@ import pytest
 from scipy.stats import beta, binomtest
 
 import seaopt as so
-from seaopt.control import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.certify import _digest
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges
+from tests.laws import scaled
 
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25
@@ -155,14 +155,10 @@ def test_an_unidentifiable_fit_is_not_certified(controller, stand, short_log, th
 
 
 def test_the_law_alone_is_certified(controller, stand, thor):
-    """Halve both transfer functions: the design figures are of the halved law, not of what was tuned."""
+    """Halve the law: the design figures are of the halved law, not of what was tuned."""
     from dataclasses import replace
 
-    from seaopt.control import TransferFunction
-
-    halved = {n: TransferFunction(num=0.5 * getattr(controller, n).num, den=getattr(controller, n).den)
-              for n in ("reference", "measurement")}  # fmt: skip
-    certificate = so.certify(replace(controller, **halved), {"stand": stand}, thor)
+    certificate = so.certify(replace(controller, law=scaled(controller.law, 0.5)), {"stand": stand}, thor)
     (row,) = [item for item in certificate.requirements if item.name == "bandwidth_hz"]
     assert not row.met
     assert row.value < 20
@@ -235,9 +231,7 @@ def test_the_design_plant_is_certified_though_nobody_lists_it(controller, stand,
 
 def test_another_law_meets_other_draws(controller, swing, thor):
     """A law tuned with the worst draws of a certificate must not be certified on the same draws."""
-    softer = replace(
-        controller, measurement=TransferFunction(num=0.9 * controller.measurement.num, den=controller.measurement.den)
-    )
+    softer = replace(controller, law=scaled(controller.law, 1.0, 0.9))
     points = [
         so.certify(law, {"swing": swing}, thor, ranges={"I_p": (0.2, 0.6)}, samples=1, seed=seed)
         for law, seed in ((controller, 1), (controller, 1), (controller, 2), (softer, 1))

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import TransferFunction
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.robustness import run_simulations
+from tests.laws import scaled
 
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 CELL = so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})
@@ -89,11 +89,8 @@ def test_robustness_json_reads_back(certificate, controller, stand, swing, thor)
 
 def test_a_run_that_fails_is_a_requirement_with_its_witness(controller, stand, thor):
     """At 11 times the gain the limit of 9 A holds the loop in a limit cycle near 84 Hz (docs/verification.md)."""
-    wild = {
-        name: TransferFunction(num=12 * getattr(controller, name).num, den=getattr(controller, name).den)
-        for name in ("reference", "measurement")
-    }
-    found = so.certify(replace(controller, **wild), {"stand": stand}, thor).with_simulation(seed=3)
+    wild = replace(controller, law=scaled(controller.law, 12.0))
+    found = so.certify(wild, {"stand": stand}, thor).with_simulation(seed=3)
     (failed,) = [item for item in found.requirements if item.name == "simulation_failures"]
     assert (failed.met, failed.value, failed.limit) == (False, 7.0, 0.0)  # the same failure in every run, once
     assert failed.where.startswith("stand, ") and "draw nominal, seed 3: unstable" in failed.where

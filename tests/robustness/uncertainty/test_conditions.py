@@ -20,6 +20,7 @@ from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
 from tests.control.running.test_closed_loop import swing_by_hand
+from tests.laws import scaled
 
 STEP = Scenario(name="step", phases=(Phase(duration_s=0.12, force_N=30.0), Phase(duration_s=0.28)))
 TS = 1e-3
@@ -34,8 +35,7 @@ def controller(limited_controller):
 def proportional(controller):
     """Return the controller with a law that does not integrate: it rests at a reference other than the force."""
     law = Gains(k_p=3.0, k_i=0.0, k_d=0.03, T_f=1e-3, k_r=4.0)
-    reference, measurement = law.transfer_functions("pd", TS)
-    return replace(controller, reference=reference, measurement=measurement)
+    return replace(controller, law=law.law("pd", TS))
 
 
 def at(params, **conditions):
@@ -251,7 +251,7 @@ def test_the_certificates_worst_draw_is_played_there(controller, swing, thor):
 
 
 def test_a_law_whose_reference_does_nothing_is_refused(controller, swing, thor):
-    deaf = replace(controller, reference=so.control.TransferFunction(num=np.zeros(1), den=np.ones(1)))
+    deaf = replace(controller, law=scaled(controller.law, 0.0, 1.0))
     loop = Stage(controller=deaf, plant=swing).loop(held=False)
     assert runnable(deaf).integrators
     with pytest.raises(ControlError, match="blocked at 0 Hz"):
@@ -262,8 +262,7 @@ def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(contro
     """1 + N(A) L = 0 with L of the drawn angle and delay, N(A) = 2/pi (asin s + s sqrt(1 - s^2)), s = limit/A."""
     drawn = at(thor, phi=0.7, delay_s=0.4e-3)
     law = Gains(k_p=27.0, k_i=0.0, k_d=0.27, T_f=1e-3, k_r=28.0)
-    reference, measurement = law.transfer_functions("pd", TS)
-    wild = replace(controller, reference=reference, measurement=measurement)
+    wild = replace(controller, law=law.law("pd", TS))
     loop = wild.close(swing, drawn)
     assert not loop.figures().stable
     f = np.linspace(20, 200, 200_001)

@@ -9,11 +9,11 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import TransferFunction
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.robustness import plant_margins
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
+from tests.laws import law_of, scaled
 
 TS = 1e-3
 
@@ -65,12 +65,10 @@ def base(stand, thor):
 
 
 def closed(base, plant, gain):
-    law = TransferFunction(num=np.array([float(gain)]), den=np.array([1.0]))
     spec = so.ControllerSpec(bandwidth_hz=30, measured="F1")
     return replace(
         base,
-        reference=law,
-        measurement=law,
+        law=law_of([gain]),
         command=replace(base.command, per_effort=1.0),
         spec=spec,
         design=(plant, plant.defaults),
@@ -120,12 +118,11 @@ def test_a_delay_that_is_there_stays(base):
 def test_a_slow_loops_margin_of_seconds_is_found(base):
     """An integral of 0.1 rad/s: a quarter of its period, 15 s, is 15,700 samples; the closed form is pi/2 / 0.1 s."""
     plant = modes((300.0, 0.7, 1.0))
-    law = TransferFunction(num=np.array([5e-5, 5e-5]), den=np.array([1.0, -1.0]))
-    controller = replace(closed(base, plant, 1.0), reference=law, measurement=law)
+    law = law_of([5e-5, 5e-5], [1.0, -1.0])
+    controller = replace(closed(base, plant, 1.0), law=law)
     figures = plant_margins(controller, plant, plant.defaults)
     assert figures.searched_delay_s == pytest.approx(20.0)
     assert figures.sampled_delay_s == pytest.approx(np.pi / 2 / 0.1, rel=1e-3)
-    slower = TransferFunction(num=0.5 * law.num, den=law.den)
-    beyond = plant_margins(replace(controller, reference=slower, measurement=slower), plant, plant.defaults)
+    beyond = plant_margins(replace(controller, law=scaled(law, 0.5)), plant, plant.defaults)
     assert beyond.sampled_delay_s is None
     assert beyond.margins.delay_s > beyond.searched_delay_s == pytest.approx(20.0)

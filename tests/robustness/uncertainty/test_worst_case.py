@@ -77,7 +77,7 @@ def test_draws_beyond_computing_are_failures(b_r, controller, stand, thor):
 def test_a_plant_that_is_not_finite_is_not_stable(value, controller, stand, thor, monkeypatch):
     plant = controller.plant(stand, thor)
     a = np.where(np.eye(len(plant.a)) > 0, value, plant.a)
-    loop = Loop(plant=replace(plant, a=a), reference=controller.reference, measurement=controller.measurement)
+    loop = Loop(plant=replace(plant, a=a), law=controller.law)
     figures = loop.figures()
     assert (figures.stable, figures.spectral_radius, figures.ms) == (False, np.inf, np.inf)
     assert margins(loop).disks == {}

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import Gains, TransferFunction
+from seaopt.control import Gains
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import SimulationError
 from seaopt.robustness.verification.linear import linearise_last_phase
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
+from tests.laws import scaled
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +75,7 @@ def test_noise_on_a_healthy_loop_is_no_fault(controller, stand, swing, thor, on_
 @pytest.mark.parametrize(("factor", "late"), [(9.5, 0), (40.0, 0), (-0.05, 0), (1.0, 8)])
 def test_every_run_of_an_unstable_loop_fails_and_says_so(controller, stand, thor, cell, factor, late):
     """Radius and frequency from the eigenvalues of loop matrices written out here."""
-    laws = {
-        name: TransferFunction(num=factor * getattr(controller, name).num, den=getattr(controller, name).den)
-        for name in ("reference", "measurement")
-    }
-    wild = replace(controller, **laws, delay_samples=1 + late)
+    wild = replace(controller, law=scaled(controller.law, factor), delay_samples=1 + late)
     plant, tf = wild.plant(stand, thor), wild.measurement
     n, m, d = plant.b.size, tf.den.size - 1, wild.delay_samples
     # States: plant, the last d commands (newest first), and the law's history of m measurements and m commands.
@@ -131,8 +128,7 @@ def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand
     """An integrator pushes against 300 N of static friction: 41 N at 4.75 Hz by the spectrum of the last 8 s."""
     hunter = so.tune(stand, thor, replace(controller.spec, max_noise_gain=None))
     gains = Gains(**{**hunter.gains, "k_i": hunter.gains["k_i"] + 1.0})
-    reference, measurement = gains.transfer_functions("pid", hunter.sample_time_s)
-    hunter = replace(hunter, reference=reference, measurement=measurement)
+    hunter = replace(hunter, law=gains.law("pid", hunter.sample_time_s))
     plant = so.plants.high_impedance(parts=["stribeck"])
     params = plant.complete(thor).update(f_c=100.0, v_s=1e-5, f_s=300.0, v_st=3e-4)
     assert hunter.close(plant, params).figures().stable

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import TransferFunction
 from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
 from seaopt.robustness.verification.limit_cycles import seek_limit_cycles
+from tests import laws
 from tests.stick_slip import Mass, simulate
 
 RELAY = 2.0
@@ -32,11 +32,7 @@ def blind(stand, rubbing):
 
 
 def scaled(controller, factor, **spec):
-    laws = {
-        name: TransferFunction(num=factor * getattr(controller, name).num, den=getattr(controller, name).den)
-        for name in ("reference", "measurement")
-    }
-    return replace(controller, **laws, spec=replace(controller.spec, **spec))
+    return replace(controller, law=laws.scaled(controller.law, factor), spec=replace(controller.spec, **spec))
 
 
 def third_order_lag(steepness):
@@ -55,10 +51,9 @@ def third_order_lag(steepness):
 
 def test_a_relay_with_a_third_order_lag_oscillates_at_the_square_root_of_three(blind):
     """The textbook's example: the lag is 1/8 at 180 degrees, so that the amplitude is 4 M/(8 pi)."""
-    nothing = TransferFunction(num=np.array([0.0]), den=np.array([1.0]))
     plant = third_order_lag(1e5)
     spec = so.ControllerSpec(measured="v", bandwidth_hz=25)
-    open_loop = replace(blind, measurement=nothing, reference=nothing, spec=spec, design=(plant, so.ParameterSet()))
+    open_loop = replace(blind, law=laws.law_of([0.0]), spec=spec, design=(plant, so.ParameterSet()))
     (cycle,) = predict_limit_cycles(open_loop, plant, so.ParameterSet())
     assert cycle.stable
     assert cycle.frequency_hz == pytest.approx(np.sqrt(3.0) / (2 * np.pi), rel=1e-4)

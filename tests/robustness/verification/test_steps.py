@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import TransferFunction
 from seaopt.plants.friction import friction_states
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.scenarios import step_scenarios
 from seaopt.robustness.verification.verification import verify
+from tests.laws import law_of, scaled
 from tests.stick_slip import Mass, simulate
 
 SPEC = so.ControllerSpec(
@@ -63,8 +63,8 @@ def test_where_no_peak_is_asked_for_the_certificate_says_that_none_is_judged(bli
 def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
     """A proportional law of static gain 1/(1 + 0.2): every step ends a sixth short."""
     pd = so.tune(stand, rubbing.update(f_c=0.0), replace(SPEC, current_limit_A=None, max_reference_peak=None))
-    laws = {name: TransferFunction(num=np.array([gain]), den=np.array([1.0])) for name, gain in GAINS.items()}
-    short = replace(pd, **laws, design=(stand, rubbing))
+    law = law_of([GAINS["measurement"]], reference=([GAINS["reference"]], [1.0]))
+    short = replace(pd, law=law, design=(stand, rubbing))
     found = verify(short, {"stand": stand}, rubbing, scenarios=step_scenarios)
     steps = [found.scenario(row).phases[-1].force_N for row in found.rows]
     assert steps == pytest.approx([5.0, 25.0, 125.0, 625.0])  # times the friction, without a current limit
@@ -77,11 +77,8 @@ def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
 
 @pytest.mark.parametrize(("factor", "late"), [(40.0, 0), (1.0, 30)])
 def test_a_run_away_is_told_once_and_allows_nothing_absurd(blind, stand, rubbing, factor, late):
-    laws = {
-        name: TransferFunction(num=factor * getattr(blind, name).num, den=getattr(blind, name).den)
-        for name in ("reference", "measurement")
-    }
-    certificate = so.certify(replace(blind, **laws, delay_samples=2 + late), {"stand": stand}, rubbing)
+    wild = replace(blind, law=scaled(blind.law, factor), delay_samples=2 + late)
+    certificate = so.certify(wild, {"stand": stand}, rubbing)
     (told,) = [row for row in certificate.requirements if row.name == "simulation_failures"]
     assert (told.value, "unstable" in told.where) == (4.0, True)
     sizes = [step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]]

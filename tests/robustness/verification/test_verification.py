@@ -40,8 +40,7 @@ STEPS = {"2 % step", "10 % step", "50 % step", "unsaturated step"}
 def with_law(controller, **gains):
     """Return the controller with another pd law, as if somebody had typed it in."""
     law = Gains(**{"k_i": 0.0, "T_f": 1e-3, "k_r": 1.0 + gains["k_p"], **gains})
-    reference, measurement = law.transfer_functions("pd", controller.sample_time_s)
-    return replace(controller, reference=reference, measurement=measurement)
+    return replace(controller, law=law.law("pd", controller.sample_time_s))
 
 
 def test_the_tuned_controller_passes(verification):

@@ -1,4 +1,4 @@
-r"""Realise a law's two transfer functions as one state space of least order, integrators apart, for `realisation`.
+r"""Least order: take a transfer function's integrators apart from the rest, and balance a state space.
 
 C_r and C_y become one system with two inputs, of least order, in coordinates that single precision can hold. With
 :math:`\delta = 1 - q`, every denominator is :math:`\delta^m R(q)`, R without a root at 1, and the m integrators split
@@ -16,10 +16,11 @@ nothing drives, show as Hankel singular values of zero and are left out.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
-from scipy.linalg import schur
+from jaxtyping import Complex, Float
+from scipy.linalg import block_diag, schur
 
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -29,17 +30,17 @@ EPS = float(np.finfo(float).eps)
 POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coefficients, has a root there
 ZERO_AT_ONE = 4 * EPS  # stricter for a numerator: a weak integral is to be kept, and one of rounding does no harm
 NEGLIGIBLE_HANKEL = 1e-13  # Hankel singular values below this share of the law's gain are rounding
+RESPONSE_TOLERANCE = 1e-6  # how well a state space must have the response of its transfer function
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
 @record(eq=False)
 class SplitLaw:
-    """A transfer function taken apart: g_1 ... g_m, Y, R, and the first m + 2 terms of the series of N/R."""
+    """A transfer function taken apart: g_1 ... g_m, Y and R."""
 
     chain: Float[np.ndarray, " m"]
     rest: Float[np.ndarray, " _"]
     den: Float[np.ndarray, " _"]
-    series: Float[np.ndarray, " _"]
 
 
 def split(name: str, tf: TransferFunction) -> SplitLaw:
@@ -55,12 +56,12 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     if not (np.all(np.isfinite(num)) and np.all(np.isfinite(den)) and tf.den[0] == 1.0):
         raise ControlError(f"{name}: num or den has a number that is not finite, or den[0] is not 1; tune again")
     if not np.any(num):
-        return SplitLaw(chain=np.zeros(0), rest=np.zeros(1), den=np.ones(1), series=np.zeros(2))
+        return SplitLaw(chain=np.zeros(0), rest=np.zeros(1), den=np.ones(1))
     while den.size > 1 and _has_root_at_one(den, POLE_AT_ONE):
         den, m = np.cumsum(den)[:-1], m + 1
         if num.size > 1 and _has_root_at_one(num, ZERO_AT_ONE):
             num, m = np.cumsum(num)[:-1], m - 1
-    series = _expand(num, den, m + 2)
+    series = _expand(num, den, m)
     chain = np.zeros(m + 1)  # the coefficients of w^0 ... w^m in X / delta^m, with 1/delta = 1 + w
     for power, value in zip(range(m, 0, -1), series, strict=False):
         chain[: power + 1] += value * np.array([math.comb(power, i) for i in range(power + 1)])
@@ -70,15 +71,68 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
     rest[: removed.size] -= removed
     for _ in range(m):
         rest = np.cumsum(rest)[:-1]
-    return SplitLaw(chain=chain[1:], rest=rest, den=den, series=series)
+    return SplitLaw(chain=chain[1:], rest=rest, den=den)
 
 
-def put_over_one_denominator(parts: list[SplitLaw]) -> tuple[list[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]]:
-    """Return both Y over one R."""
+def realise_rest(
+    parts: list[SplitLaw],
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Return Y/R of both in observer form, each of its input: on shared states where R is the same, else side by side.
+
+    The direct terms, Y at q = 0, are left out.
+    """
     one, other = parts
-    if np.array_equal(one.den, other.den):
-        return [one.rest, other.rest], one.den
-    return [np.convolve(one.rest, other.den), np.convolve(other.rest, one.den)], np.convolve(one.den, other.den)
+    groups = [((0, one), (1, other))] if np.array_equal(one.den, other.den) else [((0, one),), ((1, other),)]
+    blocks: list[Float[np.ndarray, "_ _"]] = []
+    drives: list[Float[np.ndarray, "_ 2"]] = []
+    for group in groups:
+        den = group[0][1].den
+        n = max(p.size for _, part in group for p in (part.rest, den)) - 1
+        column = np.pad(den, (0, n + 1 - den.size))[1:]
+        a, b = np.eye(n, k=1), np.zeros((n, 2))
+        a[:, :1] -= column[:, None]
+        for input_number, part in group:
+            b[:, input_number] = np.pad(part.rest, (0, n + 1 - part.rest.size))[1:] - part.rest[0] * column
+        blocks.append(a)
+        drives.append(b)
+    c = np.concatenate([np.eye(1, len(block))[0] for block in blocks])
+    return np.asarray(block_diag(*blocks)).reshape(c.size, c.size), np.vstack(drives), c
+
+
+def build_chain(
+    chain: Float[np.ndarray, "m k"], a: Float[np.ndarray, "l l"], b: Float[np.ndarray, "l k"],
+    c: Float[np.ndarray, " l"],
+) -> dict[str, Float[np.ndarray, "..."]]:  # fmt: skip
+    """Return a, b and c of a chain of m accumulators, g_j in row j of `chain`, beside a state space."""
+    m, n = len(chain), len(chain) + c.size
+    whole = np.zeros((n, n))
+    whole[:m, :m], whole[m:, m:] = np.eye(m) + np.eye(m, k=1), a
+    return {"a": whole, "b": np.vstack([chain, b]), "c": np.concatenate([np.eye(1, m)[0], c])}
+
+
+def check_same_response(
+    name: str, tf: TransferFunction, response: Callable[[Float[np.ndarray, " k"]], Complex[np.ndarray, " k"]],
+    sample_time_s: float,
+) -> None:  # fmt: skip
+    """Refuse a state space whose response is not that of its transfer function, but for its coefficients' rounding.
+
+    Raises
+    ------
+    ControlError
+        It is not.
+
+    """
+    f = np.geomspace(1e-4, 0.49, 25) / sample_time_s
+    q = np.exp(-2j * np.pi * f * sample_time_s)
+    bottom = np.polynomial.polynomial.polyval(q, tf.den)
+    wanted = np.polynomial.polynomial.polyval(q, tf.num) / bottom
+    rounding = np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(wanted)
+    allowed = RESPONSE_TOLERANCE * np.abs(wanted) + 256 * EPS * rounding / np.abs(bottom)
+    if not np.all(np.abs(response(f) - wanted) <= allowed):
+        raise ControlError(
+            f"{name}: slow poles are too close together to tell from integrators in double precision; sample more "
+            "slowly, make them faster, or give the law as a state space"
+        )
 
 
 def _has_root_at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:
@@ -104,30 +158,14 @@ def _expand(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: i
 
 
 def balance(
-    numerators: list[Float[np.ndarray, " _"]], den: Float[np.ndarray, " k"], gain: float
-) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Return a balanced realisation of least order of two transfer functions over one denominator, each of its input.
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"], gain: float
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"], Float[np.ndarray, " m"]]:
+    """Return a stable system balanced and of least order.
 
     What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the largest Hankel singular value, is rounding.
-
-    Raises
-    ------
-    ControlError
-        A pole is not inside the unit circle.
-
     """
-    n = max(p.size for p in (*numerators, den)) - 1
-    column = np.pad(den, (0, n + 1 - den.size))[1:]
-    a, c = np.eye(n, k=1), np.eye(1, n)[0]
-    a[:, :1] -= column[:, None]
-    b = np.column_stack([np.pad(p, (0, n + 1 - p.size))[1:] - p[0] * column for p in numerators])
-    if not c.size:
-        return a, b, c
     a, turn = (np.asarray(part) for part in schur(a))  # powers of a triangle keep its poles, of a companion form not
     b, c = turn.T @ b, c @ turn
-    radius = float(np.max(np.abs(np.linalg.eigvals(a))))
-    if radius >= 1.0:
-        raise ControlError(f"the law has a pole at |z| = {radius:.9g} besides its integrators; tune a stable one")
     reach, show = _factor(a, b), _factor(a.T, c[:, None])
     left, hankel, right = np.linalg.svd(show.T @ reach)
     kept = hankel > NEGLIGIBLE_HANKEL * max(float(hankel[0]), gain)

@@ -1,0 +1,101 @@
+r"""A law put together from its parts, with what integrates written down and not multiplied out.
+
+With :math:`q = z^{-1}` and :math:`\delta = 1 - q`, an `Assembly` is
+
+.. math:: u = \sum_{j=1}^{m} \frac{g_j}{\delta^j} + D + C (zI - A)^{-1} B ,
+
+one column for each input, A stable. A part :math:`G = d + c(zI - a)^{-1}b` in series splits the integrators off by
+its Taylor series at :math:`\delta = 0`, whose terms are those of
+
+.. math:: \frac{G(z) - G(1)}{\delta} = -c(I-a)^{-1}b - c\,(zI - a)^{-1}(I-a)^{-1}a\,b ,
+
+a system with the same poles: what cancels is never computed. As :math:`1/\delta = 1 + w`, w = 1/(z - 1), the
+:math:`g_j` become the chain of `seaopt.control.loops.law`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.minimal import build_chain
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.records import record
+
+Columns = Float[np.ndarray, " k"]
+
+
+@record(eq=False)
+class Assembly:
+    """Integrators in powers of 1/delta, shape (m, k), beside a state space (a, b, c, d)."""
+
+    chain: Float[np.ndarray, "m k"]
+    a: Float[np.ndarray, "n n"]
+    b: Float[np.ndarray, "n k"]
+    c: Float[np.ndarray, " n"]
+    d: Columns
+
+    @classmethod
+    def of_gains(cls, gains: Columns) -> Assembly:
+        """Return numbers, one per input."""
+        k = gains.size
+        return cls(chain=np.zeros((0, k)), a=np.zeros((0, 0)), b=np.zeros((0, k)), c=np.zeros(0), d=gains)
+
+    @property
+    def static(self) -> Columns:
+        """What does not integrate, at 0 Hz."""
+        return self.d + self.c @ np.linalg.solve(np.eye(self.c.size) - self.a, self.b)
+
+    def plus(self, other: Assembly) -> Assembly:
+        """Return the sum, on the same inputs."""
+        m, n, more = max(len(self.chain), len(other.chain)), self.c.size, other.c.size
+        chain = np.zeros((m, self.d.size))
+        chain[: len(self.chain)] += self.chain
+        chain[: len(other.chain)] += other.chain
+        a = np.zeros((n + more, n + more))
+        a[:n, :n], a[n:, n:] = self.a, other.a
+        return Assembly(
+            chain=chain, a=a, b=np.vstack([self.b, other.b]), c=np.concatenate([self.c, other.c]), d=self.d + other.d
+        )  # fmt: skip
+
+    def through(self, part: TransferFunction) -> Assembly:
+        """Return this in series with a stable part."""
+        a, b, c, d = part.state_space()
+        n, more = self.c.size, c.size
+        into, through, chain = np.outer(b, self.d), d * self.d, np.zeros_like(self.chain)
+        drive, direct = b, d  # of one term of the part's Taylor series after the other, first the part itself
+        for order in range(len(chain)):
+            fixed = np.linalg.solve(np.eye(more) - a, drive)
+            chain[: len(chain) - order] += (direct + float(c @ fixed)) * self.chain[order:]
+            drive, direct = -a @ fixed, -float(c @ fixed)
+            into = into + np.outer(drive, self.chain[order])
+            through = through + direct * self.chain[order]
+        whole = np.zeros((n + more, n + more))
+        whole[:n, :n], whole[n:, n:], whole[n:, :n] = self.a, a, np.outer(b, self.c)
+        return Assembly(
+            chain=chain, a=whole, b=np.vstack([self.b, into]), c=np.concatenate([d * self.c, c]), d=through
+        )  # fmt: skip
+
+    def integrated(self, static: Columns) -> Assembly:
+        """Return this over delta; `static` is its `static`, in which the caller may know a zero to be one."""
+        inner = np.eye(self.c.size) - self.a
+        row = np.linalg.solve(inner.T, self.c)
+        return Assembly(
+            chain=np.vstack([static, self.chain]), a=self.a, b=self.b, c=-row @ self.a, d=-row @ self.b
+        )  # fmt: skip
+
+    def law(self, sample_time_s: float) -> Law:
+        """Return the law of a reference and a measurement, where the inputs are reference - measurement, reference."""
+        m = len(self.chain)
+        while m and not np.any(self.chain[m - 1]):
+            m -= 1
+        chain, d = np.zeros((m, 2)), self.d.copy()
+        for power, row in enumerate(self.chain[:m], start=1):
+            d += row
+            for j in range(1, power + 1):
+                chain[j - 1] += math.comb(power, j) * row
+        turn = np.array([[1.0, -1.0], [1.0, 0.0]])  # inputs (error, reference) from (reference, measurement)
+        return Law(**build_chain(chain @ turn, self.a, self.b @ turn, self.c), d=d @ turn, sample_time_s=sample_time_s)

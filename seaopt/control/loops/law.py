@@ -1,0 +1,213 @@
+r"""A control law as one discrete state space, from (reference, measured) to effort, with what integrates kept apart.
+
+.. math:: x^+ = A x + B \begin{bmatrix} r \\ y \end{bmatrix}, \qquad
+          u = C x + D \begin{bmatrix} r \\ y \end{bmatrix} = C_r r - C_y y .
+
+The first m states are a chain of accumulators, :math:`x_j^+ = x_j + x_{j+1} + \dots`, read at its head:
+
+.. math:: u = \sum_{j=1}^{m} g_j w^j + \text{(a stable rest)}, \qquad w = \frac{1}{z-1},
+
+with :math:`g_j` the j-th row of B. Its poles are 1 to the last bit, however many they are, and the loop comes to rest
+where :math:`g_m` says: at a force equal to its reference exactly if the two columns' :math:`g_m` are equal but for
+their sign. Multiplied out as polynomials a double pole at 1 is known to the root of rounding only, and the DC gain of
+what stands beside it to :math:`\epsilon/\prod|1 - p_i|`, which at a few kHz is percents.
+
+Responses use :math:`z - 1` itself and a complex Schur form of the rest, by back substitution for all frequencies at
+once, so that they keep their digits down to 0 Hz.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.loops.minimal import balance, build_chain, check_same_response, realise_rest, split
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.records import record
+
+if TYPE_CHECKING:
+    import control
+
+NEAREST_TO_ONE = 1e-17  # abs(z - 1) at least: an integrator's response at 0 Hz is large instead of infinite
+
+
+@record(eq=False)
+class Law:
+    """x+ = a x + b (r, y), u = c x + d (r, y): a control law from its reference and what it measures to an effort.
+
+    Parameters
+    ----------
+    a, b, c, d
+        Matrices, shapes (n, n), (n, 1 + measured), (n,) and (1 + measured,).
+    sample_time_s : float
+        Seconds.
+
+    Examples
+    --------
+    >>> pi = Law.from_transfer_functions(
+    ...     *2 * [TransferFunction(num=np.array([2.5, -1.5]), den=np.array([1.0, -1.0]))], sample_time_s=1e-3
+    ... )
+    >>> pi.integrators, pi.b.tolist(), pi.d.tolist()
+    (1, [[1.0, -1.0]], [2.5, -2.5])
+
+    """
+
+    a: Float[np.ndarray, "n n"]
+    b: Float[np.ndarray, "n k"]
+    c: Float[np.ndarray, " n"]
+    d: Float[np.ndarray, " k"]
+    sample_time_s: float
+
+    @property
+    def integrators(self) -> int:
+        """How many of the first states are the chain of accumulators."""
+        n, m = self.c.size, 0
+        for length in range(1, n + 1):
+            if self.a[length - 1, length - 1] != 1.0:
+                break
+            rows = np.eye(length, n) + np.eye(length, n, k=1) * (np.arange(n) < length)
+            alone = np.array_equal(self.a[:length], rows) and not np.any(self.a[length:, :length])
+            if alone and np.array_equal(self.c[:length], np.eye(1, length)[0]):
+                m = length
+        return m
+
+    @property
+    def rest(self) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]:
+        """A, B and C of what does not integrate."""
+        m = self.integrators
+        return self.a[m:, m:], self.b[m:], self.c[m:]
+
+    @property
+    def poles(self) -> Complex[np.ndarray, " n"]:
+        """The eigenvalues of `a`, those of the chain exactly 1."""
+        return np.concatenate([np.ones(self.integrators), np.linalg.eigvals(self.rest[0])]).astype(complex)
+
+    def responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
+        """Return u per reference and per measured signal at frequencies in Hz; very large at 0 where it integrates."""
+        return self.evaluate(np.expm1(2j * np.pi * f * self.sample_time_s))
+
+    def reference_response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return C_r at frequencies in Hz."""
+        return self.responses(f)[0]
+
+    def measurement_response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return C_y at frequencies in Hz."""
+        return -self.responses(f)[1]
+
+    def evaluate(self, from_one: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
+        """Return u per reference and per measured signal at z = 1 + from_one."""
+        m = self.integrators
+        a, b, c = self.rest
+        distance = np.where(np.abs(from_one) < NEAREST_TO_ONE, NEAREST_TO_ONE, from_one)
+        out = np.repeat(self.d[:, None], from_one.size, axis=1).astype(complex)
+        power = np.ones_like(distance)
+        for row in self.b[:m]:
+            power = power / distance
+            out += np.multiply.outer(row, power)
+        if not c.size:
+            return out
+        triangle, basis = _triangulate(a)
+        x, left = np.zeros((c.size, from_one.size), dtype=complex), c @ basis
+        for i in range(c.size):  # x (zI - triangle) = left
+            x[i] = (left[i] + triangle[:i, i] @ x[:i]) / (from_one + (1.0 - triangle[i, i]))
+        return out + (basis.conj().T @ b).T @ x
+
+    def balanced(self) -> Law:
+        """Return the same law with what does not integrate balanced and of least order; as it is if that is unstable.
+
+        Balanced, controllability and observability Gramians are equal and diagonal, which keeps rounding noise low, so
+        that single precision can hold the states (`seaopt.control.loops.minimal`).
+        """
+        m, rest = self.integrators, self.rest
+        if not rest[2].size or np.max(np.abs(np.linalg.eigvals(rest[0]))) >= 1.0:
+            return self
+        return Law(
+            **build_chain(self.b[:m], *balance(*rest, float(np.max(np.abs(self.d))))), d=self.d,
+            sample_time_s=self.sample_time_s,
+        )  # fmt: skip
+
+    def transfer_functions(self) -> tuple[TransferFunction, TransferFunction]:
+        """Return C_r and C_y multiplied out over one denominator, for reading: they say less than the law does."""
+        m = self.integrators
+        a, b, c = self.rest
+        difference = np.array([1.0, -1.0])
+        powers = [_power(difference, k) for k in range(m + 1)]
+        slow = np.real(np.poly(a)) if c.size else np.ones(1)
+        den = np.convolve(powers[m], slow)
+        out: list[TransferFunction] = []
+        for column, sign in ((0, 1.0), (1, -1.0)):
+            num = np.zeros(den.size)
+            over = (np.real(np.poly(a - np.outer(b[:, column], c))) - slow) if c.size else np.zeros(1)
+            num += np.convolve(powers[m], over + self.d[column] * slow)
+            for j in range(1, m + 1):
+                term = np.convolve(np.convolve(np.eye(1, j + 1, k=j)[0], powers[m - j]), slow)
+                num += self.b[j - 1, column] * term
+            out.append(TransferFunction(num=sign * num, den=den))
+        return out[0], out[1]
+
+    def to_control(self) -> control.StateSpace:
+        """Return the law as python-control's `StateSpace`, inputs reference and measured, output effort."""
+        import control  # deferred: slow to import
+
+        measured = [f"measured{i}" if self.d.size > 2 else "measured" for i in range(1, self.d.size)]
+        return control.StateSpace(
+            self.a, self.b, self.c[None], self.d[None], self.sample_time_s,
+            inputs=["reference", *measured], outputs=["effort"], name="law",
+        )  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return A, B, C and D as matrices, for JSON."""
+        return {"A": self.a, "B": self.b, "C": self.c[None], "D": self.d[None]}
+
+    @classmethod
+    def from_transfer_functions(
+        cls, reference: TransferFunction, measurement: TransferFunction, sample_time_s: float
+    ) -> Law:
+        """Return the balanced law u = C_r r - C_y y of two transfer functions, for laws that are given as such.
+
+        Raises
+        ------
+        ControlError
+            A coefficient is not finite, den[0] is not 1, or a pole lies so close to 1 that double precision does not
+            tell it from an integrator.
+
+        Examples
+        --------
+        >>> lag = TransferFunction(num=np.array([0.5]), den=np.array([1.0, -0.5]))
+        >>> Law.from_transfer_functions(lag, lag, sample_time_s=1e-3).c.size
+        1
+
+        """
+        parts = [split(name, tf) for name, tf in (("reference", reference), ("measurement", measurement))]
+        m = max(part.chain.size for part in parts)
+        chain = np.zeros((m, 2))
+        for column, part in enumerate(parts):
+            chain[: part.chain.size, column] = part.chain
+        through = np.array([reference.num[0], -measurement.num[0]], dtype=float)
+        a, b, c = realise_rest(parts)
+        sign = np.array([1.0, -1.0])
+        law = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s).balanced()
+        for name, tf, response in (
+            ("reference", reference, law.reference_response), ("measurement", measurement, law.measurement_response),
+        ):  # fmt: skip
+            check_same_response(name, tf, response, sample_time_s)
+        return law
+
+
+def _triangulate(a: Float[np.ndarray, "n n"]) -> tuple[Complex[np.ndarray, "n n"], Complex[np.ndarray, "n n"]]:
+    """Return the complex Schur form of a matrix, and its basis."""
+    if a.shape[0] == 1:
+        return a.astype(complex), np.ones((1, 1), dtype=complex)
+    from scipy.linalg import schur
+
+    triangle, basis = (np.asarray(part) for part in schur(a, output="complex")[:2])
+    return triangle, basis
+
+
+def _power(polynomial: Float[np.ndarray, " n"], exponent: int) -> Float[np.ndarray, " m"]:
+    out = np.ones(1)
+    for _ in range(exponent):
+        out = np.convolve(out, polynomial)
+    return out
