@@ -137,7 +137,7 @@ def check_distinct(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[
             if known == unit:
                 raise LogError(
                     f'{place[0]}: column "{place[1]}" is given for {other} and for {name}; each channel needs a column '
-                    "of its own: choose another for one of them, or leave it out"
+                    "of its own: choose another for one of them, leave it out, or give a file's column shared = true"
                 )
             notes.append(f'{other} and {name} are the same column "{place[1]}", in {known or "-"} and in {unit or "-"}')
         seen.setdefault(place, {})[name] = unit

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +15,11 @@ from rich.console import Console
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import to_json, write_json
 from seaopt.formatting import format_table
-from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, read_table
+from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, contents, read_table
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
+from seaopt.logs.reading.selection import ClockError, is_time_name
+from seaopt.signals import Table
 
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
@@ -22,8 +27,8 @@ STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 def inspect_log(
     path: Path, *, time: str | None = None, channels: Sequence[str] = (), inputs: Sequence[str] = (),
-    units: Sequence[str] = (), align: str | None = None, counter: str | None = None, folder: Path | None = None,
-    json: bool = False,
+    units: Sequence[str] = (), align: str | None = None, counter: str | None = None, rate_hz: float | None = None,
+    folder: Path | None = None, json: bool = False,
 ) -> None:  # fmt: skip
     """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
 
@@ -38,13 +43,14 @@ def inspect_log(
     headers, unit_of = _parse_pairs("--channel", channels), _parse_pairs("--unit", units)
     for name in unit_of:
         if name != "time" and name not in headers:
-            raise SeaoptError(f"--unit {name}={unit_of[name]}: name its column too, --channel {name}=COLUMN")
-    if "time" in unit_of and time is None:
-        raise SeaoptError(f"--unit time={unit_of['time']}: name its column too, --time COLUMN")
-    clock = Column(column=time, unit=unit_of.get("time")) if time is not None else None
+            command = _spell_command(path, f"--channel {name}=COLUMN --unit {name}={unit_of[name]}")
+            raise SeaoptError(f"--unit {name}={unit_of[name]}: name its column too: {command}")
     columns = {name: Column(column=header, unit=unit_of.get(name)) for name, header in headers.items()}
-    rule = _parse_rule(align)
-    table = read_table(path, time=clock, channels=columns or None, align=rule, counter=_parse_counter(counter))
+    read = partial(
+        read_table, path, channels=columns or None, align=_parse_rule(align), counter=_parse_counter(counter),
+        rate_hz=rate_hz,
+    )  # fmt: skip
+    table = _read_on_clock(path, read, time, unit_of.get("time"))
     quality = assess_quality(table, inputs=list(inputs) or None)
     written: list[Path] = []
     if folder is not None:
@@ -56,6 +62,43 @@ def inspect_log(
         sys.stdout.write(to_json(quality.to_dict()))
         return
     _print_report(quality, written)
+
+
+def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
+    """Read a table; where its clock is not clear the error is the command to type, and seconds may be assumed.
+
+    Raises
+    ------
+    LogError
+        No column, or more than one, is named like a time, or it has another unit.
+
+    """
+    if time is None and unit is not None:
+        named = [field.name for field in contents(path).fields if field.numeric and is_time_name(field.name)]
+        if len(named) != 1:
+            raise LogError(f"--unit time={unit}: name its column too: {_spell_clock(path, 'COLUMN', unit)}")
+        time = named[0]
+    clock = Column(column=time, unit=unit) if time is not None else None
+    try:
+        return read(time=clock)
+    except ClockError as error:
+        if error.column is None:
+            likely = error.candidates[0] if error.candidates else "COLUMN"
+            raise LogError(f"{error}; type {_spell_clock(path, likely, 's')}") from error
+        if not is_time_name(error.column):
+            raise LogError(f"{error}; type {_spell_clock(path, error.column, 's')}") from error
+        table = read(time=Column(column=error.column, unit="s"))
+        other = _spell_clock(path, error.column, "ms")
+        note = f'column "{error.column}" has no unit: seconds were assumed; for milliseconds type {other}'
+        return replace(table, notes=(note, *table.notes))
+
+
+def _spell_clock(path: Path, column: str, unit: str) -> str:
+    return _spell_command(path, f"--time {shlex.quote(column)} --unit time={unit}")
+
+
+def _spell_command(path: Path, options: str) -> str:
+    return f"seaopt inspect {shlex.quote(str(path))} {options}"
 
 
 def _parse_rule(align: str | None) -> Rule | None:

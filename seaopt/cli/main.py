@@ -141,6 +141,9 @@ def inspect(
         str | None,
         typer.Option(metavar="COLUMN=SAMPLES", help="A column that counts samples, and how many a count stands for."),
     ] = None,
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate-hz", metavar="HZ", help="Sample rate of a log without a clock.")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write quality.json and the figure there.")
     ] = None,
@@ -157,7 +160,7 @@ def inspect(
         return
     inspect_log(
         log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
-        counter=counter, folder=output, json=json,
+        counter=counter, rate_hz=rate_hz, folder=output, json=json,
     )  # fmt: skip
 
 

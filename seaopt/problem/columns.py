@@ -13,7 +13,7 @@ def list_log_files(table: ExperimentTable) -> list[str]:
     """Return the files of an experiment: its log or logs, then those that columns name."""
     logs = [table.log] if isinstance(table.log, str) else list(table.log or [])
     columns = [column for column in (table.time, *table.inputs.values(), *table.outputs.values()) if column is not None]
-    named = [column.file for column in columns if not isinstance(column, str) and column.file is not None]
+    named = [column.file for column in columns if not isinstance(column, str | int) and column.file is not None]
     return list(dict.fromkeys([*logs, *named]))
 
 
@@ -32,17 +32,20 @@ def check_inside(place: str, table: ExperimentTable) -> None:
                 raise ProblemError(f'{place}.log = "{name}" leaves the problem file\'s folder; put the log beside it')
 
 
-def make_column(table: str | ClockTable | ColumnTable, folder: Path) -> Column:
+def make_column(table: str | int | ClockTable | ColumnTable, folder: Path) -> Column:
     """Return a column as the reader takes it."""
-    if isinstance(table, str):
+    if isinstance(table, str | int):
         return Column(column=table)
     file = None if table.file is None else folder / table.file
     if isinstance(table, ClockTable):
-        return Column(column=table.column, unit=table.unit, file=file, clock_offset_s=table.clock_offset_s)
-    time = table.time if table.time is None or isinstance(table.time, str) else make_column(table.time, folder)
+        return Column(
+            column=table.column, unit=table.unit, file=file, clock_offset_s=table.clock_offset_s, where=table.where
+        )  # fmt: skip
+    time = table.time if table.time is None or isinstance(table.time, str | int) else make_column(table.time, folder)
     return Column(
         column=table.column, unit=table.unit, scale=table.scale, offset=table.offset, wrap_bits=table.wrap_bits,
         file=file, time=time, clock_offset_s=table.clock_offset_s, align=make_rule(table.align),
+        where=table.where, from_header=table.source == "header", shared=table.shared,
     )  # fmt: skip
 
 

@@ -186,6 +186,8 @@ class Problem:
             align=make_rule(table.align),
             window_s=table.window_s,
             counter=None if table.counter is None else Counter(**table.counter.model_dump()),
+            rate_hz=table.rate_hz,
+            duplicates=table.duplicates,
         )
 
     def _simulate_bench(self, plant: Plant, table: VirtualTable) -> Log:
@@ -216,6 +218,8 @@ def _resample(log: Log, table: ExperimentTable) -> Log:
         return log
     if resample == "restamp":
         return log.restamp()
+    if resample.rule == "restamp":
+        return log.restamp(rate_hz=resample.rate_hz)
     return log.resample(rate_hz=resample.rate_hz, rule=make_rule(resample.rule), bridge_s=resample.bridge_s)
 
 
@@ -354,7 +358,7 @@ def _read_toml(source: Path) -> dict[str, Any]:
             raise ProblemError(f"{source}: is a folder; give a problem file (TOML)")
         if source.stat().st_size > MAX_BYTES:
             raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
-        return tomllib.loads(source.read_text(encoding="utf-8"))
+        return tomllib.loads(source.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise ProblemError(f"{source}: no such file; check the path") from error
     except OSError as error:

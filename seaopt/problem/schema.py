@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, model_validator
 
 from seaopt.control.laws.limits import BY_NAME
 from seaopt.documents import Flag, Number, Whole
@@ -69,27 +69,38 @@ class AlignTable(_Strict):
         return self
 
 
+Header = Annotated[str, Strict()] | Annotated[Whole, Field(ge=1)]  # or the column's number
+
+
 class ClockTable(_Strict):
     """A time column."""
 
-    column: str
+    column: Header
     unit: str | None = None
     file: str | None = None
     clock_offset_s: Number = 0.0
+    where: dict[str, Annotated[str, Strict()] | Number] | None = None
 
 
 class ColumnTable(_Strict):
     """A column of a log, the way from its numbers to its unit, and for an output its noise."""
 
-    column: str
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, strict=False, populate_by_name=True
+    )  # fmt: skip
+
+    column: Header
     unit: str | None = None
     scale: Number = 1.0
     offset: Number = 0.0
     wrap_bits: Annotated[Whole, Field(ge=2, le=53)] | None = None
     file: str | None = None
-    time: str | ClockTable | None = None
+    time: Header | ClockTable | None = None
     clock_offset_s: Number = 0.0
     align: AlignTable | None = None
+    where: dict[str, Annotated[str, Strict()] | Number] | None = None
+    source: Annotated[Literal["header"] | None, Field(alias="from")] = None
+    shared: Flag = False
     sigma: Number | None = None
 
 
@@ -165,7 +176,7 @@ class ResampleTable(_Strict):
     """A uniform clock that a log is interpolated to, by lines where no rule is given."""
 
     rate_hz: Annotated[Number, Field(gt=0, le=1e9)]
-    rule: AlignTable | None = None
+    rule: AlignTable | Literal["restamp"] | None = None
     bridge_s: Annotated[Number, Field(gt=0)] | None = None
 
 
@@ -176,12 +187,14 @@ class ExperimentTable(_Strict):
     plant: Name
     log: str | list[str] | None = None
     virtual: VirtualTable | None = None
-    time: str | ClockTable | None = None
-    inputs: dict[str, str | ColumnTable] = {}
-    outputs: dict[str, str | ColumnTable] = {}
+    time: Header | ClockTable | None = None
+    rate_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
+    inputs: dict[str, Header | ColumnTable] = {}
+    outputs: dict[str, Header | ColumnTable] = {}
     align: AlignTable | None = None
     window_s: tuple[Number, Number] | None = None
     counter: CounterTable | None = None
+    duplicates: Literal["first", "mean"] | None = None
     sigma: dict[str, Number] = {}
     initial_state: Literal["estimate", "rest"] | dict[str, Number] = "estimate"
     offset: Flag | dict[str, Number] = True

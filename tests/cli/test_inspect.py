@@ -108,7 +108,6 @@ def test_a_counter_opens_the_gap_that_it_shows(inspect, recorded):
         ("bad.csv", {"channels": ["F1=F1 [N]", "F1=F2 [N]"]}, "twice"),
         ("bad.csv", {"channels": ["F1=F1 [kN]"]}, 'no column "F1 \\[kN\\]"'),
         ("bad.csv", {"units": ["F1=N"]}, "name its column too"),
-        ("bad.csv", {"units": ["time=s"]}, "name its column too"),
         ("bad.csv", {"inputs": ["cur"]}, 'inputs names "cur"'),
         ("bad.csv", {"out": "bad.csv"}, "is a file"),
         ("bad.csv", {"align": "nearest"}, "give hold or linear"),
@@ -119,3 +118,31 @@ def test_a_counter_opens_the_gap_that_it_shows(inspect, recorded):
 def test_bad_options_are_refused(inspect, name, options, words):
     with pytest.raises(SeaoptError, match=words):
         inspect(name, **options)
+
+
+ROWS = "0,1\n1,2\n2,4\n3,1\n"
+
+
+def test_a_clock_called_time_without_unit_is_in_seconds_and_says_so(tmp_path):
+    path = tmp_path / "bare.csv"
+    path.write_text("time,F1 [N]\n" + ROWS, encoding="utf-8")
+    inspect_log(path, folder=tmp_path)
+    report = json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))
+    assert report["rate_hz"] == 1.0
+    assert f"seaopt inspect {path} --time time --unit time=ms" in report["notes"][0]
+    inspect_log(path, units=["time=ms"], folder=tmp_path)
+    assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 1000.0
+
+
+def test_a_clock_that_is_not_clear_is_the_command_to_type(tmp_path):
+    path = tmp_path / "a log.csv"
+    path.write_text("my stamp,F1 [N]\n" + ROWS, encoding="utf-8")
+    with pytest.raises(SeaoptError) as raised:
+        inspect_log(path)
+    command = f"seaopt inspect '{path}' --time 'my stamp' --unit time=s"
+    assert command in str(raised.value) and "\n" not in str(raised.value)
+    inspect_log(path, time="my stamp", units=["time=s"])
+    with pytest.raises(SeaoptError, match="--unit time=s"):
+        inspect_log(path, time="my stamp")
+    inspect_log(path, rate_hz=10.0, folder=tmp_path)
+    assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 10.0

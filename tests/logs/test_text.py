@@ -146,7 +146,6 @@ def test_blocks_meet_without_seam(file, monkeypatch):
         ("\n \n", "the file is empty"),
         ("# only a comment\n", "only comments"),
         ("t [s],F [N]\n", "0 rows below the header"),
-        ("t [s],F [N],F [N]\n0,1,1\n1,2,2\n", '2 columns are named "F \\[N\\]"'),
         ("t [s],F [N]\n0,1\n1,1.2.3\n", 'line 3: "1.2.3" in column "F \\[N\\]" is not a number'),
         ("t [s],F [N]\n0,1\n1,inf\n", 'line 3: "inf" in column "F \\[N\\]" is not finite'),
         ("t [s],F [N]\n0,1\n1,2,3\n", "line 3 has 3 columns and the header 2"),

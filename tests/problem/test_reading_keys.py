@@ -64,6 +64,7 @@ def test_a_window_and_a_rule_for_all(problem):
         ('"cell.csv"', '"C:\\\\cell.csv"', "leaves the problem file's folder"),
         ("linear = { max_gap_s = 0.01 }", "linear = {}, hold = {}", "exactly one of hold, linear and nearest"),
         ("wrap_bits = 16", "wrap_bits = 99", "wrap_bits"),
+        ("wrap_bits = 16", 'from = "footer"', "header"),
         ("clock_offset_s = -0.5", "clok_offset_s = -0.5", 'did you mean "clock_offset_s"'),
     ],
 )
@@ -71,3 +72,41 @@ def test_bad_keys_are_named(problem, old, new, words):
     with pytest.raises(ProblemError, match=words) as raised:
         problem(KEYS.replace(old, new, 1))
     assert "\n" not in str(raised.value)
+
+
+def test_columns_by_number_a_rate_and_constants_of_the_header(problem, tmp_path):
+    (tmp_path / "bare.csv").write_text("# gain = 3 N\n1,10\n2,20\n3,25\n", encoding="utf-8")
+    keys = """
+log = "bare.csv"
+rate_hz = 100
+inputs = { I = { column = 1, unit = "A" } }
+[experiment.outputs]
+F1 = { column = 2, unit = "N" }
+F2 = { column = "gain", from = "header" }
+"""
+    (experiment,) = problem(keys).experiments()
+    assert experiment.log.rate_hz == 100.0 and experiment.log["F1"].tolist() == [10, 20, 25]
+    assert experiment.log["F2"].tolist() == [3, 3, 3]
+
+
+def test_rows_by_name_duplicates_and_a_stated_rate(problem, tmp_path):
+    stamps = T + 2e-4 * (np.arange(400) % 3)
+    lines = [f"{name},{value},{t:.7f}\n" for t in [0.0, *stamps] for name, value in (("I", 2), ("F1", 30.0 + t))]
+    (tmp_path / "long.csv").write_text("id,value,t [s]\n" + "".join(lines), encoding="utf-8")
+    keys = """
+log = "long.csv"
+time = { column = "t [s]", where = { id = "I" } }
+inputs = { I = { column = "value", unit = "A", where = { id = "I" } } }
+outputs = { F1 = { column = "value", unit = "N", where = { id = "F1" } } }
+duplicates = "mean"
+resample = { rate_hz = 400, rule = "restamp" }
+"""
+    (experiment,) = problem(keys).experiments()
+    assert len(experiment.log) == 400 and len(experiment.log.segments) == 1
+    np.testing.assert_allclose(np.diff(experiment.log.time), 1 / 400)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):
+    path = tmp_path / "problem.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + b'schema = 1\n[plant.a]\nkind = "high_impedance"\n')
+    assert list(so.read_problem(path).plants) == ["a"]

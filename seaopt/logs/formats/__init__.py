@@ -7,9 +7,10 @@ from importlib import import_module
 from pathlib import Path
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Window, check_count, translate_errors
+from seaopt.logs.formats.mat4 import is_mat4
+from seaopt.logs.formats.source import Field, Source, Window, check_count, keep_rows, translate_errors
 
-__all__ = ["Field", "Source", "Window", "open_source", "sniff"]
+__all__ = ["Field", "Source", "Window", "keep_rows", "open_source", "sniff"]
 
 # First bytes, module and function that open the format, and its name.
 _MAGIC: tuple[tuple[bytes, str, str, str], ...] = (
@@ -38,7 +39,7 @@ _REFUSED: tuple[tuple[bytes, str], ...] = (
     *((b"\x80" + bytes([n]), "is a Python pickle, which could run code; save it as NPZ or CSV") for n in (2, 3, 4, 5)),
 )  # fmt: skip
 _JSON_NAMES = (".json", ".jsonl", ".ndjson")
-_BINARY_NAMES = {".mat": "MAT file of version 5 or 7.3 (save one of version 4 again with -v7)",
+_BINARY_NAMES = {".mat": "MAT file of version 4, 5 or 7.3",
                  ".bag": "ROS bag", ".mcap": "MCAP file",
                  ".db3": "ROS 2 bag", ".parquet": "Parquet file", ".npz": "NPZ archive", ".h5": "HDF5 file",
                  ".hdf5": "HDF5 file", ".mf4": "MDF file", ".tdms": "TDMS file"}  # fmt: skip
@@ -69,6 +70,8 @@ def sniff(path: Path) -> tuple[str, str, str]:
             return module, function, form
     if any(head[offset:].startswith(_MAGIC[0][0]) for offset in (512, 1024, 2048)):
         return _MAGIC[0][1:]
+    if is_mat4(head):
+        return "mat4", "open_mat4", "MAT 4"
     for magic, reason in _REFUSED:
         if head.startswith(magic):
             raise LogError(f"{path}: {reason}")

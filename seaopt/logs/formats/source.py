@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError, SeaoptError
+from seaopt.errors import LogError, SeaoptError, suggestion
 from seaopt.records import record
 
 # What one file may unfold to in memory: archives are checked before they are unpacked.
@@ -23,6 +24,8 @@ _NUMBER_KIND = re.compile(r"bool|u?int\d+|float\d+")
 MAX_FIELDS = 100_000
 MAX_PARTS = 256  # columns of one matrix, or elements of one array, that get a name each
 MAX_DEPTH = 32  # of groups, structs, objects or messages inside one another
+
+Where = Mapping[str, str | float]  # column to the value that its rows have
 
 
 @record
@@ -43,6 +46,10 @@ class Field:
         Name of the field that is its clock, where the format says so.
     remedy : str
         What to do where it holds no numbers.
+    header : str or None
+        Its header where that is not its name, because other columns have it too.
+    position : int or None
+        Number of its column, from 1, where that is not its place among the fields.
 
     """
 
@@ -52,6 +59,8 @@ class Field:
     unit: str | None = None
     clock: str | None = None
     remedy: str = "choose another column"
+    header: str | None = None
+    position: int | None = None
 
     @property
     def numeric(self) -> bool:
@@ -83,6 +92,12 @@ class Source:
         in it, but the same ones for every name.
     notes : tuple of str
         What was found on listing.
+    constants : mapping of name to (number, unit or None)
+        What the file's header says besides its columns.
+    load_where : function of (names, where), optional
+        As `load`, of the rows in which columns, of text too, have given values.
+    rows : str
+        Which rows are read, where not all are.
 
     """
 
@@ -91,6 +106,9 @@ class Source:
     fields: tuple[Field, ...]
     load: Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]
     notes: tuple[str, ...] = ()
+    constants: Mapping[str, tuple[float, str | None]] = field(default_factory=dict[str, tuple[float, str | None]])
+    load_where: Callable[[Sequence[str], Where], dict[str, Float[np.ndarray, " _"]]] | None = None
+    rows: str = ""
 
     def read(self, names: Sequence[str], window: Window | None = None) -> dict[str, Float[np.ndarray, " _"]]:
         """Return the data of fields that share a clock.
@@ -103,6 +121,41 @@ class Source:
         """
         with translate_errors(self.path, self.format):
             return self.load(list(dict.fromkeys(names)), window)
+
+
+def keep_rows(source: Source, where: Where) -> Source:
+    """Return a source of the rows in which columns have given values: one signal of a table of (name, value, time).
+
+    Raises
+    ------
+    LogError
+        A column is not there, or (outside text files) holds no numbers.
+
+    """
+    rows = ", ".join(f"{name} = {value}" for name, value in where.items())
+    known = {one.name: one for one in source.fields}
+    for name, value in where.items():
+        if name not in known:
+            raise LogError(f'{source.path}: no column "{name}" for where; {suggestion(name, known)}')
+        if source.load_where is None and (isinstance(value, str) or not known[name].numeric):
+            raise LogError(
+                f'{source.path}: where {name} = "{value}" compares text, which {source.format} files do not allow; '
+                "save the table as CSV"
+            )
+
+    def load(names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " _"]]:
+        if source.load_where is not None:
+            columns = source.load_where(names, where)
+        else:
+            every = source.load(list(dict.fromkeys([*names, *where])), window)
+            kept = np.all([every[name] == value for name, value in where.items()], axis=0)
+            columns = {name: every[name][kept] for name in names}
+        if not all(values.size for values in columns.values()):
+            raise LogError(f"{source.path}: no row has {rows}; check the value, or window_s")
+        return columns
+
+    fields = tuple(replace(one, length=None) for one in source.fields)
+    return replace(source, fields=fields, load=load, load_where=None, rows=rows)
 
 
 def make_row_loader(

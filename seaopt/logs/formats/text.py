@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Source, Window, summarise_error
+from seaopt.logs.formats.source import Field, Source, Where, Window, summarise_error
 from seaopt.logs.formats.text_layout import (
     BLANK,
     MAX_LINE,
@@ -33,6 +33,7 @@ from seaopt.logs.formats.text_layout import (
     line_length_error,
     split_cells,
 )
+from seaopt.units import bare_name
 
 if TYPE_CHECKING:
     import polars as pl
@@ -46,17 +47,67 @@ _BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
 def open_text(path: Path) -> Source:
     """List a text file's columns."""
     form = find_layout(path)
+    names = _name_columns(form.headers)
     fields = tuple(
-        Field(name=name, kind="float64" if numeric else "text", length=None, unit=unit)
-        for name, unit, numeric in zip(form.headers, form.units, form.numeric, strict=True)
+        Field(
+            name=name, kind="float64" if numeric else "text", length=None, unit=unit, position=at,
+            header=header if header != name else None,
+        )
+        for at, (name, header, unit, numeric) in enumerate(
+            zip(names, form.headers, form.units, form.numeric, strict=True), start=1
+        )
         if name
-    )
-    return Source(path=path, format="CSV", fields=fields, load=partial(_load, path, form), notes=form.notes)
+    )  # fmt: skip
+    repeated = [field.name for field in fields if field.header is not None]
+    notes = form.notes
+    if repeated:
+        named = ", ".join(repeated[:4]) + (", ..." if len(repeated) > 4 else "")
+        notes = (*notes, f"headers that several columns have were numbered: {named}")
+    return Source(
+        path=path, format="CSV", fields=fields, load=partial(_load, path, form), notes=notes,
+        constants=form.constants, load_where=partial(_load_where, path, form),
+    )  # fmt: skip
+
+
+def _name_columns(headers: Sequence[str]) -> list[str]:
+    """Return the columns' names: a header that several have, with each one's number before its brackets.
+
+    Examples
+    --------
+    >>> _name_columns(["X [s]", "Y", "X [s]", ""])
+    ['X#1 [s]', 'Y', 'X#3 [s]', '']
+
+    """
+    names: list[str] = []
+    counts = Counter(headers)
+    for at, header in enumerate(headers, start=1):
+        bare = bare_name(header)
+        repeated = bool(header) and counts[header] > 1
+        names.append(f"{bare}#{at}{header[len(bare) :]}" if repeated else header)
+    return names
+
+
+def _place_columns(form: TextLayout) -> dict[str, int]:
+    return {name: at for at, name in enumerate(_name_columns(form.headers)) if name}
 
 
 def _load(path: Path, form: TextLayout, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     """Return columns by header; text has no index, so a window reads it whole."""
-    index = {name: form.headers.index(name) for name in names}
+    return _load_blocks(path, form, names, _parse)
+
+
+def _load_where(path: Path, form: TextLayout, names: Sequence[str], where: Where) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return columns of the rows in which others have given values."""
+    places = _place_columns(form)
+    ids = {places[name]: value for name, value in where.items()}
+    return _load_blocks(path, form, names, partial(_parse_where, ids))
+
+
+def _load_blocks(
+    path: Path, form: TextLayout, names: Sequence[str], parse: Callable[..., dict[str, Any]]
+) -> dict[str, Float[np.ndarray, " n"]]:
+    places = _place_columns(form)
+    index = {name: places[name] for name in names}
     columns = _GrowingColumns(names)
     size = path.stat().st_size
     pending: deque[tuple[float, Future[dict[str, Any]]]] = deque()
@@ -64,7 +115,7 @@ def _load(path: Path, form: TextLayout, names: Sequence[str], _: Window | None) 
         with closing(_read_blocks(path, form)) as blocks, ThreadPoolExecutor(BLOCKS_AHEAD) as pool:
             for number, block in enumerate(blocks):
                 if not block.isspace():
-                    pending.append((size / len(block), pool.submit(_parse, path, form, block, index, number)))
+                    pending.append((size / len(block), pool.submit(parse, path, form, block, index, number)))
                 if len(pending) > BLOCKS_AHEAD:
                     columns.add(*pending.popleft())
             while pending:
@@ -165,6 +216,38 @@ def _parse(path: Path, form: TextLayout, block: bytes, index: dict[str, int], nu
     parsed = {name: frame[f"column_{at}"].to_numpy() for name, at in index.items()}
     if any(np.isinf(values).any() for values in parsed.values()):
         raise error_at("a cell is infinite")
+    return parsed
+
+
+def _parse_where(
+    ids: dict[int, str | float], path: Path, form: TextLayout, block: bytes, index: dict[str, int], number: int
+) -> dict[str, Any]:
+    """Parse the rows of a block in which the columns `ids` have their values; what the others hold is not looked at."""
+    import polars as pl
+
+    wanted = {**index, **{f"id {at}": at for at in ids}}
+    try:
+        frame = _parse_frame(_replace_blanks(_BLANK_LINES.sub(b"", block), form), form, wanted, pl.String)
+    except (pl.exceptions.PolarsError, ValueError) as error:
+        line = _find_first_line(path, form, number)
+        raise _cell_error(path, form, block, {}, line, summarise_error(error)) from error
+    for at, value in ids.items():
+        text = frame[f"column_{at}"].str.strip_chars()
+        alike = text == str(value)
+        if isinstance(value, int | float):
+            alike |= text.cast(pl.Float64, strict=False).fill_null(float("nan")) == float(value)
+        frame = frame.filter(alike.fill_null(False))
+    parsed: dict[str, Any] = {}
+    for name, at in index.items():
+        text = frame[f"column_{at}"].str.strip_chars()
+        values = (text.str.replace(",", ".", literal=True) if form.comma else text).cast(pl.Float64, strict=False)
+        wrong = (values.is_null() & ~text.str.to_lowercase().is_in(list(BLANK)).fill_null(True)) | values.is_infinite()
+        if wrong.fill_null(False).any():
+            cell = str(text.filter(wrong.fill_null(False))[0])[:60]
+            raise LogError(
+                f'{path}: "{cell}" in column "{name}" is not a finite number, in a row that where keeps; correct it'
+            )
+        parsed[name] = values.to_numpy()
     return parsed
 
 

@@ -10,12 +10,13 @@ import codecs
 import csv
 import re
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 from seaopt.errors import LogError
 from seaopt.formatting import format_count
 from seaopt.records import record
-from seaopt.units import header_unit, is_unit
+from seaopt.units import bare_name, header_unit, is_unit
 
 MAX_LINE = 1 << 20
 HEAD_BYTES = 2 * MAX_LINE  # bytes in which the data must begin
@@ -24,6 +25,10 @@ SAMPLE_LINES = 200  # lines that decide on delimiter and decimal sign
 COMMENTS = ("#", "%", "//")
 BLANK = frozenset({"", "nan", "na", "n/a"})
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?inf(inity)?", re.IGNORECASE | re.ASCII)
+_CONSTANT = re.compile(
+    r"(?P<name>[^=:;,\t|]{1,80}?)\s*[=:;,\t|]\s*\"?(?P<value>[-+]?[\d.,]+(?:[eE][-+]?\d+)?)\"?\s*[;,\t|]?\s*"
+    r"(?P<unit>[^\d=:;,\t|][^=:;,\t|]{0,19})?"
+)
 _DELIMITERS = ("\t", ";", "|", ",", " ")
 WINDOWS = "cp1252"  # of which Latin-1's signs and letters are a part
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
@@ -46,6 +51,8 @@ class TextLayout:
         Whether the column's first filled cell is a number.
     first : int
         Lines above the data.
+    constants : mapping of name to (number, unit or None)
+        Lines above the data such as "kp = 200" or "mass [kg]; 0.5".
     notes : tuple of str
 
     """
@@ -58,6 +65,7 @@ class TextLayout:
     numeric: tuple[bool, ...]
     first: int
     notes: tuple[str, ...]
+    constants: Mapping[str, tuple[float, str | None]]
 
 
 def find_layout(path: Path) -> TextLayout:
@@ -96,7 +104,22 @@ def find_layout(path: Path) -> TextLayout:
     return TextLayout(
         encoding=encoding, delimiter=delimiter, comma=comma, headers=tuple(headers), units=tuple(units),
         numeric=numeric, first=first, notes=tuple(notes),
+        constants=_find_constants(lines[:first], delimiter, comma),
     )  # fmt: skip
+
+
+def _find_constants(above: list[str], delimiter: str, comma: bool) -> dict[str, tuple[float, str | None]]:
+    """Return the constants above the data: a name, a sign or delimiter, a number, and a unit where there is one."""
+    constants: dict[str, tuple[float, str | None]] = {}
+    for line in above:
+        match = _CONSTANT.fullmatch(line.lstrip("#%/; \t").rstrip(f";, {delimiter}"))
+        if match is None or not is_number(match["value"], comma):
+            continue
+        number = match["value"].replace(",", ".", 1) if comma else match["value"]
+        name, bracket = bare_name(match["name"].strip()), header_unit(match["name"].strip())
+        unit = (match["unit"] or "").strip("[]() ") or bracket
+        constants.setdefault(name, (float(number), unit if unit is None or is_unit(unit) else None))
+    return constants
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
@@ -235,6 +258,8 @@ def _find_headers(
     header_rows = [
         (at, row) for at, row in table if _fits(row, width, rows) and sum(map(bool, row)) > min(1, width - 1)
     ]
+    named = [(at, row) for at, row in header_rows if not _CONSTANT.fullmatch(above[at].strip())]
+    header_rows = named or header_rows
     if not header_rows and table:  # a lone line above the data is the header, whatever its width
         at, row = table[-1]
         raise LogError(

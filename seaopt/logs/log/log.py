@@ -158,7 +158,8 @@ class Log:
                 raise LogError(
                     f"{self.source}: a step of time differs by {worst / self.period:.0%} from the period "
                     f"{self.period:.4g} s (5 % is allowed); call log.resample(rate_hz={round_rate:g}), or "
-                    "log.restamp() where only the timestamps are rounded (in a problem file: resample)"
+                    "log.restamp() where only the timestamps are rounded or late (in a problem file: "
+                    f'resample = {{ rate_hz = {round_rate:g} }}, or resample = "restamp")'
                 )
         return stretches
 
@@ -204,7 +205,8 @@ class Log:
             Linear if left out. A line between samples is a low-pass filter: it attenuates by 0.9 dB at a quarter of the
             sample rate and 3.9 dB at half.
         bridge_s : float, optional
-            Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out.
+            Longest step of time that is interpolated across; 1.5 periods, which is what a gap is, if left out. A log
+            sampled at irregular times needs a longer one, or it falls apart into many short stretches.
 
         Returns
         -------
@@ -226,8 +228,14 @@ class Log:
         """
         return self.with_values(*resampling.resample(self, self.period, rate_hz=rate_hz, rule=rule, bridge_s=bridge_s))
 
-    def restamp(self) -> Log:
-        """Replace rounded timestamps by the uniform clock that explains them; samples are not changed.
+    def restamp(self, *, rate_hz: float | None = None) -> Log:
+        """Replace rounded or late timestamps by the uniform clock behind them; samples are not changed.
+
+        Parameters
+        ----------
+        rate_hz : float, optional
+            The rate of the device that sampled, where a PC put the timestamps on: they may then jitter by more than
+            their rounding, but not drift from that rate. A gap is as many whole samples as it is long.
 
         Returns
         -------
@@ -237,7 +245,7 @@ class Log:
         Raises
         ------
         LogError
-            Rounding alone does not explain the timestamps: the sampling itself is irregular.
+            Rounding alone does not explain the timestamps, and no rate is stated; or the stated one is not theirs.
 
         Examples
         --------
@@ -248,7 +256,9 @@ class Log:
         (True, 1)
 
         """
-        time, note = resampling.restamp(self, self.period)
+        if rate_hz is not None and not (isinstance(rate_hz, int | float) and 0.0 < rate_hz < 1e12):
+            raise LogError(f"{self.source}: rate_hz = {rate_hz!r} is not a sample rate; give samples per second")
+        time, note = resampling.restamp(self, self.period, rate_hz)
         return self.with_values(time, {name: self[name] for name in self.signals}, note)
 
     def decimate(self, factor: int) -> Log:
@@ -395,7 +405,10 @@ def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
         step = np.diff(time)
     row = int(np.flatnonzero((step <= 0) | np.isinf(step))[0]) + 1
     how = "repeats" if step[row - 1] == 0 else "runs backwards" if step[row - 1] < 0 else "leaps"
-    return f"time {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows"
+    remedy = "sort or remove such rows"
+    if how == "repeats":
+        remedy = 'give read_log (or [[experiment]]) duplicates = "first" or "mean", or rate_hz where no clock is'
+    return f"time {how} at sample {row + 1} (t = {time[row]:g} s); {remedy}"
 
 
 def _mean_period(time: Float[np.ndarray, " n"]) -> float:

@@ -13,7 +13,11 @@ from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule
 from seaopt.logs.quality.clock import GAP, sample_rate_hz, split_at_gaps, timestamp_resolution
 from seaopt.signals import Recording
 
+AROUND = 20  # samples on either side of a long step that tell a gap from a late stamp
+PARTS = 20  # of a log, whose medians tell whether a stated rate is the timestamps' own
 LEAST_RATE = 0.8  # of the log's rate; below it interpolation would fold what is above the new Nyquist frequency
+
+HOW_TO_BRIDGE = "bridge_s = ... interpolates across longer ones (in a problem file resample = { ..., bridge_s = ... })"
 
 Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]
 
@@ -42,6 +46,7 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
         )
     time = log.time
     longest_step = bridge_s if bridge_s is not None else GAP * period
+    gaps = int(np.count_nonzero(np.diff(time) > longest_step))
     new_time: list[Float[np.ndarray, " _"]] = []
     new_values: dict[str, list[Float[np.ndarray, " _"]]] = {name: [] for name in log.signals}
     for stretch in split_at_gaps(time, longest_step):
@@ -52,8 +57,11 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
         for name, parts in new_values.items():
             parts.append(chosen(grid, time[stretch], log.signals[name].values[stretch]))
     if not new_time:
-        raise LogError(f"{log.source}: no stretch without a gap holds 2 samples at {rate_hz:g} Hz; give bridge_s")
+        raise LogError(f"{log.source}: no stretch without a gap holds 2 samples at {rate_hz:g} Hz; {HOW_TO_BRIDGE}")
     note = f"resampled from {old_rate_hz:.6g} Hz to {rate_hz:g} Hz by {chosen}"
+    if gaps:
+        times = "1 step of time is" if gaps == 1 else f"{gaps} steps of time are"
+        note += f"; {times} longer than {longest_step:.3g} s and stay gaps: {HOW_TO_BRIDGE}"
     return np.concatenate(new_time), {name: np.concatenate(parts) for name, parts in new_values.items()}, note
 
 
@@ -65,15 +73,17 @@ def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) 
     return np.clip(origin + np.arange(first, last + 1) / rate_hz, time[0], time[-1])
 
 
-def restamp(log: Recording, period: float) -> tuple[Float[np.ndarray, " n"], str]:
-    """Return the uniform clock that explains rounded timestamps, and a note of what was done: see `Log.restamp`.
+def restamp(log: Recording, period: float, rate_hz: float | None = None) -> tuple[Float[np.ndarray, " n"], str]:
+    """Return the uniform clock behind rounded or late timestamps, and a note of what was done: see `Log.restamp`.
 
     Raises
     ------
     LogError
-        Rounding alone does not explain the timestamps: the sampling itself is irregular.
+        Rounding alone does not explain the timestamps, and no rate is stated; or the stated one is not theirs.
 
     """
+    if rate_hz is not None:
+        return _restamp_at(log, rate_hz)
     resolution = timestamp_resolution(log.time)
     uniform = log.time.copy()
     for stretch in split_at_gaps(log.time, GAP * period):
@@ -84,8 +94,50 @@ def restamp(log: Recording, period: float) -> tuple[Float[np.ndarray, " n"], str
         if np.ptp(deviations) > 2.0 * resolution + 1e-9 * period:
             raise LogError(
                 f"{log.source}: the timestamps deviate by {np.ptp(deviations) / 2:.3g} s from a uniform clock, more "
-                f"than their rounding to {resolution:.3g} s explains; call log.resample(rate_hz=...)"
+                f"than their rounding to {resolution:.3g} s explains; call log.resample(rate_hz=...), in TOML "
+                f"resample = {{ rate_hz = ... }}; or where a PC stamped the samples of a perfect clock, "
+                f'log.restamp(rate_hz=...), in a problem file resample = {{ rate_hz = ..., rule = "restamp" }}'
             )
         uniform[stretch] = line + 0.5 * (np.min(deviations) + np.max(deviations))
     rounded = f", rounded to {resolution:.3g} s," if resolution else ""
     return uniform, f"timestamps{rounded} put on a uniform clock of {sample_rate_hz(period):.6g} Hz"
+
+
+def _restamp_at(log: Recording, rate_hz: float) -> tuple[Float[np.ndarray, " n"], str]:
+    """Return a clock of a stated rate, with gaps of whole samples where the timestamps move on for good.
+
+    A sample that was stamped late is followed by a step that is too short: the timestamps come back to their line. At a
+    gap they do not: the median of the next `AROUND` samples lies above that of the ones before by whole periods.
+    """
+    time, period = log.time, 1.0 / rate_hz
+    late = time - period * np.arange(time.size)
+    lost = np.zeros(time.size)
+    for row in np.flatnonzero(np.diff(time) > GAP * period) + 1:
+        after, before = late[row : row + AROUND], late[max(row - AROUND, 0) : row]
+        lost[row] = max(np.round((np.median(after) - np.median(before)) * rate_hz), 0.0)
+    jumps = np.flatnonzero((lost[1:] > 0) & (lost[:-1] > 0)) + 1
+    lost[jumps] = 0.0  # two late samples at one gap
+    line = period * (np.arange(time.size) + np.cumsum(lost))
+    off = time - line
+    off -= np.median(off)
+    # The line has to hold from end to end: half a period of drift, and samples would be counted wrongly.
+    parts = [float(np.median(part)) for part in np.array_split(off, min(PARTS, time.size))]
+    if max(parts) - min(parts) > 0.5 * period:
+        raise LogError(
+            f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
+            f"{max(parts) - min(parts):.3g} s and rise at {sample_rate_hz(_median_period(log)):.6g} Hz on average; "
+            "correct it, or call log.resample(rate_hz=...)"
+        )
+    gaps = int(np.count_nonzero(lost))
+    between = f" with {gaps} gap{'s' * (gaps != 1)} of whole samples" if gaps else ""
+    note = (
+        f"timestamps, off by {np.sqrt(np.mean(off**2)):.3g} s rms and {np.max(np.abs(off)):.3g} s at most, put on the "
+        f"stated clock of {rate_hz:g} Hz{between}"
+    )
+    return line + np.median(time - line), note
+
+
+def _median_period(log: Recording) -> float:
+    """Return the mean step between samples, but for gaps."""
+    step = np.diff(log.time)
+    return float(np.mean(step[step <= GAP * np.median(step)]))

@@ -10,6 +10,7 @@ from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
 
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
+DIP_BANDS = 3  # of a third of an octave, between usable ones: the coherence may be low in them
 REACHED = 0.1  # of the largest power in a band; what is weaker is the window's
 LEAST_COHERENCE = 0.5  # of an output with the input, power-weighted; below it most of the output is something else
 
@@ -57,13 +58,21 @@ class InputExcitation:
 
     @property
     def usable_hz(self) -> tuple[float, float] | None:
-        """The widest stretch of usable bands, in octaves; None where there is none."""
+        """The widest stretch of usable bands, in octaves; None where there is none.
+
+        A dip of the coherence within it is part of it, where the input excites: beside a sharp resonance the window
+        leaks its power, and at an antiresonance little is left of the output.
+        """
         best: tuple[float, float] | None = None
         start: float | None = None
+        dip = 0
         for band in self.bands:
             if not band.usable:
-                start = None
+                dip += 1
+                if dip > DIP_BANDS or band.level_db < -RANGE_DB:
+                    start = None
                 continue
+            dip = 0
             start = band.low_hz if start is None else start
             if best is None or band.reach_hz / start > best[1] / best[0]:
                 best = (start, band.reach_hz)

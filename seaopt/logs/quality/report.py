@@ -27,13 +27,14 @@ from seaopt.logs.quality.findings import (
     sort_findings,
 )
 from seaopt.logs.quality.lags import ChannelPair, correlate_channels
-from seaopt.logs.quality.spectra import Spectra, compute_spectra, find_hum
+from seaopt.logs.quality.spectra import FEWEST_STRETCHES, SHORTEST_STRETCH, Spectra, compute_spectra, find_hum
 from seaopt.records import record
 from seaopt.signals import Recording
 
 QUALITY_SCHEMA = "seaopt/quality/1"
 INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u"})  # names of inputs, in any case
 INPUT_UNITS = frozenset({"A", "V"})
+ENOUGH_SAMPLES = FEWEST_STRETCHES * SHORTEST_STRETCH  # for spectra, in one stretch
 
 
 @record(eq=False)
@@ -183,7 +184,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     findings += [finding for channel in channels.values() for finding in find_channel_faults(channel, data.time)]
     findings += [finding for pair in pairs for finding in find_pair_faults(pair, clock.period, pair.first in inputs)]
     findings += [describe_excitation(bands) for bands in excitation.values()]
-    findings += _list_unjudged(inputs, spectra, data)
+    findings += _list_unjudged(inputs, spectra, clock, data)
     finite = data.time[np.isfinite(data.time)]
     return Quality(
         source=data.source, duration_s=float(np.ptp(finite)), clock=clock, channels=channels, inputs=inputs,
@@ -245,9 +246,19 @@ def _assess_inputs(spectra: Spectra | None, inputs: Sequence[str]) -> dict[str, 
     return {name: excitation for name, excitation in bands.items() if excitation is not None}
 
 
-def _list_unjudged(inputs: Sequence[str], spectra: Spectra | None, data: Recording) -> list[Finding]:
+def _list_unjudged(
+    inputs: Sequence[str], spectra: Spectra | None, clock: ClockQuality, data: Recording
+) -> list[Finding]:
     """Return what could not be looked at, and why."""
-    if spectra is None:
+    stretches = _stretches(clock, len(data))
+    if spectra is None and len(data) >= ENOUGH_SAMPLES and len(stretches) > 1:
+        longest = max(rows.stop - rows.start for rows in stretches)
+        text = (
+            f"{len(stretches) - 1} gaps leave stretches of at most {longest} samples, too short for spectra: hum, "
+            "delays, signs and excitation were not looked at; where the sampling is irregular, resample the log with "
+            "bridge_s, in a problem file resample = { rate_hz = ..., bridge_s = ... }"
+        )
+    elif spectra is None:
         text = f"{len(data)} samples are too few for spectra: hum, delays, signs and excitation were not looked at"
     elif not inputs:
         text = "no channel is known to be an input: excitation and delays were not looked at; name it (inputs)"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,8 @@ class Column:
 
     Parameters
     ----------
-    column : str
-        Its header or path, as `contents` lists it.
+    column : str or int
+        Its header or path, as `contents` lists it; or its number, from 1, where headers are missing or repeated.
     unit : str, optional
         Unit after scale and offset; where it is left out, the file's own.
     scale, offset : float
@@ -35,6 +37,13 @@ class Column:
         Seconds to add to its own clock.
     align : Hold, Linear or Nearest, optional
         How it is aligned from its own clock to the log's.
+    where : mapping of column to value, optional
+        Read only the rows in which other columns have these values: a table of (name, value, time) holds many channels.
+        Each is then on the clock of its own rows.
+    from_header : bool
+        `column` is not a column but a constant that the header states ("kp = 200"); the channel has that value always.
+    shared : bool
+        Another channel of the same unit may be the same column, which is otherwise taken for a mistake.
 
     Examples
     --------
@@ -43,17 +52,26 @@ class Column:
 
     """
 
-    column: str
+    column: str | int
     unit: str | None = None
     scale: float = 1.0
     offset: float = 0.0
     wrap_bits: int | None = None
     file: str | Path | None = None
-    time: str | Column | None = None
+    time: str | int | Column | None = None
     clock_offset_s: float = 0.0
     align: Rule | None = None
+    where: Mapping[str, str | float] | None = None
+    from_header: bool = False
+    shared: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.column, bool) or not isinstance(self.column, str | int):
+            raise LogError(f"column = {self.column!r} is neither a header nor a number; give one, counted from 1")
+        if isinstance(self.column, int) and self.column < 1:
+            raise LogError(f"column = {self.column}: columns are counted from 1")
+        if self.from_header and (self.where or self.time or self.wrap_bits):
+            raise LogError(f'column "{self.column}": a constant from the header has no where, time or wrap_bits')
         if not np.isfinite(self.scale) or self.scale == 0 or not np.isfinite(self.offset):
             raise LogError(
                 f'column "{self.column}": scale = {self.scale:g}, offset = {self.offset:g}; give finite numbers, no '
@@ -82,6 +100,21 @@ class Column:
         steps += [f"plus {self.offset:g}"] if self.offset else []
         steps += [f"{unit} to {si_unit(unit)}"] if factor(unit, si_unit(unit)) != 1 else []
         return ", ".join(steps)
+
+
+def spell_column(**keys: str | int) -> str:
+    """Return how a column is written in Python, and in a problem file.
+
+    Examples
+    --------
+    >>> spell_column(column="cur", unit="A")
+    'Column(column="cur", unit="A"), in a problem file { column = "cur", unit = "A" }'
+
+    """
+    spelt = {name: json.dumps(value, ensure_ascii=False) for name, value in keys.items()}
+    python = ", ".join(f"{name}={value}" for name, value in spelt.items())
+    toml = ", ".join(f"{name} = {value}" for name, value in spelt.items())
+    return f"Column({python}), in a problem file {{ {toml} }}"
 
 
 def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:

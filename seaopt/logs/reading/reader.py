@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +18,9 @@ from seaopt.formatting import format_count
 from seaopt.logs.formats import Window, open_source
 from seaopt.logs.log.alignment import Rule, check_increasing
 from seaopt.logs.log.log import Log
-from seaopt.logs.reading.column import Column, suspect_wrap
+from seaopt.logs.reading.column import Column, spell_column, suspect_wrap
 from seaopt.logs.reading.counter import Counter
-from seaopt.logs.reading.selection import ClockColumn, SelectedChannel, Selection, select
+from seaopt.logs.reading.selection import HOW_TO_ALIGN, ClockColumn, SelectedChannel, Selection, select
 from seaopt.signals import Origin, Signal, Table
 from seaopt.units import factor, si_unit
 
@@ -26,11 +28,12 @@ from seaopt.units import factor, si_unit
 def read_table(
     path: str | Path | Sequence[str | Path],
     *,
-    time: str | Column | None = None,
-    channels: Mapping[str, str | Column] | None = None,
+    time: str | int | Column | None = None,
+    channels: Mapping[str, str | int | Column] | None = None,
     align: Rule | None = None,
     window_s: tuple[float, float] | None = None,
     counter: Counter | None = None,
+    rate_hz: float | None = None,
     digest: bool = True,
 ) -> Table:
     r"""Read a file as it is: time may repeat or run backwards, and a channel may be empty.
@@ -39,10 +42,10 @@ def read_table(
     ----------
     path : path, or several
         CSV and other text, MAT, HDF5, Parquet, NPZ, JSON, ROS bags, MCAP, MDF or TDMS, recognised by content.
-    time : str or Column, optional
+    time : str, int or Column, optional
         The clock: a column, or in a bag a topic. Where it is left out, the format's own clock, or the one column that
         is named like a time.
-    channels : mapping of channel name to str or Column, optional
+    channels : mapping of channel name to str, int or Column, optional
         Which column is which channel; where it is left out, every column of numbers on the clock, named by its header
         without the unit's brackets.
     align : Hold, Linear or Nearest, optional
@@ -51,6 +54,8 @@ def read_table(
         Read only what lies between these times of the clock; formats with an index skip the rest of the file.
     counter : Counter, optional
         A column that counts samples: where it skips, the later times are moved to open a gap.
+    rate_hz : float, optional
+        Samples per second of a file without a clock, in place of `time`.
     digest : bool
         Whether to note the files' SHA-256, for which each is read as a whole, but not kept in memory.
 
@@ -81,7 +86,7 @@ def read_table(
     _check_window(window_s)
     with ThreadPoolExecutor(max_workers=1) as pool:  # the files are hashed while they are parsed
         digests = {source.path: pool.submit(_hash_file, source.path) if digest else None for source in sources}
-        chosen = select(sources, time, channels, align, counter)
+        chosen = select(sources, time, channels, align, counter, rate_hz)
         arrays, clock, notes = _read_channels(chosen, window_s, counter)
         hashes = {file: future.result() if future is not None else "" for file, future in digests.items()}
     notes = [*chosen.notes, *notes]
@@ -95,19 +100,24 @@ def read_table(
 def read_log(
     path: str | Path | Sequence[str | Path],
     *,
-    time: str | Column | None = None,
-    channels: Mapping[str, str | Column] | None = None,
+    time: str | int | Column | None = None,
+    channels: Mapping[str, str | int | Column] | None = None,
     align: Rule | None = None,
     window_s: tuple[float, float] | None = None,
     counter: Counter | None = None,
+    rate_hz: float | None = None,
+    duplicates: Literal["first", "mean"] | None = None,
     digest: bool = True,
 ) -> Log:
     r"""Read a file, and check that it is a log.
 
     Parameters
     ----------
-    path, time, channels, align, window_s, counter, digest
+    path, time, channels, align, window_s, counter, rate_hz, digest
         As in `read_table`; channels are named as the plant's inputs and outputs, as a rule.
+    duplicates : {"first", "mean"}, optional
+        What becomes of samples at one time: the first is kept, or their mean (of those that are not missing). They are
+        refused if it is left out.
 
     Returns
     -------
@@ -131,12 +141,37 @@ def read_log(
 
     """
     table = read_table(
-        path, time=time, channels=channels, align=align, window_s=window_s, counter=counter, digest=digest
-    )
+        path, time=time, channels=channels, align=align, window_s=window_s, counter=counter, rate_hz=rate_hz,
+        digest=digest,
+    )  # fmt: skip
+    if duplicates is not None:
+        table = _merge_duplicates(table, duplicates)
     for signal in table.signals.values():
         if not np.any(np.isfinite(signal.values)):
             raise LogError(f'{table.source}: column "{signal.origin.column}" holds no number; choose another column')
     return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes)
+
+
+def _merge_duplicates(table: Table, how: str) -> Table:
+    """Return a table with one sample of each run of samples at one time, and a note of how many there were."""
+    if how not in ("first", "mean"):
+        raise LogError(f'duplicates = "{how}" is not known; give "first" or "mean"')
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(table.time) != 0.0]))
+    if starts.size == table.time.size:
+        return table
+
+    def merge(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        if how == "first":
+            return values[starts]
+        there = np.isfinite(values)
+        counts = np.add.reduceat(there.astype(float), starts)
+        with np.errstate(invalid="ignore"):  # none of them is there: missing
+            return np.add.reduceat(np.where(there, values, 0.0), starts) / counts
+
+    signals = {name: replace(signal, values=merge(signal.values)) for name, signal in table.signals.items()}
+    kept = "their mean" if how == "mean" else "the first"
+    note = f"{format_count(table.time.size - starts.size, 'sample')} at the time of the one before merged: {kept} kept"
+    return replace(table, time=table.time[starts], signals=signals, notes=(*table.notes, note))
 
 
 def write_log(log: Log, path: str | Path) -> Path:
@@ -160,7 +195,8 @@ def _read_channels(
     """Return the channels in their files' units and the clock in seconds, and what was done."""
     notes: list[str] = []
     arrays: dict[str, Float[np.ndarray, " n"]] = {}
-    on_clock = {name: channel for name, channel in chosen.channels.items() if channel.clock == chosen.clock}
+    read = {name: channel for name, channel in chosen.channels.items() if channel.constant is None}
+    on_clock = {name: channel for name, channel in read.items() if channel.clock == chosen.clock}
     extra = [counter.column] if counter is not None else []
     columns, clock = _read_clock(chosen.clock, [channel.field.name for channel in on_clock.values()] + extra, window)
     if clock.size < 2:
@@ -170,16 +206,24 @@ def _read_channels(
         clock, note = counter.open_gaps(clock, columns[counter.column], str(chosen.clock.source.path))
         notes.append(note)
     arrays |= _separate_arrays(on_clock, columns)
-    others = [channel.clock for channel in chosen.channels.values() if channel.clock != chosen.clock]
+    for name, channel in chosen.channels.items():
+        if channel.constant is not None:
+            arrays[name] = np.full(clock.size, channel.constant)
+    others = [channel.clock for channel in read.values() if channel.clock != chosen.clock]
     # Each other clock is read once, for all of its channels.
     for other in dict.fromkeys(others):
-        group = {name: channel for name, channel in chosen.channels.items() if channel.clock == other}
+        group = {name: channel for name, channel in read.items() if channel.clock == other}
         columns, time = _read_clock(
             other, [channel.field.name for channel in group.values()], _widen_window(window, group)
         )
-        check_increasing(time, f'{other.source.path}: clock "{other.name}"')
+        if all(channel.rule is None for channel in group.values()) and np.array_equal(time, clock):
+            arrays |= _separate_arrays(group, columns)  # rows of one table, at the same instants
+            continue
+        place = f'{other.source.path}: clock "{other.name}"' + (f" of {other.rows}" if other.rows else "")
+        check_increasing(time, place)
         for name, channel in group.items():
-            assert channel.rule is not None
+            if channel.rule is None:
+                raise LogError(f"{place}: has other instants than the log's clock; {HOW_TO_ALIGN}")
             arrays[name] = channel.rule(clock, time, columns[channel.field.name])
             notes.append(_describe_alignment(name, channel, clock, time))
     return arrays, clock, notes
@@ -191,6 +235,13 @@ def _read_clock(
     """Return columns that share a clock, and the clock in seconds, cut to the window."""
     scale = factor(clock.unit, "s")
     span = None
+    if clock.rate_hz is not None:
+        columns = clock.source.read(names)
+        sizes = {values.size for values in columns.values()}
+        if len(sizes) > 1:
+            raise LogError(f"{clock.path}: its columns hold {min(sizes)} to {max(sizes)} samples; choose one length")
+        time = np.arange(float(max(sizes, default=0))) / clock.rate_hz + clock.offset_s
+        return _cut_window(columns, time, window)
     if window is not None:
         start, stop = ((edge - clock.offset_s) / scale for edge in window)
         slack = 1e-9 * max(abs(start), abs(stop))  # the exact cut is below, in seconds
@@ -199,11 +250,21 @@ def _read_clock(
     time = columns[clock.name] * scale if scale != 1.0 or clock.name in names else columns[clock.name]
     if clock.offset_s:
         time = time + clock.offset_s
-    if window is not None:
-        keep = (time >= window[0]) & (time <= window[1])
-        columns = {name: values[keep] for name, values in columns.items()}
-        time = time[keep]
-    return columns, time
+    # The shorter one of two tables side by side ends in empty rows.
+    empty = np.isnan(time)
+    if empty.size and empty[-1]:
+        full = max((np.flatnonzero(~np.isnan(values))[-1:].tolist() or [-1])[0] for values in [time, *columns.values()])
+        time, columns = time[: full + 1], {name: values[: full + 1] for name, values in columns.items()}
+    return _cut_window(columns, time, window)
+
+
+def _cut_window(
+    columns: dict[str, Float[np.ndarray, " n"]], time: Float[np.ndarray, " n"], window: tuple[float, float] | None
+) -> tuple[dict[str, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]]:
+    if window is None:
+        return columns, time
+    keep = (time >= window[0]) & (time <= window[1])
+    return {name: values[keep] for name, values in columns.items()}, time[keep]
 
 
 def _separate_arrays(
@@ -263,12 +324,13 @@ def _remark_on(signal: Signal) -> list[str]:
     if bits is not None:
         return [
             f"{signal.name}: looks like signed numbers in an unsigned field of {bits} bits; if so, give "
-            f'Column(column="{signal.origin.column}", wrap_bits={bits})'
+            f"{spell_column(column=signal.origin.column, wrap_bits=bits)}"
         ]
     loss = Counter.suspect(signal.values)
     if loss:
         return [
             f"{signal.name}: looks like a sample counter that misses {format_count(loss, 'sample')}; to open "
-            f'gaps there, give counter=Counter(column="{signal.origin.column}", ...)'
+            f'gaps there, give counter=Counter(column="{signal.origin.column}", ...), in a problem file '
+            f'counter = {{ column = "{signal.origin.column}", samples_per_count = ... }}'
         ]
     return []

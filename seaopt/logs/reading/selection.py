@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from seaopt.errors import LogError, SeaoptError, suggestion
-from seaopt.logs.formats import Field, Source
+from seaopt.logs.formats import Field, Source, keep_rows
 from seaopt.logs.log.alignment import Rule
-from seaopt.logs.reading.column import Column
+from seaopt.logs.reading.column import Column, spell_column
 from seaopt.logs.reading.counter import Counter
 from seaopt.records import record
 from seaopt.signals import check_distinct
@@ -18,17 +18,30 @@ from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 MAX_NAMES = 20  # in a message
+HOW_TO_ALIGN = (
+    "bring it over by align=Hold(), Linear() or Nearest(tolerance_s=...), in a problem file align = { linear = {} }"
+)
+
+
+class ClockError(LogError):
+    """The log's clock is not clear: its unit if `column` is named, else which of the `candidates` it is."""
+
+    def __init__(self, text: str, column: str | None = None, candidates: Sequence[str] = ()) -> None:
+        super().__init__(text)
+        self.column, self.candidates = column, tuple(candidates)
 
 
 @record
 class ClockColumn:
-    """A column of times: two are the same clock if all of this is the same."""
+    """A column of times, or without one a rate: two are the same clock if all of this is the same."""
 
     source: Source = dataclasses.field(compare=False)
     path: Path
     name: str
     unit: str
     offset_s: float = 0.0
+    rows: str = ""
+    rate_hz: float | None = None
 
 
 @record
@@ -41,6 +54,7 @@ class SelectedChannel:
     unit: str
     clock: ClockColumn
     rule: Rule | None
+    constant: float | None = None
 
 
 @record
@@ -54,10 +68,11 @@ class Selection:
 
 def select(
     sources: Sequence[Source],
-    time: str | Column | None,
-    channels: Mapping[str, str | Column] | None,
+    time: str | int | Column | None,
+    channels: Mapping[str, str | int | Column] | None,
     align: Rule | None,
     counter: Counter | None,
+    rate_hz: float | None = None,
 ) -> Selection:
     """Return the log's clock and its channels.
 
@@ -73,8 +88,12 @@ def select(
     if channels is not None and "time" in channels:
         raise LogError(f'{sources[0].path}: a channel is named "time"; rename it, time is the clock')
     columns = None if channels is None else {name: as_column(column) for name, column in channels.items()}
-    places = None if columns is None else {name: find_column(sources, name, column) for name, column in columns.items()}
-    clock = _find_log_clock(sources, time, None if places is None else list(places.values()))
+    constants = {name: column for name, column in (columns or {}).items() if column.from_header}
+    places = None
+    if columns is not None:
+        columns = {name: column for name, column in columns.items() if not column.from_header}
+        places = _find_columns(sources, columns)
+    clock = _find_log_clock(sources, time, None if places is None else list(places.values()), rate_hz)
     notes = [note for source in sources for note in source.notes]
     if columns is None or places is None:
         columns, places, more = _select_every_channel(sources, clock, align)
@@ -86,21 +105,59 @@ def select(
         source, field = places[name]
         channel_clock = _find_channel_clock(sources, clock, column, source, field)
         rule = column.align or align
-        if channel_clock != clock and rule is None:
+        # Rows of one table may be at the same instants; whether they are is seen on reading.
+        if channel_clock != clock and rule is None and not (source.rows and clock.rows and source.path == clock.path):
             raise LogError(
                 f'{source.path}: "{field.name}" is on the clock "{channel_clock.name}", the log on "{clock.name}" of '
-                f"{clock.path.name}; bring it over by align=Hold(), Linear() or Nearest(tolerance_s=...)"
+                f"{clock.path.name}; {HOW_TO_ALIGN}"
             )
         selected[name] = SelectedChannel(
             column=column, source=source, field=field, unit=resolve_unit(source, column, field), clock=channel_clock,
             rule=rule if channel_clock != clock else None,
         )  # fmt: skip
-    origins = {name: (str(channel.source.path), channel.field.name) for name, channel in selected.items()}
-    notes += check_distinct({name: (origins[name], si_unit(channel.unit)) for name, channel in selected.items()})
-    return Selection(clock=clock, channels=selected, notes=tuple(notes))
+    origins = {
+        name: ((str(channel.source.path), " ".join((channel.field.name, channel.source.rows)).strip()))
+        for name, channel in selected.items()
+        if not channel.column.shared
+    }
+    notes += check_distinct({name: (place, si_unit(selected[name].unit)) for name, place in origins.items()})
+    selected |= {name: _select_constant(sources, clock, name, column) for name, column in constants.items()}
+    ordered = {name: selected[name] for name in (channels if channels is not None else selected)}
+    return Selection(clock=clock, channels=ordered, notes=tuple(notes))
 
 
-def as_column(column: str | Column) -> Column:
+def _find_columns(sources: Sequence[Source], columns: Mapping[str, Column]) -> dict[str, tuple[Source, Field]]:
+    """Return file and field of each column; columns of the same rows share a source, and so a clock."""
+    found: dict[str, tuple[Source, Field]] = {}
+    kept: dict[tuple[str, str], Source] = {}
+    for name, column in columns.items():
+        source, field = find_column(sources, name, column)
+        if column.where:
+            rows = keep_rows(source, column.where)
+            source = kept.setdefault((str(source.path), rows.rows), rows)
+        found[name] = source, field
+    return found
+
+
+def _select_constant(sources: Sequence[Source], clock: ClockColumn, name: str, column: Column) -> SelectedChannel:
+    """Return a channel that has the value that a header states."""
+    files = [source for source in sources if column.file is None or source.path == Path(column.file)]
+    known = {constant: source for source in files for constant in source.constants}
+    if column.column not in known:
+        raise LogError(
+            f'{_list_paths(files)}: the header states no constant "{column.column}" for {name}; '
+            f"{suggestion(str(column.column), known)}"
+        )
+    source = known[str(column.column)]
+    value, unit = source.constants[str(column.column)]
+    field = Field(name=str(column.column), kind="float64", length=None, unit=unit)
+    return SelectedChannel(
+        column=column, source=source, field=field, unit=resolve_unit(source, column, field), clock=clock, rule=None,
+        constant=value,
+    )  # fmt: skip
+
+
+def as_column(column: str | int | Column) -> Column:
     """Return a column, of which the header alone may be given."""
     return column if isinstance(column, Column) else Column(column=column)
 
@@ -111,23 +168,41 @@ def find_column(sources: Sequence[Source], name: str, column: Column) -> tuple[S
     if not places:
         known = ", ".join(str(source.path) for source in sources)
         raise LogError(f'{name}: file = "{column.file}" is none of those read; give one of {known}')
-    hits = [(source, field) for source in places for field in source.fields if field.name == column.column]
+    hits = [(source, field) for source in places for field in _match_fields(source, column.column)]
     if not hits:
-        names = [field.name for source in places for field in source.fields]
-        raise LogError(
-            f'{_list_paths(places)}: no column "{column.column}" for {name}; {suggest_names(column.column, names)}'
-        )
+        raise LogError(f"{_list_paths(places)}: {_explain_missing(places, name, column.column)}")
     if len(hits) > 1 and hits[0][0] is hits[1][0]:
         raise LogError(f'{hits[0][0].path}: {len(hits)} columns are named "{column.column}"; rename all but one')
     if len(hits) > 1:
         raise LogError(
             f'"{column.column}" for {name} is in {_list_paths([source for source, _ in hits])}; say which with '
-            f'Column(column="{column.column}", file=...)'
+            f"{spell_column(column=column.column, file='...')}"
         )
     source, field = hits[0]
     if not field.numeric and source.format != "CSV":  # a text file names the cell, on reading
         raise LogError(f'{source.path}: "{field.name}" holds {field.kind}, not numbers; {field.remedy}')
     return source, field
+
+
+def _match_fields(source: Source, column: str | int) -> list[Field]:
+    """Return the fields of a name, or of a number counted from 1."""
+    if isinstance(column, str):
+        return [field for field in source.fields if field.name == column]
+    numbered = ((at if field.position is None else field.position, field) for at, field in enumerate(source.fields, 1))
+    return [field for number, field in numbered if number == column]
+
+
+def _explain_missing(places: Sequence[Source], name: str, column: str | int) -> str:
+    """Return what to do about a column that is not there, or about a header that several columns have."""
+    fields = [field for source in places for field in source.fields]
+    if isinstance(column, int):
+        return f"no column {column} for {name}; the file has {len(fields)}"
+    repeated = [field.position for field in fields if field.header == column]
+    if repeated:
+        numbers = ", ".join(map(str, repeated[:MAX_NAMES]))
+        how = spell_column(column=repeated[0] or 1)
+        return f'{len(repeated)} columns are named "{column}"; give the number of the one for {name}, {numbers}: {how}'
+    return f'no column "{column}" for {name}; {suggest_names(column, [field.name for field in fields])}'
 
 
 def suggest_names(name: str, names: Sequence[str]) -> str:
@@ -143,12 +218,9 @@ def resolve_unit(source: Source, column: Column, field: Field) -> str:
     """Return a column's unit: as given, else as the file says."""
     unit = column.unit if column.unit is not None else field.unit
     if unit is None:
-        how = (
-            f'write it in the header\'s brackets, "{field.name} [unit]", or give it with the column (--unit)'
-            if source.format == "CSV"
-            else f'give it: Column(column="{field.name}", unit="...") (--unit)'
-        )
-        raise LogError(f'{source.path}: column "{field.name}" has no unit; {how}')
+        spelt = spell_column(column=column.column, unit="...")
+        brackets = f'write it in the header\'s brackets, "{field.name} [unit]", or ' if source.format == "CSV" else ""
+        raise LogError(f'{source.path}: column "{field.name}" has no unit; {brackets}give it: {spelt} (--unit)')
     try:
         factor(unit, si_unit(unit))
     except SeaoptError as error:
@@ -161,23 +233,39 @@ def _list_paths(sources: Sequence[Source]) -> str:
 
 
 def _make_clock(source: Source, field: Field, column: Column) -> ClockColumn:
+    if column.unit is None and field.unit is None:
+        raise ClockError(
+            f'{source.path}: column "{field.name}" has no unit, and is the time; give it, in seconds if it is: '
+            f"time={spell_column(column=column.column, unit='s')} (--unit time=s)",
+            column=field.name,
+        )
     unit = resolve_unit(source, column, field)
     try:
         factor(unit, "s")
     except SeaoptError as error:
         raise type(error)(f"{source.path}: time: {error}") from error
-    return ClockColumn(source=source, path=source.path, name=field.name, unit=unit, offset_s=column.clock_offset_s)
+    return ClockColumn(
+        source=source, path=source.path, name=field.name, unit=unit, offset_s=column.clock_offset_s, rows=source.rows
+    )
 
 
 def _find_log_clock(
-    sources: Sequence[Source], time: str | Column | None, places: list[tuple[Source, Field]] | None
+    sources: Sequence[Source],
+    time: str | int | Column | None,
+    places: list[tuple[Source, Field]] | None,
+    rate_hz: float | None,
 ) -> ClockColumn:
     """Return the log's clock: as given, else the one that all channels share."""
+    if rate_hz is not None:
+        return _make_rate_clock(sources, time, places, rate_hz)
     if time is not None:
         column = as_column(time)
-        if len(sources) > 1 and column.file is None and places:
-            # A header that several files have is the clock of the first channel's file.
-            sources = [places[0][0]] if any(field.name == column.column for field in places[0][0].fields) else sources
+        if column.where:
+            source, field = find_column(sources, "time", column)
+            return _make_clock(keep_rows(source, column.where), field, column)
+        if (len(sources) > 1 and column.file is None and places) or (places and places[0][0].rows):
+            # A header that several files have, or rows, is the clock of the first channel's.
+            sources = [places[0][0]] if _match_fields(places[0][0], column.column) else sources
         return _make_clock(*find_column(sources, "time", column), column)
     if places is None:
         places = [(source, field) for source in sources for field in source.fields if field.numeric]
@@ -200,19 +288,47 @@ def _find_log_clock(
     return _make_clock(*find_column([source], "time", column), column)
 
 
+def _make_rate_clock(
+    sources: Sequence[Source], time: object, places: list[tuple[Source, Field]] | None, rate_hz: float
+) -> ClockColumn:
+    """Return a clock of a stated rate, for a file that has none."""
+    if time is not None:
+        raise LogError(f"{_list_paths(sources)}: time and rate_hz are both given; keep one of them")
+    if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < 1e12:
+        raise LogError(f"rate_hz = {rate_hz!r} is not a sample rate; give samples per second")
+    source = places[0][0] if places else sources[0]
+    if len(sources) > 1 or any(other is not source for other, _ in places or []):
+        raise LogError(f"{_list_paths(sources)}: rate_hz is the clock of one table; read one file, without where")
+    return ClockColumn(source=source, path=source.path, name=f"{rate_hz:g} Hz", unit="s", rate_hz=float(rate_hz))
+
+
 def _find_time_column(source: Source) -> Column:
     """Return the one column that is named like a time."""
     names = [field.name for field in source.fields if field.numeric]
-    named = [field for field in source.fields if field.numeric and _last_part(field.name).casefold() in _TIME_NAMES]
+    named = [field for field in source.fields if field.numeric and is_time_name(field.header or field.name)]
     # Of several, T in degrees is a temperature.
     times = [field.name for field in named if len(named) == 1 or _may_be_time(field.unit)]
     if len(times) == 1:
         return Column(column=times[0])
     why = "no column is" if not times else f"{len(times)} columns are"
     shown = ", ".join(names[:MAX_NAMES]) + (", ..." if len(names) > MAX_NAMES else "")
-    raise LogError(
-        f"{source.path}: {why} named like a time; give time= (--time), one of the columns: {shown or 'none'}"
+    raise ClockError(
+        f"{source.path}: {why} named like a time; give time= (--time), one of the columns: {shown or 'none'}; or "
+        "rate_hz= where there is none",
+        candidates=times or names,
     )
+
+
+def is_time_name(name: str) -> bool:
+    """Tell whether a column is named like a time.
+
+    Examples
+    --------
+    >>> is_time_name("Zeit [ms]"), is_time_name("imu.t"), is_time_name("F1 [N]")
+    (True, True, False)
+
+    """
+    return _last_part(name).casefold() in _TIME_NAMES
 
 
 def _may_be_time(unit: str | None) -> bool:
@@ -230,12 +346,14 @@ def _find_channel_clock(
     if column.time is not None:
         time = as_column(column.time)
         return _shift_clock(_make_clock(*find_column([source], f'time of "{field.name}"', time), time), column)
-    reference = next(known for known in clock.source.fields if known.name == clock.name)
-    if source is clock.source and field.clock == reference.clock:
+    reference = _find_reference(clock)
+    if source is clock.source and (reference is None or field.clock == reference.clock):
+        if reference is None:
+            return _shift_clock(clock, column)
         if None not in (field.length, reference.length) and field.length != reference.length:
             raise LogError(
                 f'{source.path}: "{field.name}" has {field.length} samples and the clock "{clock.name}" '
-                f'{reference.length}; give it its own with Column(column=..., time="...")'
+                f"{reference.length}; give it its own with {spell_column(column=field.name, time='...')}"
             )
         return _shift_clock(clock, column)
     # Another clock: the format's own, or in another file the column named like the log's clock.
@@ -245,8 +363,14 @@ def _find_channel_clock(
         same = [known.name for known in source.fields if known.name == clock.name]
         known = Column(column=same[0], unit=clock.unit) if same else _find_time_column(source)
     else:
-        raise LogError(f'{source.path}: "{field.name}" has no clock of its own; give it one with Column(time="...")')
+        how = spell_column(column=field.name, time="...")
+        raise LogError(f'{source.path}: "{field.name}" has no clock of its own; give it one: {how}')
     return _shift_clock(_make_clock(*find_column([source], f'time of "{field.name}"', known), known), column)
+
+
+def _find_reference(clock: ClockColumn) -> Field | None:
+    """Return the field of a clock; None for one that is a rate."""
+    return next((field for field in clock.source.fields if field.name == clock.name), None)
 
 
 def _shift_clock(clock: ClockColumn, column: Column) -> ClockColumn:
@@ -254,7 +378,7 @@ def _shift_clock(clock: ClockColumn, column: Column) -> ClockColumn:
         return clock
     return ClockColumn(
         source=clock.source, path=clock.path, name=clock.name, unit=clock.unit,
-        offset_s=clock.offset_s + column.clock_offset_s,
+        offset_s=clock.offset_s + column.clock_offset_s, rows=clock.rows, rate_hz=clock.rate_hz,
     )  # fmt: skip
 
 
@@ -262,7 +386,7 @@ def _select_every_channel(
     sources: Sequence[Source], clock: ClockColumn, align: Rule | None
 ) -> tuple[dict[str, Column], dict[str, tuple[Source, Field]], list[str]]:
     """Return every column of numbers on the clock; with a rule for all, those on other clocks too."""
-    reference = next(field for field in clock.source.fields if field.name == clock.name)
+    reference = _find_reference(clock)
     clock_names = {(str(source.path), field.clock) for source in sources for field in source.fields if field.clock}
     notes: list[str] = []
     every = [(source, field) for source in sources for field in source.fields if field.name != clock.name]
@@ -298,7 +422,9 @@ def _select_every_channel(
     return columns, places, notes
 
 
-def _is_on_clock(clock: ClockColumn, reference: Field, source: Source, field: Field) -> bool:
+def _is_on_clock(clock: ClockColumn, reference: Field | None, source: Source, field: Field) -> bool:
+    if reference is None:
+        return source is clock.source and field.clock is None
     lengths = (field.length, reference.length)
     same = None in lengths or lengths[0] == lengths[1]
     return source is clock.source and field.clock == reference.clock and same
