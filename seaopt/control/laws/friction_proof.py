@@ -13,7 +13,9 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states, has_friction
 
 
-def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
+def prove_friction(
+    controller: Controller, plant: Plant, params: ParameterSet, first: str = "", least: float = 0.0
+) -> FrictionMargin | None:
     """Return how much steeper friction may be with stability proved, between the samples too; None without friction.
 
     The linear plant of the proof is the sliding one; what a curve's slope is above its flattest is in the sector.
@@ -24,6 +26,8 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
         Its measurement path closes the loop; the reference stands still.
     plant, params
         The plant with its friction, and parameters, conditions among them.
+    first, least
+        As in `friction_margin`.
 
     Returns
     -------
@@ -47,7 +51,7 @@ def prove_friction(controller: Controller, plant: Plant, params: ParameterSet) -
     if np.max(np.abs(closed.eigenvalues())) >= STABLE:
         zeros = (0.0,) * loop.slopes.size
         return FrictionMargin(factor=0.0, slopes=zeros, frequency_hz=0.0, multiplier="none: unstable without friction")
-    return friction_margin(loop)
+    return friction_margin(loop, first, least)
 
 
 def take_friction_out(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionLoop | None:

@@ -58,6 +58,7 @@ WORTHWHILE = 0.9  # of the inverse: a multiplier that gains less is not looked a
 
 Angles = Float[np.ndarray, " m"]
 Multiplier = Callable[[Complex[np.ndarray, "*n"]], Complex[np.ndarray, "*n"]]
+Test = Callable[[float], Angles]
 
 
 @record(eq=False)
@@ -133,16 +134,26 @@ class FrictionMargin:
         return f"friction: stability is proved for every curve {steep}, between the samples too{missing}"
 
 
-def friction_margin(loop: FrictionLoop) -> FrictionMargin:
+def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> FrictionMargin:
     """Return the steepest friction for which the loop is proved stable, the best over all multipliers tried.
 
     The loop without friction must be stable, by its eigenvalues; the caller sees to that. Sums over aliases are
     truncated with a bound on the rest; rounding is not enclosed.
+
+    Parameters
+    ----------
+    loop : FrictionLoop
+    first : str, optional
+        The name of a multiplier that is tried first, and alone where it proves stability for the curves as they are.
+    least : float
+        A smaller factor is not looked for, which is quicker: the margin is then zero.
+
     """
     responses = _respond(loop, _angles(loop))
+    bar = 1.0 / least if least else np.inf
     best = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
-    for name, multiplier in _multipliers(loop):
-        inverse = _least_inverse(responses, multiplier, WORTHWHILE / best.factor if best.factor else np.inf)
+    for name, multiplier in sorted(_multipliers(loop), key=lambda named: named[0] != first):
+        inverse = _least_inverse(responses, multiplier, WORTHWHILE / best.factor if best.factor else bar)
         if inverse is None:
             continue
         fine, inverse = _settle(loop, responses, multiplier, inverse)
@@ -154,6 +165,8 @@ def friction_margin(loop: FrictionLoop) -> FrictionMargin:
             factor=float(factor), slopes=tuple(float(slope) for slope in factor * loop.slopes),
             frequency_hz=float(fine.theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
         )  # fmt: skip
+        if name == first and best.proved:
+            break
     return best
 
 
@@ -187,7 +200,7 @@ class _Responses:
 
 def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
     """Return G_v, a (without M) and b at angles."""
-    period, n = loop.plant.sample_time_s, loop.motor.size
+    period = loop.plant.sample_time_s
     z = np.exp(1j * theta)
     f = theta / (2 * np.pi * period)
     law = loop.law.measurement_response(f)
@@ -196,41 +209,90 @@ def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
     s = 1j * (theta[:, None] + 2 * np.pi * np.arange(-ALIASES, ALIASES + 1)) / period
     root = np.sqrt(loop.slopes)  # phi = slope v: with v' = root v and phi' = phi / root the slope is 1
     causes = np.column_stack([loop.friction * root, loop.motor])
-    inner = s[..., None, None] * np.eye(n) - loop.a
-    x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (*s.shape, n, causes.shape[1])))
-    velocity = (root[:, None] * loop.velocity) @ x
+    seen = np.vstack([root[:, None] * loop.velocity, loop.measured])
+    response = _transfer(loop.a, causes, seen, s)
+    velocity, measured = response[..., :-1, :], response[..., -1, :-1]
     hold = -np.expm1(-s * period) / s * np.exp(-s * loop.delay_s)
     return _Responses(
         theta=theta, s=s, mobility=velocity[..., :-1], command=-velocity[..., -1] * (hold * gain[:, None])[..., None],
-        sensed=np.conj((loop.measured @ x)[..., :-1] + loop.through * root) / period,
+        sensed=np.conj(measured + loop.through * root) / period,
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
         order=ALIASES + theta / (2 * np.pi),
     )  # fmt: skip
 
 
+def _transfer(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n u"], c: Float[np.ndarray, "y n"], s: Complex[np.ndarray, "m k"]
+) -> Complex[np.ndarray, "m k y u"]:
+    """Return c (sI - a)^-1 b, by back substitution in a Schur basis of the balanced matrix, for all s at once."""
+    from scipy.linalg import matrix_balance, schur
+
+    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    triangle, basis = schur(balanced, output="complex")
+    right, left = basis.conj().T @ (b / scale[:, None]), (c * scale) @ basis
+    n, flat = len(triangle), s.ravel()
+    x = np.empty((n, right.shape[1], flat.size), dtype=complex)
+    for i in range(n - 1, -1, -1):
+        known = np.tensordot(triangle[i, i + 1 :], x[i + 1 :], axes=1) if i + 1 < n else 0.0
+        x[i] = (right[i][:, None] + known) / (flat - triangle[i, i])
+    out = np.tensordot(left, x, axes=1)
+    return np.moveaxis(out, -1, 0).reshape(*s.shape, *out.shape[:2])
+
+
 def _definiteness(at: _Responses, multiplier: Multiplier, inverse: float) -> Angles:
     """Return, per angle, what is positive where M (H + inverse) is positive definite."""
+    return _weigh(at, multiplier)(inverse)
+
+
+def _weigh(at: _Responses, multiplier: Multiplier) -> Test:
+    """Return the test of one multiplier: of 1/kappa, the values of `_definiteness`."""
     weight = multiplier(at.s)
-    block = weight[..., None, None] * (at.mobility + inverse * np.eye(at.mobility.shape[-1]))
+    if at.mobility.shape[-1] == 1:
+        return _weigh_one(at, weight)
     right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
-    if block.shape[-1] == 1:  # one friction: numbers, not matrices
-        real = np.real(block[..., 0, 0])
-        negative = np.any(real <= 0.0, axis=-1)
-        columns = right[..., 0, :]
-        sums = np.conj(columns)[..., :, None] * columns[..., None, :] / np.where(real > 0.0, real, 1.0)[..., None, None]
-    else:
+
+    def test(inverse: float) -> Angles:
+        block = weight[..., None, None] * (at.mobility + inverse * np.eye(at.mobility.shape[-1]))
         block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
         negative = np.any(np.linalg.eigvalsh(block) <= 0.0, axis=(-2, -1))
         block = np.where(negative[:, None, None, None], np.eye(block.shape[-1]), block)
         sums = np.conj(np.swapaxes(right, -1, -2)) @ np.linalg.solve(block, right)
-    total = np.sum(sums, axis=-3)
-    # The terms fall like 1/omega^2: the rest of each sum is at most this multiple of its last term.
-    edge = np.maximum(np.abs(sums[..., 0, :, :]), np.abs(sums[..., -1, :, :]))
-    rest = TAIL_GROWTH * edge * (at.order**2 * at.tail)[:, None, None]
-    alpha, beta = (np.real(total[..., i, i]) + rest[..., i, i] for i in (0, 1))
-    gamma = np.abs(2.0 + total[..., 1, 0]) - rest[..., 1, 0]
-    plain = (np.sign(gamma) * gamma**2 - alpha * beta) / (4.0 + np.abs(alpha * beta))
-    return np.where(negative, -1.0, plain)
+        alpha, beta, gamma = (sums[..., i, j] for i, j in ((0, 0), (1, 1), (1, 0)))
+        return np.where(negative, -1.0, _compare(at, np.real(alpha), np.real(beta), gamma))
+
+    return test
+
+
+def _weigh_one(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> Test:
+    """Return the test where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
+    mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
+    command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
+    own, other, both = np.abs(command) ** 2, np.abs(sensed) ** 2, np.conj(sensed) * command
+
+    def test(inverse: float) -> Angles:
+        real = mobility + inverse * slope
+        negative = np.any(real <= 0.0, axis=-1)
+        real = np.where(real > 0.0, real, 1.0)
+        return np.where(negative, -1.0, _compare(at, own / real, other / real, both / real))
+
+    return test
+
+
+def _compare(
+    at: _Responses, alpha: Float[np.ndarray, "m k"], beta: Float[np.ndarray, "m k"], gamma: Complex[np.ndarray, "m k"]
+) -> Angles:
+    """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it.
+
+    The terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
+    """
+    reach = TAIL_GROWTH * at.order**2 * at.tail
+
+    def rest(terms: Complex[np.ndarray, "m k"] | Float[np.ndarray, "m k"]) -> Angles:
+        return reach * np.maximum(np.abs(terms[:, 0]), np.abs(terms[:, -1]))
+
+    product = (np.sum(alpha, axis=1) + rest(alpha)) * (np.sum(beta, axis=1) + rest(beta))
+    least = np.abs(2.0 + np.sum(gamma, axis=1)) - rest(gamma)
+    return (np.sign(least) * least**2 - product) / (4.0 + np.abs(product))
 
 
 def _least_inverse(at: _Responses, multiplier: Multiplier, bar: float) -> float | None:
@@ -239,8 +301,10 @@ def _least_inverse(at: _Responses, multiplier: Multiplier, bar: float) -> float 
     More of it adds the Hermitian part of M, which is not negative: what holds at one value holds above it.
     """
 
+    test = _weigh(at, multiplier)
+
     def holds(inverse: float) -> bool:
-        return bool(np.min(_definiteness(at, multiplier, inverse)) > 0.0)
+        return bool(np.min(test(inverse)) > 0.0)
 
     high = min(bar, LARGEST_INVERSE)
     if not holds(high):
@@ -268,7 +332,7 @@ def _angles(loop: FrictionLoop) -> Angles:
 
 
 def _refine(loop: FrictionLoop, at: _Responses, multiplier: Multiplier, inverse: float) -> _Responses:
-    """Return the responses at more angles, about the least values of the test."""
+    """Return the responses at new angles, about the least values of the test."""
     values = _definiteness(at, multiplier, inverse)
     dips = [
         i for i in range(values.size) if values[i] <= min(values[max(i - 1, 0)], values[min(i + 1, values.size - 1)])
@@ -277,7 +341,7 @@ def _refine(loop: FrictionLoop, at: _Responses, multiplier: Multiplier, inverse:
     new = [
         np.linspace(at.theta[max(i - 1, 0)], at.theta[min(i + 1, values.size - 1)], POINTS_PER_DIP) for i in dips
     ]  # fmt: skip
-    return _respond(loop, np.unique(np.concatenate([at.theta, *new])))
+    return _respond(loop, np.unique(np.concatenate(new)))
 
 
 def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
