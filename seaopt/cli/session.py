@@ -343,7 +343,7 @@ class Session:
         result = certify(
             controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
             others=self.problem.parameters, bounds=Budget() if table.bounds else None,
-            max_failure_probability=table.max_failure_probability,
+            max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
             progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
         )  # fmt: skip
         tell("simulating scenarios")

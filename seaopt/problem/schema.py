@@ -271,6 +271,7 @@ class RobustnessTable(_Strict):
     retune: Annotated[Whole, Field(ge=0, le=20)] = 0
     bounds: Flag = False
     max_failure_probability: Annotated[Number, Field(gt=0, le=1)] | None = None
+    min_friction_margin: Annotated[Number, Field(gt=0)] | None = None
     sensors: SensorsTable = SensorsTable()
     current_step_A: NotNegative = 0.0
 

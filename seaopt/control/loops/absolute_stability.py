@@ -143,6 +143,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
     Parameters
     ----------
     loop : FrictionLoop
+        The loop with its friction taken out.
     first : str, optional
         The name of a multiplier that is tried first, and alone where it proves stability for the curves as they are.
     least : float
@@ -227,8 +228,9 @@ def _transfer(
     """Return c (sI - a)^-1 b, by back substitution in a Schur basis of the balanced matrix, for all s at once."""
     from scipy.linalg import matrix_balance, schur
 
-    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
-    triangle, basis = schur(balanced, output="complex")
+    balanced, transform = matrix_balance(a, permute=False)
+    scale = np.diag(transform)
+    triangle, basis = np.array(schur(balanced, output="complex")[:2])
     right, left = basis.conj().T @ (b / scale[:, None]), (c * scale) @ basis
     n, flat = len(triangle), s.ravel()
     x = np.empty((n, right.shape[1], flat.size), dtype=complex)
@@ -300,7 +302,6 @@ def _least_inverse(at: _Responses, multiplier: Multiplier, bar: float) -> float 
 
     More of it adds the Hermitian part of M, which is not negative: what holds at one value holds above it.
     """
-
     test = _weigh(at, multiplier)
 
     def holds(inverse: float) -> bool:

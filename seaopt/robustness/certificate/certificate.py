@@ -10,7 +10,6 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
-from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.control.laws.limits import BY_NAME, BY_REQUIREMENT
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.margins import Margins, margins, nu_gap
@@ -31,6 +30,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
+from seaopt.robustness.certificate.friction import FrictionDraws, prove_frictions
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -47,6 +47,7 @@ from seaopt.robustness.verification.verification import Verification
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
+MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 FRICTION_CYCLE = "friction_cycle_N"
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
@@ -69,6 +70,8 @@ class Requirement:
     @property
     def sense(self) -> str:
         """What the value must be to the limit, as a sign; of draws and worst cases it is at most that."""
+        if self.name == MIN_FRICTION_MARGIN:
+            return "≥"
         return BY_REQUIREMENT[self.name].symbol if self.name in BY_REQUIREMENT else "≤"
 
 
@@ -150,14 +153,6 @@ class PlantMargins:
         }  # fmt: skip
 
 
-def prove_frictions(
-    controller: Controller, models: Mapping[str, Plant], params: ParameterSet
-) -> dict[str, FrictionMargin]:
-    """Return the friction margin of every plant that has friction."""
-    margins = {name: prove_friction(controller, model, params) for name, model in models.items()}
-    return {name: margin for name, margin in margins.items() if margin is not None}
-
-
 def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:
     """Measure the margins of a controller on a plant; the controller knows its design plant."""
     loop = controller.close(plant, params)
@@ -206,6 +201,8 @@ class Certificate:
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
         Of each model with friction: for how steep a friction stability is proved, between sliding and stuck.
+    friction_draws : mapping of name to FrictionDraws
+        The same over draws, of those models that are proved at the nominal parameters.
     remarks : tuple of str
         What only the fit could tell, one sentence each: a delay that the controller does not count on.
 
@@ -226,6 +223,7 @@ class Certificate:
     cycles: Mapping[str, tuple[FrictionCycle, ...]] = field(default_factory=dict[str, tuple[FrictionCycle, ...]])
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
+    friction_draws: Mapping[str, FrictionDraws] = field(default_factory=dict[str, FrictionDraws])
     remarks: tuple[str, ...] = ()
 
     @property
@@ -377,6 +375,11 @@ class Certificate:
                 varied=varied,
                 brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
                 friction=prove_frictions(controller, models, parameters),
+                friction_draws={
+                    name: FrictionDraws(**one.draws.model_dump())
+                    for name, one in stored.friction.items()
+                    if one.draws is not None
+                },
                 remarks=tuple(stored.remarks),
             )
             certificate = certificate.play_steps()
@@ -404,6 +407,7 @@ class Certificate:
                 name: {"sector_stable": True if margin.proved else self._find_instability(name)}
                 | _list_fields(margin)
                 | {"limit_cycles": [cycle.to_dict() for cycle in self.cycles.get(name, ())]}
+                | {"draws": _list_fields(self.friction_draws[name]) if name in self.friction_draws else None}
                 for name, margin in self.friction.items()
             },
             "monte_carlo": _list_fields(self.monte_carlo),
@@ -432,7 +436,7 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        friction = [f"{name}: {margin}{self._describe_cycles(name)}" for name, margin in self.friction.items()]
+        friction = [f"{name}: {margin}{self._describe_proof(name)}" for name, margin in self.friction.items()]
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
@@ -446,6 +450,11 @@ class Certificate:
         }  # fmt: skip
         bounds = self.brackets[name].to_dict() if name in self.brackets else {}
         return _list_fields(worst.witness) | {"largest": largest} | bounds
+
+    def _describe_proof(self, name: str) -> str:
+        """Return what draws and predicted limit cycles add to a plant's proof, or to that there is none."""
+        drawn = f"; {self.friction_draws[name]}" if name in self.friction_draws else ""
+        return drawn + self._describe_cycles(name)
 
     def _find_instability(self, name: str) -> bool | None:
         """Return False where an oscillation lasts in a simulation, None where nothing is proved either way."""

@@ -32,9 +32,14 @@ from seaopt.robustness.certificate.certificate import (
     MonteCarlo,
     Requirement,
     plant_margins,
-    prove_frictions,
 )
-from seaopt.robustness.certificate.requirements import design_requirements, draw_requirements, plant_requirements
+from seaopt.robustness.certificate.friction import prove_friction_draws, prove_frictions
+from seaopt.robustness.certificate.requirements import (
+    design_requirements,
+    draw_requirements,
+    friction_requirements,
+    plant_requirements,
+)
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
@@ -94,6 +99,7 @@ def certify(
     seed: int = 1,
     confidence: float = CONFIDENCE,
     max_failure_probability: float | None = None,
+    min_friction_margin: float | None = None,
     bounds: Budget | None = None,
     progress: DrawProgress | None = None,
 ) -> Certificate:
@@ -125,6 +131,9 @@ def certify(
         Of the bound (Clopper-Pearson).
     max_failure_probability : float, optional
         Required of that bound, so that too few draws do not pass; if left out, the bound is stated, not required.
+    min_friction_margin : float, optional
+        Required of every plant with friction, N s/m (N m s/rad): stability is proved for friction curves of this slope,
+        counted from the flattest, at the nominal parameters and at up to 100 draws.
     bounds : Budget, optional
         Also bound the worst case from above, with this much work on each plant; not at all if left out. The bounds
         are not a requirement; a plant that this meets and that is worse than the worst case found replaces it.
@@ -153,7 +162,7 @@ def certify(
     (True, 0, ['design', 'swing'])
 
     """
-    _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability)
+    _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
     models, others = _with_design(controller, plants, others or ParameterSet())
     unknown = combine_uncertainty(parameters, others, ranges or {}, models)
     _check_delay(controller, unknown.ranges)
@@ -176,16 +185,19 @@ def certify(
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
+    friction = prove_frictions(controller, models, nominal)
+    friction_draws = prove_friction_draws(controller, models, unknown, friction, samples, rng)
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
+        *friction_requirements(friction, friction_draws, min_friction_margin),
     )
     certificate = Certificate(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
-        brackets=brackets, friction=prove_frictions(controller, models, nominal),
+        brackets=brackets, friction=friction, friction_draws=friction_draws,
         remarks=_remark_delay(controller, parameters),
     )  # fmt: skip
     return certificate.with_steps()
@@ -200,7 +212,7 @@ def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tup
 
 def _check_arguments(
     controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
-    max_failure_probability: float | None,
+    max_failure_probability: float | None, min_friction_margin: float | None,
 ) -> None:  # fmt: skip
     if not isinstance(plants, Mapping):
         raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
@@ -209,6 +221,8 @@ def _check_arguments(
     for name, value, least, what in (("samples", samples, 1, "number of draws"), ("seed", seed, 0, "seed")):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ControlError(f"{name} = {value!r} is not a {what}; give a whole number, {least} or more")
+    if min_friction_margin is not None and not min_friction_margin > 0.0:
+        raise ControlError(f"min_friction_margin = {min_friction_margin:g} is not positive; give a slope in N s/m")
     if not 0.0 < confidence < 1.0:
         raise ControlError(f"confidence = {confidence:g} is not between 0 and 1")
     if max_failure_probability is not None and not 0.0 < max_failure_probability <= 1.0:

@@ -10,11 +10,13 @@ from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import LIMIT_ROUNDING, MeasuredLoop, PortFigures
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import Verdict, judge
+from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.port import port_of
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.robustness.certificate.certificate import MonteCarlo, Requirement
+from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, MonteCarlo, Requirement
+from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 
@@ -86,6 +88,23 @@ def draw_requirements(
     if not result.failures:
         rows += [row for key, case in worst.items() for row in _require_worst(key, case)]
     return rows + bound
+
+
+def friction_requirements(
+    margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None
+) -> list[Requirement]:
+    """Return that stability is proved for friction as steep as asked, N s/m, at the nominal values and over draws."""
+    if least is None:
+        return []
+    rows: list[Requirement] = []
+    for name, margin in margins.items():
+        value, where = min(margin.slopes), f"{name}: {margin.multiplier} at {margin.frequency_hz:.4g} Hz"
+        drawn = draws.get(name)
+        if drawn is not None and drawn.least_slope < value:
+            value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
+        met = bool(value >= least * (1.0 - LIMIT_ROUNDING))
+        rows.append(Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=value, met=met, where=where))
+    return rows
 
 
 def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:

@@ -102,6 +102,22 @@ class StoredSimulation(ResultTable):
     seed: Whole
 
 
+class StoredFrictionDraws(ResultTable):
+    """For how many draws stability is proved with friction, and the least margin."""
+
+    samples: Whole
+    proved: Whole
+    least_slope: NullIsInfinite
+    factor: NullIsInfinite
+    parameters: dict[str, Number]
+
+
+class StoredFriction(ResultTable):
+    """The proof of a plant with friction, of which all but the draws is made again."""
+
+    draws: StoredFrictionDraws | None = None
+
+
 class StoredCertificate(ResultTable):
     """A robustness.json."""
 
@@ -111,6 +127,7 @@ class StoredCertificate(ResultTable):
     varied: list[StoredVaried] = []
     simulation: StoredSimulation | None = None
     remarks: list[str] = []
+    friction: dict[str, StoredFriction] = {}
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:

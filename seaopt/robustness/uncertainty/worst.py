@@ -180,20 +180,25 @@ def combine_worst(cases: Sequence[Worst]) -> Worst:
     return Worst(*worst, worst.witness, limited=worst.limited, largest=(ms, mt))
 
 
-def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
-    """Return the worst case at parameters and conditions, its loop closed on its own and not in a batch."""
+def place_values(plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> ParameterSet:
+    """Return a plant's parameters with those of a draw that it has, and its conditions, in place of the nominal."""
     extra = conditions((plant,))
     values = plant.complete(nominal)
     changed = {name: value for name, value in at.items() if name in values}
-    placed = {name: value for name, value in at.items() if name in extra}
-    known = read_conditions(plant, nominal) | placed
-    values = values.update(**changed).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
+    known = read_conditions(plant, nominal) | {name: value for name, value in at.items() if name in extra}
+    return values.update(**changed).with_parameters(*(replace(extra[name], value=known[name]) for name in known))
+
+
+def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
+    """Return the worst case at parameters and conditions, its loop closed on its own and not in a batch."""
+    values = place_values(plant, nominal, at)
     figures = controller.close(plant, values).figures()
     single = BatchFigures(
         spectral_radius=np.array([figures.spectral_radius]), ms=np.array([figures.ms]), mt=np.array([figures.mt])
     )
     witness = Witness(
-        parameters=changed | placed, ms=figures.ms, mt=figures.mt, ms_hz=figures.ms_hz,
+        parameters={name: value for name, value in at.items() if name in values},
+        ms=figures.ms, mt=figures.mt, ms_hz=figures.ms_hz,
         spectral_radius=figures.spectral_radius, severity=float(severities(controller, single)[0]),
     )  # fmt: skip
     return Worst(plant, values, witness, limited=bool(np.isfinite(min(limits(controller)))))

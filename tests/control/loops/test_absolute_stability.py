@@ -138,3 +138,41 @@ def test_a_loop_that_needs_friction_is_not_proved():
     margin = prove_friction(controller, swing, actuator)
     eigenvalues = controller.close(swing, actuator.update(f_c=0.0)).eigenvalues()
     assert margin.proved <= bool(np.max(np.abs(eigenvalues)) < 1.0)
+
+
+def test_the_responses_are_those_of_a_solve_at_each_point():
+    """Four states of very different size: back substitution against numpy's own solution, one point at a time."""
+    a = np.array([[0, 1, 0, 0], [-3e5, -20, 4e3, 0], [0, 0, -1e3, 5e4], [2e-3, 0, 0, -300.0]])
+    b, c = np.array([[0.0, 1.0], [3.0, 0.1], [0.0, 0.0], [1e-3, 0.0]]), np.array([[0.0, 1.0, 0.0, 2e2]])
+    s = 1j * np.array([[0.1, 3.0], [500.0, -2e5]])
+    found = proof._transfer(a, b, c, s)
+    for place in np.ndindex(s.shape):
+        np.testing.assert_allclose(found[place], c @ np.linalg.solve(s[place] * np.eye(4) - a, b), rtol=1e-9)
+
+
+def test_one_friction_is_tested_as_many_are():
+    """The scalar test against the matrix test: a second friction that acts on nothing changes neither."""
+    law = pid(0.53, 0.018)
+    loop = loop_of(law, slope=6250.0)
+    theta = np.array([0.02, 0.3, 1.5, 3.0])
+    one = proof._respond(loop, theta)
+    wide = np.zeros((*one.s.shape, 2, 2), dtype=complex)
+    wide[..., :1, :1] = one.mobility
+    wide[..., 1, 1] = 1.0  # moves itself alone
+    still = np.zeros((*one.s.shape, 1))
+    two = proof._Responses(
+        theta=theta, s=one.s, mobility=wide, command=np.concatenate([one.command, still], axis=-1),
+        sensed=np.concatenate([one.sensed, still], axis=-1), tail=one.tail, order=one.order,
+    )  # fmt: skip
+    for inverse in (1e-3, 0.1, 1.0):
+        found, expected = (proof._definiteness(at, lambda s: 1.0 + 1e-3 * s, inverse) for at in (one, two))
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_multiplier_tried_first_proves_no_more_than_all_of_them():
+    loop = loop_of(pid(0.53, 0.018), slope=6250.0)
+    best = proof.friction_margin(loop)
+    again = proof.friction_margin(loop, best.multiplier)
+    assert again.multiplier == best.multiplier
+    assert again.factor == pytest.approx(best.factor, rel=0.02)
+    assert proof.friction_margin(loop, least=2.0 * best.factor).factor == 0.0

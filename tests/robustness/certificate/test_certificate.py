@@ -360,6 +360,28 @@ def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
     assert again.friction == certificate.friction
 
 
+def test_friction_is_proved_over_draws_and_may_be_required(stand, thor):
+    """Viscous friction is in the sector: at every draw the loop with the least proved slope has stable eigenvalues."""
+    rubbing = thor.update(f_c=50.0)
+    controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25))
+    ranges = {"eta": (0.8, 1.1), "f_c": (20.0, 80.0)}
+    certificate = so.certify(controller, {"stand": stand}, rubbing, ranges=ranges, samples=20, min_friction_margin=1e4)
+    drawn = certificate.friction_draws["stand"]
+    assert (drawn.samples, drawn.proved) == (20, 20)
+    assert drawn.least_slope == pytest.approx(drawn.factor * drawn.parameters["f_c"] / rubbing["v_s"].value)
+    radius = thor["l"].value / (2 * np.pi * thor["N_p"].value)
+    for eta in (0.8, 1.1, drawn.parameters["eta"]):
+        viscous = thor.update(eta=eta, b_r=thor["b_r"].value + drawn.least_slope * radius**2)
+        assert np.max(np.abs(controller.close(stand, viscous).eigenvalues())) < 1.0
+    (row,) = [row for row in certificate.requirements if row.name == "min_friction_margin"]
+    assert row.met and row.sense == "≥" and row.value == min(drawn.least_slope, *certificate.friction["stand"].slopes)
+    again = type(certificate).from_dict(certificate.to_dict(), controller, {"stand": stand}, certificate.parameters)
+    assert again.friction_draws == certificate.friction_draws
+    asked = so.certify(controller, {"stand": stand}, rubbing, samples=5, min_friction_margin=1e9)
+    (broken,) = [row for row in asked.requirements if row.name == "min_friction_margin"]
+    assert not broken.met and not asked.passed
+
+
 def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
     rubbing = thor.update(f_c=5.0)
     controller = so.tune(

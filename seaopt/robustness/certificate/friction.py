@@ -1,0 +1,96 @@
+"""How steep a friction stability is proved for, at nominal parameters and over draws, for the certificate.
+
+At the nominal parameters every multiplier is tried. Over draws the one that served there is tried first, and the others
+only where it proves too little: a margin of a draw is then a lower bound of what could be proved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.formatting import format_values
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.robustness.uncertainty.draws import Uncertainty
+from seaopt.robustness.uncertainty.worst import place_values
+
+PROVED_DRAWS = 100  # at most so many are looked at
+
+
+@record
+class FrictionDraws:
+    """For how many draws stability is proved for every friction curve of their sector, and the least margin.
+
+    Parameters
+    ----------
+    samples, proved : int
+        Draws looked at, and those with a proof.
+    least_slope : float
+        The steepest friction that is proved, N s/m (N m s/rad), of the draw with the least; zero where one has no
+        proof, infinite where none is bounded.
+    factor : float
+        That slope over the draw's own; zero where there is no proof.
+    parameters : mapping
+        That draw: the first without a proof, if there is one.
+
+    """
+
+    samples: int
+    proved: int
+    least_slope: float
+    factor: float
+    parameters: dict[str, float]
+
+    def __str__(self) -> str:
+        head = f"over draws, it is proved for {self.proved} of {self.samples}"
+        where = f"at {format_values(self.parameters)}"
+        if self.proved < self.samples:
+            return f"{head}; the first without a proof is {where}"
+        if np.isinf(self.least_slope):
+            return f"{head}, however steep"
+        return f"{head}, the least up to a slope of {self.least_slope:.4g}, {self.factor:.3g} times its own, {where}"
+
+
+def prove_frictions(
+    controller: Controller, models: Mapping[str, Plant], params: ParameterSet
+) -> dict[str, FrictionMargin]:
+    """Return the friction margin of every plant that has friction."""
+    margins = {name: prove_friction(controller, model, params) for name, model in models.items()}
+    return {name: margin for name, margin in margins.items() if margin is not None}
+
+
+def prove_friction_draws(
+    controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, nominal: Mapping[str, FrictionMargin],
+    samples: int, rng: np.random.Generator,
+) -> dict[str, FrictionDraws]:  # fmt: skip
+    """Prove stability at draws, of the plants with a proof at the nominal parameters."""
+    count = min(samples, PROVED_DRAWS)
+    if not count or not any(margin.proved for margin in nominal.values()):
+        return {}
+    values = unknown.values(unknown.draw(count, rng))
+    draws = [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
+    return {
+        name: _prove_draws(controller, models[name], unknown.nominal, draws, margin.multiplier)
+        for name, margin in nominal.items()
+        if margin.proved
+    }
+
+
+def _prove_draws(
+    controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]], multiplier: str
+) -> FrictionDraws:
+    """Return how many draws of one plant have a proof, and the least margin."""
+    proved, slope, factor, place = 0, np.inf, np.inf, draws[0]
+    for draw in draws:
+        margin = prove_friction(controller, plant, place_values(plant, nominal, draw), multiplier, least=1.0)
+        proved += margin is None or margin.proved  # without friction there is nothing to prove
+        if margin is not None and min(margin.slopes) < slope:
+            slope, factor, place = min(margin.slopes), margin.factor, draw
+    used = {name: value for name, value in place.items() if name in place_values(plant, nominal, place)}
+    return FrictionDraws(samples=len(draws), proved=proved, least_slope=slope, factor=factor, parameters=used)
