@@ -41,21 +41,22 @@ def draw(rng: np.random.Generator) -> Case:
     """Draw a plant and a specification, some of which nothing can meet."""
 
     def maybe(chance, low, high):
-        return float(rng.uniform(low, high)) if rng.random() < chance else None
+        return float(rng.uniform(low, high)) if rng.random() < chance else False
 
     thor = so.plants.thor()
     spread = {"J": 0.8, "b_r": 1.0, "k": 0.8, "m_l": 0.5}
     values = {name: thor[name].value * np.exp(rng.uniform(-s, s)) for name, s in spread.items()}
     params = thor.update(**values, I_p=rng.uniform(0.2, 0.6))
     structure = str(rng.choice(["pd", "pid", "pid", "pid_dob"]))
-    noise = float(np.exp(rng.uniform(np.log(25), np.log(300)))) if rng.random() < 0.7 else None
+    noise = float(np.exp(rng.uniform(np.log(25), np.log(300)))) if rng.random() < 0.7 else False
     spec = so.ControllerSpec(
         structure=structure, bandwidth_hz=float(rng.uniform(15, 60)), delay_samples=int(rng.integers(0, 3)),
         sample_rate_hz=float(rng.choice([500.0, 1e3, 1e3, 2e3])), max_sensitivity=float(rng.uniform(1.45, 2.2)),
         max_complementary=maybe(0.6, 1.15, 1.6), max_reference_peak=maybe(0.6, 1.05, 1.5), max_noise_gain=noise,
         min_disk_margin=maybe(0.2, 0.6, 1.1), objective=str(rng.choice(["disturbance", "disturbance", "noise"])),
         reference_weights=str(rng.choice(["error", "error", "measurement"])),
-        notch=Notch() if structure == "pid" and rng.random() < 0.2 else None,
+        notch=Notch() if structure == "pid" and rng.random() < 0.2 else None, max_droop_db=False,
+        min_filter_samples=False,
     )  # fmt: skip
     return Case(spec=spec, params=params, swing=bool(rng.random() < 0.5))
 
@@ -146,7 +147,7 @@ class Judge:
 
         def top(curve, limit):
             nonlocal worst
-            if limit is not None:
+            if limit:
                 worst = np.maximum(worst, np.max(curve, axis=1) / limit)
 
         for row, p in enumerate(self.p):
@@ -154,7 +155,7 @@ class Judge:
             s = 1 / (1 + loop)
             top(np.abs(s), spec.max_sensitivity)
             top(np.abs(loop * s), spec.max_complementary)
-            top(np.abs(s - loop * s), None if spec.min_disk_margin is None else 2 / spec.min_disk_margin)
+            top(np.abs(s - loop * s), spec.min_disk_margin and 2 / spec.min_disk_margin)
             angle = np.unwrap(np.angle(1 + loop), axis=1)
             turned = np.minimum(turned, angle[:, -1] - angle[:, 0])
             if spec.objective == "disturbance":

@@ -157,5 +157,5 @@ def test_the_integrals_that_the_tuning_page_states_are_those_of_its_code(capsys)
     text = (DOCS / "tuning.md").read_text(encoding="utf-8")
     lines = [line for line in first.splitlines() if line.startswith(("import", "from", "stand"))]
     exec("\n".join(lines) + "\n" + second, {})
-    assert capsys.readouterr().out.split() == ["pid_dob", "0.96", "pid", "1.4"]
-    assert "is 0.96 with it and 1.40 without:" in text
+    assert capsys.readouterr().out.split() == ["pid_dob", "1.0", "pid", "1.53"]
+    assert "is 1.00\nwith it and 1.53 without;" in text

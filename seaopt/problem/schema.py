@@ -234,6 +234,9 @@ def _limit(name: str) -> Any:
     return Field(default=BY_NAME[name].default, description=BY_NAME[name].description)
 
 
+Level = Number | Literal[False] | None  # of a limit: false lifts it
+
+
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
@@ -246,12 +249,14 @@ class ControllerTable(_Strict):
     bandwidth_range_hz: tuple[Number, Number] = (15.0, 60.0)
     sample_rate_hz: Number = 1000.0
     delay_samples: Whole | None = None
-    max_sensitivity: Number | None = _limit("max_sensitivity")
-    max_complementary: Number | None = _limit("max_complementary")
-    min_disk_margin: Number | None = _limit("min_disk_margin")
-    max_reference_peak: Number | None = _limit("max_reference_peak")
-    max_noise_gain: Number | None = _limit("max_noise_gain")
-    min_sensitivity_bandwidth_hz: Number | None = _limit("min_sensitivity_bandwidth_hz")
+    max_sensitivity: Level = _limit("max_sensitivity")
+    max_complementary: Level = _limit("max_complementary")
+    min_disk_margin: Level = _limit("min_disk_margin")
+    max_reference_peak: Level = _limit("max_reference_peak")
+    max_droop_db: Level = _limit("max_droop_db")
+    max_noise_gain: Level = _limit("max_noise_gain")
+    min_filter_samples: Level = _limit("min_filter_samples")
+    min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")
     passive_band_hz: tuple[Number, Number] | None = _limit("passive_band_hz")
     objective: Literal["disturbance", "noise"] = "disturbance"
     robust_to: list[Name] = []

@@ -94,11 +94,9 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
         axes[0, 1].semilogx(f, 20 * np.log10(np.abs(loop.sensitivity(f))), **style)
         axes[1, 1].semilogx(f, 20 * np.log10(np.maximum(np.abs(loop.tracking(f)), 1e-6)), **style)
     spec = controller.spec
-    if spec.max_sensitivity is not None:
-        limit = 20 * np.log10(spec.max_sensitivity)
-        axes[0, 1].axhline(
-            limit, color="#444444", linestyle="-.", linewidth=0.9, label=f"Ms = {spec.max_sensitivity:g}"
-        )
+    ms = spec.level("max_sensitivity")
+    if ms is not None:
+        axes[0, 1].axhline(20 * np.log10(ms), color="#444444", linestyle="-.", linewidth=0.9, label=f"Ms = {ms:g}")
     axes[1, 1].axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9, label="-3 dB")
     axes[1, 1].axvline(spec.bandwidth_hz, color="#444444", linestyle="--", linewidth=0.9, label="bandwidth asked")
     axes[1, 1].set_ylim(bottom=-30)

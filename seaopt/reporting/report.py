@@ -122,7 +122,7 @@ def write_report(
         "report.html.jinja", title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller,
         certificate=certificate, figures=sections, verdict=verdict(fit, controller, certificate, verification),
         swinging=_swings(certificate), forces=_describe_forces(controller),
-        limited=[] if controller is None else list_design_figures(controller.spec, controller.achieved),
+        limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
         simulated=render_verification(verification, large, coupled, port, svgs),
     )  # fmt: skip
     return write_text(target, page)

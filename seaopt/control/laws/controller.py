@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes
-from seaopt.control.laws.limits import Limit
+from seaopt.control.laws.limits import Limit, MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver
-from seaopt.control.laws.verdict import list_broken_figures, list_design_figures
+from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, list_design_figures
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -74,9 +74,8 @@ class Controller:
         The disturbance observer of a pid_dob, which the law includes.
     blocked_by : tuple of str
         The limits that are broken, each with its figure.
-    largest_bandwidth_hz : float or None
-        Where it is not feasible: the largest bandwidth in the specification's range that keeps the limits, 0 if none
-        was found; None where none was looked for.
+    possible : PossibleBandwidths or None
+        Where it is not feasible: the bandwidths that keep the limits; None where none were looked for.
 
     """
 
@@ -94,7 +93,22 @@ class Controller:
     design: tuple[Plant, ParameterSet] | None = None
     observer: DisturbanceObserver | None = None
     blocked_by: tuple[str, ...] = ()
-    largest_bandwidth_hz: float | None = None
+    possible: PossibleBandwidths | None = None
+
+    @property
+    def design_loop(self) -> MeasuredLoop:
+        """The design plant's loop, as limits are judged on it."""
+        return MeasuredLoop(name="design plant", figures=self.achieved, filter_samples=self.filter_samples)
+
+    @property
+    def filter_samples(self) -> float:
+        """T_f in samples; infinite where nothing is differentiated."""
+        return self.gains["T_f"] / self.sample_time_s if self.gains["k_d"] else np.inf
+
+    @property
+    def largest_bandwidth_hz(self) -> float | None:
+        """The largest bandwidth that is possible where the one asked is not; None where none is known."""
+        return None if self.possible is None else self.possible.largest_hz
 
     @property
     def reference(self) -> TransferFunction:
@@ -108,33 +122,28 @@ class Controller:
 
     @property
     def explanation(self) -> str:
-        """One line: the limits that block, and the bandwidth that is possible; empty where every limit is met."""
+        """One line: the limits that block, and the bandwidths that are possible; empty where every limit is met."""
         if self.feasible:
             return ""
         blocked = " and ".join(self.blocked_by or self.active_constraints)
-        asked, low = self.spec.bandwidth_hz, self.spec.bandwidth_range_hz[0]
-        if self.largest_bandwidth_hz is None:
-            return f"{asked:g} Hz is blocked by {blocked}"
-        if self.largest_bandwidth_hz == 0.0:
-            remedy = f"none is known down to {low:g} Hz; above was not tried: look with `seaopt tune --sweep`"
-        else:
-            remedy = f"with these limits {self.largest_bandwidth_hz:.4g} Hz is possible"
-        return f"{asked:g} Hz is blocked by {blocked}; {remedy}"
+        remedy = "" if self.possible is None else f"; {self.possible}"
+        return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}{remedy}"
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
+        lifted = tuple(f"{name} = false: this limit is not imposed" for name in self.spec.lifted)
         if self.design is None:
-            return ()
+            return lifted
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
         vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
-        return (*vague, *actuation_notes(plant, self.command), *self._noise_notes())
+        return (*lifted, *vague, *actuation_notes(plant, self.command), *self._noise_notes())
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
         k_d, T_f = self.gains["k_d"], self.gains["T_f"]
-        if self.spec.max_noise_gain is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
+        if self.spec.level("max_noise_gain") is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
             return ()
         return (
             f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 N of noise on "
@@ -203,6 +212,7 @@ class Controller:
             "observer": self._observer_dict(),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
+            "possible": None if self.possible is None else asdict(self.possible),
             "notes": list(self.notes),
         }
 
@@ -241,10 +251,11 @@ class Controller:
         sampled = sample(sliding, params, spec.measured, gain, stored["sample_time_s"], stored["delay_samples"])
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
         check_achieved(content.get("achieved"), _list_achieved(achieved))
-        broken = list_broken_figures(stored["spec"], achieved) if stored["feasible"] else []
-        if broken:
-            stored |= {"feasible": False, "active_constraints": tuple(broken), "blocked_by": tuple(broken)}
-        return cls(**stored, achieved=achieved, design=(plant, params))
+        controller = cls(**stored, achieved=achieved, design=(plant, params))
+        broken = tuple(list_broken_figures(controller.spec, controller.design_loop) if controller.feasible else ())
+        if not broken:
+            return controller
+        return replace(controller, feasible=False, active_constraints=broken, blocked_by=broken)
 
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec
@@ -325,7 +336,7 @@ class Controller:
         a = self.achieved
         limited = [
             (limit.label, format_figure(value, limit.unit), _format_allowed(limit, allowed))
-            for limit, value, allowed in list_design_figures(self.spec, a)
+            for limit, value, allowed in list_design_figures(self.spec, self.design_loop)
         ]
         return [
             *limited,

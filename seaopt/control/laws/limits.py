@@ -1,8 +1,8 @@
 r"""The limits that a controller can be asked to keep, one row each, for tuner, certificate, problem file and report.
 
 A limit has a *figure* of one closed loop, and is kept where that figure is at most, at least or equal to what the
-specification allows. While tuning, most limits are also a *curve*: with :math:`L = P C_y`, at every frequency up to
-`until_hz`,
+specification allows. While tuning, most limits are also a *curve*: with :math:`L = P C_y`, at every frequency from
+`from_hz` to `until_hz`,
 
 .. math:: |X| \le m\,|1 + L| \quad (\text{or} \ge), \qquad X \in \{1,\, L,\, 1 - L,\, C_y,\, P C_r\},
 
@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Literal
 
-from seaopt.control.loops.loop import STABLE, LoopFigures
+from seaopt.control.loops.loop import DROOP_BAND, STABLE, LoopFigures
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.records import record
 
@@ -27,6 +27,8 @@ LIMIT_ROUNDING = 1e-6  # by which a figure that lies on its limit may be beyond 
 BANDWIDTH_TOLERANCE = 0.005
 PASSIVE_ROUNDING = 1e-9  # Re Z/abs(Z) that is still called zero
 PLACED_BELOW = 0.97  # of the bandwidth: up to here abs(F/F_ref) must be above -3 dB, which it reaches at the bandwidth
+FALLEN_ABOVE = 1.03  # of the bandwidth: from here it must be below
+SHOULDER = 3.0  # of the bandwidth: up to here it must not come back
 
 Sense = Literal["at most", "at least", "equal to"]
 Scope = Literal["every plant", "design plant"]
@@ -54,11 +56,23 @@ class PortFigures:
 
 @record
 class MeasuredLoop:
-    """One plant's loop as limits are judged on it; `port` is the design plant's, where a passive band is asked for."""
+    """One plant's loop as limits are judged on it.
+
+    Parameters
+    ----------
+    name, figures
+        Of the plant, and its loop's.
+    port : PortFigures, optional
+        The design plant's, where a passive band is asked for.
+    filter_samples : float
+        Time constant of the derivative's filter in samples; infinite where nothing is differentiated.
+
+    """
 
     name: str
     figures: LoopFigures
     port: PortFigures | None = None
+    filter_samples: float = math.inf
 
 
 @record(eq=False)
@@ -71,10 +85,13 @@ class LimitCurve:
         X.
     level : callable
         m, of what the specification allows; that itself if left out.
-    until_hz : callable, optional
-        Where it ends, of what is allowed and of the bandwidth asked; at every frequency if left out.
+    from_hz, until_hz : callable, optional
+        Where it begins and ends, of what is allowed and of the bandwidth asked; at every frequency if left out.
     floor : bool
         abs(X) is to be above, not below.
+    fall : float
+        The level falls with the frequency to this power, from the bandwidth asked, so that the tuner leaves no curve
+        lying along it.
     symbol : str
         Of abs(X)/abs(1 + L), where a message states this rather than the figure.
 
@@ -82,8 +99,10 @@ class LimitCurve:
 
     of: Literal["1", "L", "1 - L", "C_y", "P C_r"]
     level: Callable[[float], float] = float
+    from_hz: Callable[[float, float], float] | None = None
     until_hz: Callable[[float, float], float] | None = None
     floor: bool = False
+    fall: float = 0.0
     symbol: str = ""
 
     def numerator(self, p: Any, c_y: Any, c_r: Any, open_loop: Any) -> Any:
@@ -126,7 +145,8 @@ class Limit:
     meaning, remedy : str
         What it means, and what to do where it is broken.
     default : float, optional
-        What is allowed where the specification leaves it out; None: it is then not imposed.
+        What is allowed where the specification leaves it out (None); without one it is then not imposed. False in the
+        specification lifts a limit.
     bandwidth_divisor : float, optional
         The default is bandwidth_hz over this instead.
     stuck_too : bool
@@ -191,6 +211,11 @@ class Limit:
         """What it means, whose figure it is, what is allowed where it is left out, and what to do where broken."""
         return f"{self.meaning} ({self.scope}; left out: {self.default_text}). Where it is broken: {self.remedy}."
 
+    @property
+    def is_default(self) -> bool:
+        """Whether it is imposed where the specification leaves it out."""
+        return self.default is not None or self.bandwidth_divisor is not None
+
     def in_range(self, asked: float) -> bool:
         """Tell whether a loop could keep what is asked."""
         return (self.above is None or asked > self.above) and (self.below is None or asked < self.below)
@@ -224,13 +249,13 @@ LIMITS = (
     ),
     Limit(
         name="max_sensitivity", label="Ms", figure=lambda loop: loop.figures.ms, sense="at most", scope="every plant",
-        above=1.0, curve=LimitCurve(of="1"),
+        above=1.0, default=1.7, curve=LimitCurve(of="1"),
         meaning="Ms, peak of |S|: 1/Ms is the distance of the loop gain from -1",
         remedy="lower the bandwidth, allow more noise gain, or sample faster",
     ),
     Limit(
         name="max_complementary", label="Mt", figure=lambda loop: loop.figures.mt, sense="at most",
-        scope="every plant", curve=LimitCurve(of="L"),
+        scope="every plant", default=1.3, curve=LimitCurve(of="L"),
         meaning="Mt, peak of |L/(1 + L)|: 1/Mt is the relative error of the plant that the loop tolerates",
         remedy="lower the bandwidth, or raise max_sensitivity with it",
     ),
@@ -242,10 +267,20 @@ LIMITS = (
     ),
     Limit(
         name="max_reference_peak", label="reference peak", figure=lambda loop: loop.figures.reference_peak,
-        sense="at most", scope="design plant", above=1.0, stuck_too=True,
+        sense="at most", scope="design plant", above=1.0, default=1.3, stuck_too=True,
         curve=LimitCurve(of="P C_r"),
         meaning="peak of |F/F_ref| over its static value",
         remedy="use a pid_dob, leave reference_weights tuned, or lower the bandwidth",
+    ),
+    Limit(
+        name="max_droop_db", label="droop", figure=lambda loop: loop.figures.droop_db, sense="at most",
+        scope="design plant", unit="dB", default=1.0, below=3.0,
+        curve=LimitCurve(
+            of="P C_r", level=lambda droop_db: 10.0 ** (-droop_db / 20.0),
+            until_hz=lambda _, bandwidth_hz: bandwidth_hz * DROOP_BAND, floor=True,
+        ),
+        meaning="how far |F/F_ref| falls below its static value up to a third of the bandwidth",
+        remedy="leave reference_weights tuned, allow more noise gain, or ask for another bandwidth",
     ),
     Limit(
         name="max_noise_gain", label="noise gain", figure=lambda loop: loop.figures.noise_gain, sense="at most",
@@ -272,6 +307,24 @@ LIMITS = (
         ),
         meaning="lowest frequency at which |F/F_ref| is 3 dB below its value at 0 Hz, met to 0.5 %",
         remedy="ask for the largest bandwidth that the result names",
+    ),
+    Limit(
+        name="shoulder_hz", has_field=False, label="|F/F_ref| again above -3 dB at",
+        figure=lambda loop: math.inf if loop.figures.return_hz is None else loop.figures.return_hz,
+        sense="at least", scope="design plant", unit="Hz", bandwidth_divisor=1.0 / SHOULDER,
+        tolerance=BANDWIDTH_TOLERANCE, reserve="curve",
+        curve=LimitCurve(
+            of="P C_r", level=lambda _: HALF_POWER, from_hz=lambda _, bandwidth_hz: FALLEN_ABOVE * bandwidth_hz,
+            until_hz=lambda allowed, _: allowed, fall=0.25,
+        ),
+        meaning="where |F/F_ref| comes back above -3 dB, three bandwidths or more: neither dip nor shoulder makes one",
+        remedy="ask for the bandwidths that the result names",
+    ),
+    Limit(
+        name="min_filter_samples", label="derivative's filter", figure=lambda loop: loop.filter_samples,
+        sense="at least", scope="design plant", unit="samples", default=1.0, reserve="none",
+        meaning="T_f in samples: a faster filter lets the derivative amplify what lies between two samples",
+        remedy="tune again",
     ),
     Limit(
         name="passive_band_hz", label="least Re Z/|Z| in the passive band", sense="at least",

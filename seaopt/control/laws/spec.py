@@ -11,15 +11,17 @@ from seaopt.control.laws.structures import REFERENCE_WEIGHTS, STRUCTURES, Notch,
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
 
+Level = float | Literal[False] | None  # of a limit: None is its default, False lifts it
 LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
-OPTIONAL = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz", "current_limit_A", "step_N")
+LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
+OPTIONAL = (*LIFTABLE, "current_limit_A", "step_N")
 MAX_DELAY_SAMPLES = 1000
 LOWEST_HZ = 1e-3  # limits are kept from here
 
 
 @record
 class ControllerSpec:
-    """A bandwidth and the limits of `seaopt.control.laws.limits`; a limit left out (None) is not imposed.
+    """A bandwidth and the limits of `seaopt.control.laws.limits`: left out, each has its default; False lifts one.
 
     Parameters
     ----------
@@ -47,8 +49,12 @@ class ControllerSpec:
         Symmetric disk margin, below 2, on every plant.
     max_reference_peak : float, optional
         Peak of abs(F/F_ref) over its static value, design plant.
+    max_droop_db : float, optional
+        How far abs(F/F_ref) falls below its static value up to a third of the bandwidth, design plant.
     max_noise_gain : float, optional
         Peak of abs(F_m / noise on F), N/N, design plant.
+    min_filter_samples : float, optional
+        T_f in samples.
     min_sensitivity_bandwidth_hz : float, optional
         abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.
     passive_band_hz : (low, high), optional
@@ -79,12 +85,14 @@ class ControllerSpec:
     reference_weights: ReferenceWeights = "tuned"
     sample_rate_hz: float = 1000.0
     delay_samples: int | None = None
-    max_sensitivity: float | None = BY_NAME["max_sensitivity"].default
-    max_complementary: float | None = BY_NAME["max_complementary"].default
-    min_disk_margin: float | None = BY_NAME["min_disk_margin"].default
-    max_reference_peak: float | None = BY_NAME["max_reference_peak"].default
-    max_noise_gain: float | None = BY_NAME["max_noise_gain"].default
-    min_sensitivity_bandwidth_hz: float | None = None
+    max_sensitivity: Level = BY_NAME["max_sensitivity"].default
+    max_complementary: Level = BY_NAME["max_complementary"].default
+    min_disk_margin: Level = BY_NAME["min_disk_margin"].default
+    max_reference_peak: Level = BY_NAME["max_reference_peak"].default
+    max_droop_db: Level = BY_NAME["max_droop_db"].default
+    max_noise_gain: Level = BY_NAME["max_noise_gain"].default
+    min_filter_samples: Level = BY_NAME["min_filter_samples"].default
+    min_sensitivity_bandwidth_hz: Level = None
     passive_band_hz: tuple[float, float] | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     current_limit_A: float | None = None
@@ -128,7 +136,7 @@ class ControllerSpec:
             )
         for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *OPTIONAL):
             value = getattr(self, name)
-            if value is None and name in OPTIONAL:
+            if (value is None and name in OPTIONAL) or (value is False and name in LIFTABLE):
                 continue
             if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
                 raise ControlError(f"{name} = {value!r} is not a number; give one")
@@ -136,13 +144,13 @@ class ControllerSpec:
     def _check_limits(self) -> None:
         for limit in LEVELS:
             value = getattr(self, limit.name)
-            if value is not None and not limit.in_range(value):
+            if value is not None and value is not False and not limit.in_range(value):
                 upper = "" if limit.below is None else f" and less than {limit.below:g}"
                 raise ControlError(
                     f"{limit.name} = {value:g} can be met by no loop; give more than {limit.above:g}{upper}"
                 )
         wanted = self.min_sensitivity_bandwidth_hz
-        if wanted is not None and not 0.0 <= wanted < self.bandwidth_hz:
+        if wanted is not None and wanted is not False and not 0.0 <= wanted < self.bandwidth_hz:
             raise ControlError(
                 f"min_sensitivity_bandwidth_hz = {wanted:g} is not between 0 and bandwidth_hz = "
                 f"{self.bandwidth_hz:g}; lower it"
@@ -193,15 +201,28 @@ class ControllerSpec:
 
     def allowed(self, limit: Limit) -> float | None:
         """Return the value that a limit allows; None where it is not imposed."""
-        value = getattr(self, limit.name) if limit.has_field else limit.allowed
-        if value is None:
-            return None if limit.bandwidth_divisor is None else self.bandwidth_hz / limit.bandwidth_divisor
-        return value if limit.allowed is None else limit.allowed
+        value = getattr(self, limit.name) if limit.has_field else None
+        if value is False or (limit.allowed is not None and limit.has_field and value is None):
+            return None
+        if limit.allowed is not None:
+            return limit.allowed
+        if value is not None:
+            return value
+        return limit.default if limit.bandwidth_divisor is None else self.bandwidth_hz / limit.bandwidth_divisor
+
+    def level(self, name: str) -> float | None:
+        """Return the value that the limit of a name allows; None where it is not imposed."""
+        return self.allowed(BY_NAME[name])
+
+    @property
+    def lifted(self) -> tuple[str, ...]:
+        """The limits with a default that are not imposed."""
+        return tuple(name for name in LIFTABLE if getattr(self, name) is False and BY_NAME[name].is_default)
 
     @property
     def sensitivity_bandwidth_limit_hz(self) -> float:
         """The smallest allowed sensitivity bandwidth: as given, or bandwidth_hz/5."""
-        return float(self.allowed(BY_NAME["min_sensitivity_bandwidth_hz"]) or 0.0)
+        return self.level("min_sensitivity_bandwidth_hz") or 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""

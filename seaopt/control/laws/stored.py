@@ -11,6 +11,7 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
+from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
@@ -100,6 +101,15 @@ class StoredSpec(ResultTable):
     robust_to: list[str] = []
 
 
+class StoredPossible(ResultTable):
+    """The bandwidths that keep the limits."""
+
+    nearest_hz: tuple[Finite, ...]
+    largest_hz: Finite | None
+    closest_hz: Finite
+    missed_by: Finite
+
+
 class StoredController(ResultTable):
     """A controller.json."""
 
@@ -115,7 +125,7 @@ class StoredController(ResultTable):
     feasible: Flag
     active_constraints: list[str]
     blocked_by: list[str] = []
-    largest_bandwidth_hz: Finite | None = None
+    possible: StoredPossible | None = None
     observer: StoredObserver | None = None
 
 
@@ -150,7 +160,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "delay_samples": table.delay_samples, "command": Command(**table.command.model_dump()), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
         "observer": observer, "blocked_by": tuple(table.blocked_by),
-        "largest_bandwidth_hz": table.largest_bandwidth_hz,
+        "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from seaopt.control.laws.limits import FIELDS, LIMITS, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.loop import Loop, LoopFigures
+from seaopt.control.loops.loop import Loop
 from seaopt.records import record
 
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
@@ -31,6 +31,34 @@ class Verdict:
         """The limit's name, with the plant where it holds for several."""
         named = self.limit.scope == "every plant" or self.stuck
         return f"{self.limit.name} ({self.plant})" if named else self.limit.name
+
+
+@record
+class PossibleBandwidths:
+    """The bandwidths in the specification's range at which the tuner keeps all limits.
+
+    Parameters
+    ----------
+    nearest_hz : tuple of float
+        Next to the one asked, below and above it; empty if none was found.
+    largest_hz : float or None
+        The largest.
+    closest_hz, missed_by : float
+        Where the limits are missed least, and by which share; zero where they are kept.
+
+    """
+
+    nearest_hz: tuple[float, ...] = ()
+    largest_hz: float | None = None
+    closest_hz: float
+    missed_by: float
+
+    def __str__(self) -> str:
+        if self.largest_hz is None:
+            return f"none is known that keeps them; {self.closest_hz:.4g} Hz misses them least, by {self.missed_by:.1%}"
+        nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)
+        most = "" if self.largest_hz in self.nearest_hz else f", {self.largest_hz:.4g} Hz at most"
+        return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
 
 
 def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
@@ -64,10 +92,9 @@ def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
     return [verdict.label for verdict in verdicts if not verdict.met]
 
 
-def list_broken_figures(spec: ControllerSpec, figures: LoopFigures) -> list[str]:
-    """Return the limits that the design plant's figures break; a passive band is not among them."""
-    verdicts = judge_all(replace(spec, passive_band_hz=None), [MeasuredLoop(name="design plant", figures=figures)])
-    return list_broken(verdicts)
+def list_broken_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[str]:
+    """Return the limits that the design plant's loop breaks; a passive band is not among them."""
+    return list_broken(judge_all(replace(spec, passive_band_hz=None), [design]))
 
 
 def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
@@ -85,21 +112,20 @@ def explain_broken(spec: ControllerSpec, verdicts: Sequence[Verdict], design: Me
     return [_explain(spec, verdict, design, loop) for verdict in verdicts if not verdict.met]
 
 
-def list_design_figures(spec: ControllerSpec, figures: LoopFigures) -> list[tuple[Limit, float | None, float | None]]:
+def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[tuple[Limit, float | None, float | None]]:
     """Return for tables each limit of one loop's figures, the figure, and what is allowed; None where there is none."""
-    loop = MeasuredLoop(name="design", figures=figures)
     rows: list[tuple[Limit, float | None, float | None]] = []
     for limit in FIELDS:
         if limit.condition is None:  # a figure of the loop alone
-            value = limit.figure(loop)
-            reached = limit.sense != "equal to" or np.isfinite(value)
+            value = limit.figure(design)
+            reached = limit.sense == "at most" or np.isfinite(value)
             rows.append((limit, value if reached else None, spec.allowed(limit)))
     return rows
 
 
 def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:
     limit, port = verdict.limit, design.port
-    if not limit.has_field:
+    if limit.name == "stability":
         return verdict.label
     if limit.curve is not None and limit.curve.symbol:
         return f"{limit.name}, {_reached(spec, verdict, loop)}"

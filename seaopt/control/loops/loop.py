@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes
+from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes, find_least
 from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
 
 GRID_LOWEST_HZ = 1e-3
+DROOP_BAND = 1.0 / 3.0  # of the bandwidth
 # A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
 # nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
 # takes longer than 11 days at 1 kHz.
@@ -48,6 +49,10 @@ class LoopFigures:
         Where abs(S) peaks.
     reference_peak : float
         Peak of abs(F/F_ref) over its static value.
+    droop_db : float
+        How far abs(F/F_ref) falls below its static value up to a third of the bandwidth.
+    return_hz : float or None
+        Lowest frequency above the bandwidth at which abs(F/F_ref) comes back above -3 dB.
     gain_margin_db : float or None
         Smallest change of gain, up or down, that makes the loop unstable; None: no change does.
     phase_margin_deg, delay_margin_s : float or None
@@ -69,6 +74,8 @@ class LoopFigures:
     mt: float
     ms_hz: float
     reference_peak: float
+    droop_db: float
+    return_hz: float | None
     gain_margin_db: float | None
     phase_margin_deg: float | None
     delay_margin_s: float | None
@@ -133,12 +140,14 @@ class Loop:
             return LoopFigures(
                 stable=False, spectral_radius=radius, bandwidth_hz=None, tracking_band_hz=None, crossover_hz=None,
                 sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
+                droop_db=np.inf, return_hz=None,
                 gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0, disk_margin=0.0, noise_gain=np.inf,
             )  # fmt: skip
         extremes = find_extremes(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
         (ms, mt, skew, noise, reference), ms_at = extremes.peaks, extremes.at[0]
         crossovers, slow, below = extremes.crossovers, extremes.sensitivity_edges, extremes.bandwidth_edges
+        least = find_least(system, TRACKING, DROOP_BAND * (float(below[0]) if below.size else np.pi))
         quiet = abs(extremes.ends[0, 0]) < HALF_POWER
         band = _tracking_band(system, extremes.band_edges)
         return LoopFigures(
@@ -152,6 +161,8 @@ class Loop:
             mt=float(mt),
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / extremes.static if extremes.static else np.inf,
+            droop_db=max(0.0, -20.0 * float(np.log10(least / extremes.static))) if least > 0.0 else np.inf,
+            return_hz=float(below[1]) / per_hz if below.size > 1 else None,
             gain_margin_db=_least(extremes.gains_db),
             phase_margin_deg=_least(extremes.lags_deg),
             delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),

@@ -118,6 +118,36 @@ def find_extremes(system: ClosedLoop) -> Extremes:
     )  # fmt: skip
 
 
+def find_least(system: ClosedLoop, curve: int, until: float) -> float:
+    """Return the least magnitude of a curve from 0 to an angle, to a ten-millionth.
+
+    From the least of some angles the level is lowered to the least on its own level set's arcs until none is below.
+    """
+    modes = np.abs(np.angle(system.poles))
+    theta = np.concatenate([until * COARSE_ANGLES / np.pi, modes[modes < until]])
+    least = float(np.min(np.abs(system.curves(theta)[curve])))
+    for _ in range(MAX_PROOF_ROUNDS):
+        if least <= SMALLEST_FACTOR:
+            break
+        (edges,) = find_arcs([system.modulus(curve, least * (1.0 - PROOF))])
+        edges = np.append(edges[edges < until], until)
+        middle = 0.5 * (edges[:-1] + edges[1:])
+        values = np.abs(system.curves(middle)[curve])
+        if not values.size or np.min(values) >= least * (1.0 - PROOF):
+            break
+        low = edges[:-1][values < least]
+        high = edges[1:][values < least]
+
+        def fall(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
+            return system.slopes(theta)[curve]
+
+        at_low, at_high = fall(low, np.arange(low.size)), fall(high, np.arange(low.size))
+        inside = (at_low < 0.0) & (at_high > 0.0)
+        bottom = find_zeros(fall, low[inside], high[inside], at_low[inside], at_high[inside], 1e-8)
+        least = float(np.min(np.concatenate([values, np.abs(system.curves(bottom)[curve])])))
+    return least
+
+
 def find_crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return where abs(L) = 1, and the phase of -L there (rad); the loop need not be stable."""
 

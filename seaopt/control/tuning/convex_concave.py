@@ -1,7 +1,8 @@
 r"""Improve a law's gains by successive quadratic programs, the convex-concave procedure, for the tuner's second step.
 
 At fixed filters C_r and C_y, and with them every :math:`L_m = P_m C_y`, are affine in the gains
-:math:`\theta = (k_p, k_i, k_d)`. At the last iterate let :math:`\alpha_m = \arg(1 + L_m)`. Then
+:math:`\theta = (k_p, k_i, k_d, w_r, w_c)`, the last two the weights of the reference. At the last iterate let
+:math:`\alpha_m = \arg(1 + L_m)`. Then
 
 .. math:: |1 + L_m(\theta)| \ge \rho_m(\theta) = \mathrm{Re}\, e^{-j\alpha_m} (1 + L_m(\theta)),
 
@@ -34,7 +35,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, choose_prominent
+from seaopt.control.tuning.optimisation_problem import (
+    CURVES,
+    GAINS,
+    K_D,
+    K_P,
+    PASSIVE,
+    Grid,
+    LawNumbers,
+    Task,
+    choose_prominent,
+)
 from seaopt.records import record
 
 MOST_PROGRAMS = 8
@@ -49,21 +60,21 @@ class _LinearLimits:
     """Rows value + slope dtheta - slack <= 1, gathered one kind at a time."""
 
     value: list[Float[np.ndarray, " n"]] = field(default_factory=list)
-    slope: list[Float[np.ndarray, "n 3"]] = field(default_factory=list)
+    slope: list[Float[np.ndarray, "n 5"]] = field(default_factory=list)
 
-    def add(self, value: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n 3"]) -> None:
+    def add(self, value: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n 5"]) -> None:
         self.value.append(value)
         self.slope.append(slope)
 
 
 @record(eq=False)
 class _Affine:
-    """C_y and C_r at the iterate, and their derivatives by the gains, shape (3, m)."""
+    """C_y and C_r at the iterate, and their derivatives by the gains, shape (5, m)."""
 
     c_y: Complex[np.ndarray, " m"]
     c_r: Complex[np.ndarray, " m"]
-    by_y: Complex[np.ndarray, "3 m"]
-    by_r: Complex[np.ndarray, "3 m"]
+    by_y: Complex[np.ndarray, "5 m"]
+    by_r: Complex[np.ndarray, "5 m"]
 
 
 def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAMS) -> tuple[float, LawNumbers]:
@@ -75,27 +86,28 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
         What is to be tuned.
     grid : Grid
         Frequencies that the limits are looked at on.
-    start : array, shape (8,)
+    start : array, shape (10,)
         Stable.
     steps : int
         Programs solved at most.
 
     """
     x, radius = start, FIRST_GAIN_RADIUS
-    scale = np.maximum(np.abs(start[:3]), _choose_least_gains(task, grid))
+    least = _choose_least_gains(task, grid)
+    scale = _scale_gains(task, start, least)
     merit = _measure_merit(task, grid, x)
     for _ in range(steps):
         step = _solve_step(task, grid, x, radius * scale)
         if step is None:
             break
         trial = x.copy()
-        trial[:3] += step
+        trial[GAINS] += step
         trial = task.tidy(trial)
         trial_merit = _measure_merit(task, grid, trial)
         if trial_merit < merit and task.is_stable(trial):
             small = merit - trial_merit < 1e-3
             x, merit, radius = trial, trial_merit, min(1.5 * radius, 1.0)
-            scale = np.maximum(np.abs(x[:3]), 0.1 * scale)
+            scale = _scale_gains(task, x, 0.1 * scale)
             if small:
                 break
         else:
@@ -105,36 +117,37 @@ def improve(task: Task, grid: Grid, start: LawNumbers, steps: int = MOST_PROGRAM
     return merit, x
 
 
-def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " 3"]:
+def _choose_least_gains(task: Task, grid: Grid) -> Float[np.ndarray, " 5"]:
     """Return gains that make a difference: a tenth of the inverse plant's at the bandwidth."""
     w_b = 2 * np.pi * task.spec.bandwidth_hz
     inverse = 1.0 / abs(np.interp(task.spec.bandwidth_hz, grid.f, np.abs(grid.p[0])))
-    return 0.1 * inverse * np.array([1.0, 0.1 * w_b, 1.0 / w_b])
+    return 0.1 * inverse * np.array([1.0, 0.1 * w_b, 1.0 / w_b, 1.0, 1.0 / w_b])
+
+
+def _scale_gains(task: Task, x: LawNumbers, least: Float[np.ndarray, " 5"]) -> Float[np.ndarray, " 5"]:
+    """Return the size that a change of each gain is compared with: a weight's is that of what it weights."""
+    return np.maximum([*np.abs(x[: K_D + 1]), task.k_ff + x[K_P], x[K_D]], least)
 
 
 def _measure_merit(task: Task, grid: Grid, x: LawNumbers) -> float:
     """Return the logarithm of the objective and the price of the worst usage."""
     usage = task.usage(grid, x)
     worst = max(float(np.max(curve)) for curve in usage.values())
-    worst = max(worst, 1.0 + abs(task.miss(grid, x)), _measure_missing_integral(task, x) + 1.0)
+    worst = max(worst, 1.0 + abs(task.miss(grid, x)))
     return float(np.log(task.objective(grid, x))) + USAGE_PRICE * max(0.0, worst - 1.0)
 
 
-def _measure_missing_integral(task: Task, x: LawNumbers) -> float:
-    return task.least_rate * (1 + x[0]) - x[1]
-
-
-def _linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
+def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
+    """Return the law on a grid with its derivatives by the gains."""
     series, integral, rate, _ = task.terms(grid, x)
     c_r, c_y = task.law(grid, x)
-    by_y = series * np.array([np.ones_like(grid.q), integral, rate])
-    by_r = by_y.copy()
-    if task.spec.reference_weights == "measurement":
-        by_r[2] = 0.0
+    one, none = np.ones_like(grid.q), np.zeros_like(grid.q)
+    by_y = series * np.array([one, integral, rate, none, none])
+    by_r = series * np.array([one, integral, rate, -one, -rate])
     return _Affine(c_y=c_y, c_r=c_r, by_y=by_y, by_r=by_r)
 
 
-def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "3 n"]) -> Float[np.ndarray, "n 3"]:
+def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "5 n"]) -> Float[np.ndarray, "n 5"]:
     """Return the derivative of abs(value): the part of `by` along it."""
     size = np.maximum(np.abs(value), 1e-300)
     return np.real(np.conj(value) / size * by).T
@@ -167,7 +180,6 @@ def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _L
         turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
         rows.add(used, -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * size[:, None]))
     _add_bandwidth(task, grid, x, law, rows)
-    rows.add(np.array([1.0 + _measure_missing_integral(task, x)]), np.array([[task.least_rate, -1.0, 0.0]]))
     return rows
 
 
@@ -184,7 +196,7 @@ def _add_bandwidth(task: Task, grid: Grid, x: LawNumbers, law: _Affine, rows: _L
 
 def _expand_objective(
     task: Task, grid: Grid, x: LawNumbers, law: _Affine
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+) -> tuple[Float[np.ndarray, "5 5"], Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
     if task.spec.objective == "noise":
         used = np.abs(law.c_y / (1.0 + grid.p[0] * law.c_y))[None]
@@ -194,7 +206,7 @@ def _expand_objective(
             one, grid.p[0, index] * column
         )
         size = np.max(used)
-        return np.zeros((3, 3)), used / size, slope / np.abs(one)[:, None] / size
+        return np.zeros((5, 5)), used / size, slope / np.abs(one)[:, None] / size
     w = task.weights(grid.f)
     inside = w > 0.0
     one = 1.0 + grid.p[:, inside] * law.c_y[inside]
@@ -208,30 +220,33 @@ def _expand_objective(
 
 
 def _solve_step(
-    task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " 3"] | None:
+    task: Task, grid: Grid, x: LawNumbers, reach: Float[np.ndarray, " 5"]
+) -> Float[np.ndarray, " 5"] | None:
     """Return the change of the gains that the quadratic program takes; None if it has no answer."""
-    law = _linearise_law(task, grid, x)
+    law = linearise_law(task, grid, x)
     rows = _linearise_limits(task, grid, x, law)
     curvature, values, slopes = _expand_objective(task, grid, x, law)
-    low, high = (ends[:3] for ends in task.bounds())
+    low, high = (ends[GAINS] for ends in task.bounds(x))
+    linear, least, largest = task.linear_limits(x)
     # Variables: the gains' changes in units of `reach`, the objective, the slack.
     value, slope = np.concatenate(rows.value), np.concatenate(rows.slope) * reach
-    n = value.size
-    matrix = np.zeros((n + values.size + 4, 5))
-    matrix[:n, :3], matrix[:n, 4] = slope, -1.0
-    matrix[n : n + values.size, :3], matrix[n : n + values.size, 3] = slopes * reach, -1.0
-    matrix[-4:-1, :3], matrix[-1, 4] = np.eye(3), 1.0
-    upper = np.concatenate([1.0 - value, -values, np.minimum(1.0, (high - x[:3]) / reach), [np.inf]])
+    rows_of = [
+        np.column_stack([slope, np.zeros(value.size), -np.ones(value.size)]),
+        np.column_stack([slopes * reach, -np.ones(values.size), np.zeros(values.size)]),
+        np.column_stack([linear * reach, np.zeros((3, 2))]),
+        np.column_stack([np.eye(5), np.zeros((5, 2))]),
+        np.eye(7)[-1:],
+    ]
+    matrix, now = np.concatenate(rows_of), linear @ x[GAINS]
+    upper = np.concatenate([1.0 - value, -values, largest - now, np.minimum(1.0, (high - x[GAINS]) / reach), [np.inf]])
     lower = np.full(upper.size, -np.inf)
-    lower[-4:-1], lower[-1] = np.maximum(-1.0, (low - x[:3]) / reach), 0.0
+    lower[-9:] = [*(least - now), *np.maximum(-1.0, (low - x[GAINS]) / reach), 0.0]
     size = np.maximum(1.0, np.max(np.abs(matrix), axis=1))
-    quadratic = np.zeros((5, 5))
-    quadratic[:3, :3] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(3)
-    answer = solve_qp(
-        quadratic, np.array([0.0, 0.0, 0.0, 1.0, USAGE_PRICE]), matrix / size[:, None], lower / size, upper / size
-    )
-    return None if answer is None else answer[:3] * reach
+    quadratic = np.zeros((7, 7))
+    quadratic[GAINS, GAINS] = curvature * np.outer(reach, reach) + 1e-4 * np.eye(5)
+    cost = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, USAGE_PRICE])
+    answer = solve_qp(quadratic, cost, matrix / size[:, None], lower / size, upper / size)
+    return None if answer is None else answer[GAINS] * reach
 
 
 def solve_qp(

@@ -81,7 +81,7 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
         It does; the message says what the delay allows.
 
     """
-    wanted, ms = spec.sensitivity_bandwidth_limit_hz, spec.max_sensitivity
+    wanted, ms = spec.sensitivity_bandwidth_limit_hz, spec.level("max_sensitivity")
     late = plant.delay_samples + (plant.d == 0.0)
     if ms is None or wanted <= 0.0 or late < 1 or sensitivity_possible(wanted, ms, spec.sample_time_s, late):
         return

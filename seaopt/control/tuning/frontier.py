@@ -12,7 +12,8 @@ from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
-from seaopt.control.tuning.tuner import disturbance, make_controller, make_task, solve
+from seaopt.control.tuning.solution import solve
+from seaopt.control.tuning.tuner import disturbance, make_controller, make_task
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text

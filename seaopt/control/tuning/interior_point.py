@@ -1,15 +1,15 @@
-r"""Refine all eight numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
+r"""Refine all ten numbers of a law at once by an interior-point method on exact derivatives, the tuner's third step.
 
-The quadratic programs leave filters where the scan put them and stop at a first-order step. Here gains, T_f, T_q and
-notch move together: minimise the objective subject to
+The quadratic programs leave filters where the scan put them and stop at a first-order step. Here gains, weights, T_f,
+T_q and notch move together: minimise the objective subject to
 
-.. math:: \ln u_i(x) \le s, \qquad \ln (\sqrt2\,|P C_r| / |1 + L|)_{f_b} = 0, \qquad k_i \ge \omega_i (1 + k_p)
+.. math:: \ln u_i(x) \le s, \qquad \ln (\sqrt2\,|P C_r| / |1 + L|)_{f_b} = 0
 
-with :math:`u_i` the usages of `seaopt.control.tuning.optimisation_problem` at the points of plant and frequency that
-matter (in the passive band :math:`u_i - 1` in place of the logarithm), and one slack :math:`s \ge 0` at a price that
-is beyond any gain of the objective, so that limits that cannot all be kept are missed by one common factor, the least
-possible. Derivatives, first and second, are CasADi's; the solver is IPOPT. A program of given numbers of points is
-built once and used for every plant and specification.
+and the linear limits on the gains, with :math:`u_i` the usages of `seaopt.control.tuning.optimisation_problem` at the
+points of plant and frequency that matter (in the passive band :math:`u_i - 1` in place of the logarithm), and one slack
+:math:`s \ge 0` at a price that is beyond any gain of the objective, so that limits that cannot all be kept are missed
+by one common factor, the least possible. Derivatives, first and second, are CasADi's; the solver is IPOPT. A program
+of given numbers of points is built once and used for every plant and specification.
 """
 
 from __future__ import annotations
@@ -23,7 +23,25 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.laws.structures import evaluate_terms
-from seaopt.control.tuning.optimisation_problem import CURVES, PASSIVE, Grid, LawNumbers, Task, choose_prominent
+from seaopt.control.tuning.optimisation_problem import (
+    CURVES,
+    GAINS,
+    K_D,
+    K_I,
+    K_P,
+    NOTCH_DEPTH,
+    NOTCH_W,
+    NOTCH_WIDTH,
+    PASSIVE,
+    T_F,
+    T_Q,
+    W_C,
+    W_R,
+    Grid,
+    LawNumbers,
+    Task,
+    choose_prominent,
+)
 
 POINTS_PER_LIMIT = 24  # of each kind of limit
 SPREAD_POINTS = 10  # of them, at even distances
@@ -31,6 +49,7 @@ LARGEST_FACTOR = 3.0  # factor by which a number may change in one solution
 WORST_PLANTS = 2  # plants whose objective is followed
 QUADRATURE_CHUNK = 64  # quadrature points come in multiples of this
 SLACK_PRICE = 1e3
+UNUSED = 1e-6  # of a limit: outside its band, or not imposed
 SMOOTHING = 1e-12  # keeps magnitudes differentiable at zero
 
 
@@ -87,7 +106,7 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
         What is to be tuned.
     grid : Grid
         Frequencies that the limits are looked at on.
-    start : array, shape (8,)
+    start : array, shape (10,)
         Stable.
     rounds : int
         Solutions at most; each adds the points where the one before broke a limit.
@@ -102,15 +121,17 @@ def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNum
         again = _add_missed(task, grid, trial, chosen)
         trial_rank = task.rank(grid, trial)
         if trial_rank < rank and task.is_stable(trial):
-            again = (
-                again
-                or bool(np.any(trial > 0.99 * LARGEST_FACTOR * x))
-                or bool(np.any(trial < 1.01 / LARGEST_FACTOR * x))
-            )
+            again = again or _reached_end(trial, x)
             x, rank = trial, trial_rank
         if not again:
             break
     return x
+
+
+def _reached_end(trial: LawNumbers, x: LawNumbers) -> bool:
+    """Tell whether a number changed by as much as it may in one solution; the weights may as they like."""
+    rest = np.delete(np.arange(x.size), [W_R, W_C])
+    return bool(np.any((trial > 0.99 * LARGEST_FACTOR * x)[rest] | (trial < 1.01 / LARGEST_FACTOR * x)[rest]))
 
 
 def _add_missed(task: Task, grid: Grid, x: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> bool:
@@ -130,7 +151,7 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
     chosen: dict[str, Int[np.ndarray, " n"]] = {}
     for name, curve in task.usage(grid, x).items():
         worst = np.argmax(curve, axis=0)
-        used = np.flatnonzero(np.max(curve, axis=0) > 0.0)
+        used = np.flatnonzero(np.max(curve, axis=0) > UNUSED)
         even = used[np.linspace(0, used.size - 1, SPREAD_POINTS).astype(int)] if used.size else np.zeros(1, dtype=int)
         index = np.concatenate(
             [choose_prominent(curve, POINTS_PER_LIMIT - SPREAD_POINTS), worst[even] * grid.f.size + even]
@@ -140,20 +161,18 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
 
 
 @lru_cache(maxsize=32)
-def _build_program(
-    quadrature: int, observer: bool, notch: bool, feedback_only: bool, noise: bool, passive: bool
-) -> tuple[Any, list[str]]:
+def _build_program(quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
     kinds = (*CURVES, *([PASSIVE] * passive))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
     shapes = {
         "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
-        "inv_im": total, "weight": quadrature, "ln_level": n, "at": 8, "ts": 1, "kff": 1, "scale": 8, "rate": 1,
+        "inv_im": total, "weight": quadrature, "ln_level": n, "at": 8, "ts": 1, "kff": 1, "scale": 10, "linear": 15,
         "unit": 2 * POINTS_PER_LIMIT * passive,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
-    v, t, slack = ca.MX.sym("v", 8), ca.MX.sym("t"), ca.MX.sym("slack")
+    v, t, slack = ca.MX.sym("v", 10), ca.MX.sym("t"), ca.MX.sym("slack")
     x = v * data["scale"]
 
     def law(part: dict[str, Any]) -> tuple[_Complex, _Complex, _Complex]:
@@ -161,11 +180,12 @@ def _build_program(
         q = _Complex(part["q_re"], part["q_im"])
         kept, inverse = _Complex(part["kept_re"], part["kept_im"]), _Complex(part["inv_re"], part["inv_im"])
         series, integral, rate, more = evaluate_terms(
-            q, data["ts"], x[3], (x[4], kept, inverse) if observer else None, (x[5], x[6], x[7]) if notch else None
-        )
-        both = integral * x[1] + x[0]
-        c_y = (both + rate * x[2] + more) * series
-        c_r = (both + data["kff"] if feedback_only else both + rate * x[2] + data["kff"]) * series
+            q, data["ts"], x[T_F], (x[T_Q], kept, inverse) if observer else None,
+            (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH]) if notch else None,
+        )  # fmt: skip
+        both = integral * x[K_I] + x[K_P]
+        c_y = (both + rate * x[K_D] + more) * series
+        c_r = (both + (data["kff"] - x[W_R]) + rate * (x[K_D] - x[W_C])) * series
         return _Complex(part["p_re"], part["p_im"]), c_y, c_r
 
     names = [name for name in shapes if name.endswith(("_re", "_im"))]
@@ -197,7 +217,7 @@ def _build_program(
         worst = [ca.dot(data["weight"], size[quadrature * i : quadrature * (i + 1)]) - t for i in range(WORST_PLANTS)]
     g = ca.vertcat(
         bandwidth,
-        (data["rate"] * (1 + x[0]) - x[1]) / data["scale"][1],
+        ca.reshape(data["linear"], 3, 5) @ v[GAINS],
         *worst,
         *(rows - slack for rows in usage.values()),
     )
@@ -213,12 +233,13 @@ def _build_program(
 def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    levels = task.levels() | {PASSIVE: 1.0 - spec.reserve}
     m, kinds, passive = grid.f.size, (*CURVES,), task.port is not None
     flat = np.concatenate([chosen[kind] for kind in kinds])
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
+    levels = [task.level(kind, grid.f[chosen[kind] % m]) for kind in kinds]
     if passive:
-        at_port, kinds = chosen[PASSIVE], (*kinds, PASSIVE)
+        at_port = chosen[PASSIVE]
+        levels.append(np.full(at_port.size, 1.0 - spec.reserve))
         columns, p = np.concatenate([columns, at_port]), np.concatenate([p, grid.port[at_port]])
         unit = np.where(grid.unit[at_port] == 0.0, 1.0, grid.unit[at_port])  # outside the band nothing is asked
     weights = np.zeros(0)
@@ -230,21 +251,29 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         columns = np.concatenate([columns, np.tile(padded, WORST_PLANTS)])
         p = np.concatenate([p, grid.p[worst][:, padded].ravel()])
     at = int(np.argmin(np.abs(grid.f - spec.bandwidth_hz)))
-    low, high = task.bounds()
-    scale = np.maximum(np.abs(start), [0.1, 0.1, 1e-4, 0.1 * spec.sample_time_s, 1e-4, 1e-3, 1e-2, 1e-2])
+    low, high = task.bounds(start)
+    sizes = np.abs(start)
+    sizes[[W_R, W_C]] = task.k_ff + start[K_P], start[K_D]
+    scale = np.maximum(sizes, [0.1, 0.1, 1e-4, 0.1, 1e-4, 0.1 * spec.sample_time_s, 1e-4, 1e-3, 1e-2, 1e-2])
+    linear, least, largest = task.linear_limits(start)
+    rows = np.max(np.abs(linear * scale[GAINS]), axis=1)  # each in units of its largest term
+    near, far = (
+        np.maximum(low, start / LARGEST_FACTOR),
+        np.minimum(high, LARGEST_FACTOR * np.maximum(start, 0.3 * scale)),
+    )
+    near[[W_R, W_C]], far[[W_R, W_C]] = low[[W_R, W_C]], high[[W_R, W_C]]
     every = (p, grid.q[columns], grid.kept[columns], grid.inverse[columns])
     parts = [part for z in every for part in (np.real(z), np.imag(z))]
     one = [z[at] for z in (grid.p[0], grid.q, grid.kept, grid.inverse)]
     data = [
-        *parts, weights, np.repeat(np.log([levels[kind] for kind in kinds]), POINTS_PER_LIMIT),
+        *parts, weights, np.log(np.concatenate(levels)),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
-        [task.least_rate], np.real(unit), np.imag(unit),
+        (linear * scale[GAINS] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit),
     ]  # fmt: skip
     solver, _ = _build_program(
         weights.size,
         task.nominal is not None,
         spec.notch is not None,
-        spec.reference_weights == "measurement",
         noise,
         passive,
     )
@@ -254,10 +283,11 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     count = int(solver.size_out("g")[0])
     lower, upper = np.full(count, -np.inf), np.zeros(count)
     lower[0] = 0.0
+    lower[1:4], upper[1:4] = least / rows, largest / rows
     answer = solver(
         x0=x0, p=np.concatenate([np.asarray(part, dtype=float) for part in data]), lbg=lower, ubg=upper,
-        lbx=[*(np.maximum(low, start / LARGEST_FACTOR) / scale), -np.inf, 0.0],
-        ubx=[*(np.minimum(high, LARGEST_FACTOR * np.maximum(start, 0.3 * scale)) / scale), np.inf, np.inf],
+        lbx=[*(near / scale), -np.inf, 0.0],
+        ubx=[*(far / scale), np.inf, np.inf],
     )  # fmt: skip
     x = np.array(answer["x"]).ravel()[: start.size] * scale
     return task.tidy(x) if np.all(np.isfinite(x)) else None

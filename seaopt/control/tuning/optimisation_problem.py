@@ -1,4 +1,4 @@
-r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as eight numbers.
+r"""The optimisation problem of the tuner: plants, frequencies and limits as arrays, a law as ten numbers.
 
 Every limit is one curve over frequency, its *usage*, which must not exceed 1 (`seaopt.control.laws.limits`):
 :math:`|X| / (m\,|1 + L|)`, or its inverse where abs(X) is to be above. As m is what the specification allows less the
@@ -14,6 +14,14 @@ reserve, these are for the rows of today
 with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`. In the passive band there is a further one,
 1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.laws.passivity`), the gap that the reserve leaves
 taken off.
+
+The reference's weights are counted from feedforward and feedback of the error: with :math:`w_r = 1/P(0) + k_p - k_r`
+and :math:`w_c = (1 - c) k_d`,
+
+.. math:: C_r = g \,(1/P(0) + k_p - w_r + k_i I + (k_d - w_c) D), \qquad C_y = g \,(k_p + k_i I + k_d D + O)
+
+(terms of `LawTerms`) are affine in the first five numbers, on which there are three linear limits besides:
+:math:`k_i \ge \omega_i (1 + k_p)`, :math:`w_r \le 1/P(0) + k_p`, :math:`w_c \le k_d`.
 """
 
 from __future__ import annotations
@@ -28,7 +36,7 @@ from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
@@ -39,7 +47,6 @@ FREQUENCIES = 300
 SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
 LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
-NO_RATE = 1e-3  # rad/s
 NO_LIMIT = 1e9
 NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
@@ -49,9 +56,12 @@ CURVES = {limit.name: limit.curve for limit in LIMITS if limit.curve is not None
 SCOPES: dict[Scope, tuple[str, ...]] = {
     scope: tuple(name for name in CURVES if BY_NAME[name].scope == scope) for scope in ("every plant", "design plant")
 }
+TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
 PASSIVE = "passive_band_hz"
 
-LawNumbers = Float[np.ndarray, " 8"]  # k_p, k_i, k_d, T_f, T_q, notch_w, notch_width, notch_depth
+LawNumbers = Float[np.ndarray, " 10"]  # k_p, k_i, k_d, w_r, w_c, T_f, T_q, notch_w, notch_width, notch_depth
+K_P, K_I, K_D, W_R, W_C, T_F, T_Q, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH = range(10)
+GAINS = slice(0, 5)  # what C_r and C_y are affine in
 
 
 @record(eq=False)
@@ -106,34 +116,56 @@ class Task:
     port: PortModel | None = None
     design_states: int = 1
 
-    @property
-    def least_rate(self) -> float:
-        """The least k_i/(1 + k_p), rad/s: an integral does something, and a disturbance observer integrates itself."""
-        return INTEGRAL_RAD_S if self.spec.structure == "pid" else 0.0
+    def integrates(self, x: LawNumbers) -> bool:
+        """Tell whether the law integrates the error: not a pd, nor a disturbance observer that is alone at it."""
+        return self.spec.structure == "pid" or (self.nominal is not None and bool(x[K_I] > 0.0))
 
     def tidy(self, x: LawNumbers) -> LawNumbers:
-        """Return numbers within their bounds; beside an observer an integral that does nothing becomes none."""
-        x = np.clip(x, *self.bounds())
-        if self.nominal is not None and x[1] < NO_RATE * (1 + x[0]):
-            x[1] = 0.0
+        """Return numbers within their bounds; beside an observer an integral that does too little becomes none."""
+        x, least = x.copy(), INTEGRAL_RAD_S * (1.0 + max(x[K_P], 0.0))
+        if self.nominal is not None and x[K_I] < 0.5 * least:
+            x[K_I] = 0.0
+        x = np.clip(x, *self.bounds(x))
+        if self.integrates(x):
+            x[K_I] = max(x[K_I], least)
+        x[W_R] = min(x[W_R], max(self.k_ff + x[K_P], 0.0))
+        x[W_C] = x[K_D] if self.spec.reference_weights == "measurement" else min(x[W_C], x[K_D])
         return x
 
-    def levels(self) -> dict[str, float]:
-        """Return each curve's level, with the reserve taken off; one that is never reached where none is imposed."""
-        levels: dict[str, float] = {}
-        for name, curve in CURVES.items():
-            limit, allowed = BY_NAME[name], self.spec.allowed(BY_NAME[name])
-            keep = 1.0 if limit.reserve == "none" else 1.0 - self.spec.reserve
-            if allowed is None:
-                levels[name] = 1.0 / NO_LIMIT if curve.floor else NO_LIMIT
-            else:
-                level = curve.level(allowed)
-                levels[name] = level / keep if curve.floor else max(level * keep, 1e-6)
-        return levels
+    def linear_limits(
+        self, x: LawNumbers
+    ) -> tuple[Float[np.ndarray, "3 5"], Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """Return matrix, least and largest value of the linear limits on the gains of a law that integrates as x does.
 
-    def bounds(self) -> tuple[LawNumbers, LawNumbers]:
-        """Return the least and largest values of the eight numbers; equal where a number is fixed or absent."""
-        spec, ts = self.spec, self.spec.sample_time_s
+        They are what an integral does at least, and the least weights, k_r = 0 and c = 0.
+        """
+        rate = INTEGRAL_RAD_S if self.integrates(x) else 0.0
+        matrix = np.array([[-rate, 1.0, 0.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -1.0, 0.0, 1.0]])
+        least_c = 0.0 if self.spec.reference_weights == "measurement" else -np.inf
+        return matrix, np.array([rate, -np.inf, least_c]), np.array([np.inf, max(self.k_ff, 0.0), 0.0])
+
+    def level(self, name: str, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return a curve's level, with the reserve taken off; one that is never reached where none is imposed."""
+        curve, limit, keep = CURVES[name], BY_NAME[name], 1.0 - self.spec.reserve
+        allowed, never = self.spec.allowed(limit), 1.0 / NO_LIMIT if curve.floor else NO_LIMIT
+        if allowed is None:
+            return np.full(f.size, never)
+        if limit.reserve == "figure":
+            allowed = allowed * keep if limit.sense == "at most" else allowed / keep
+        level = curve.level(allowed)
+        if limit.reserve == "curve":
+            level = level / keep if curve.floor else level * keep
+        low, high = self.band_hz(name)
+        inside = (f >= low * (1 - 1e-9)) & (f <= high * (1 + 1e-9))
+        return np.where(inside, max(level, 1e-6) * (self.spec.bandwidth_hz / f) ** curve.fall, never)
+
+    def bounds(self, x: LawNumbers) -> tuple[LawNumbers, LawNumbers]:
+        """Return the least and largest numbers of a law that integrates as x does; equal where one is fixed or absent.
+
+        Without an integral k_r is fixed, for a static gain of 1.
+        """
+        spec, ts, integrates = self.spec, self.spec.sample_time_s, self.integrates(x)
+        fixed, free = (0.0, 0.0), (0.0, np.inf)
         notch = ((0.1, 0.1), (0.5, 0.5), (1.0, 1.0))
         if spec.notch is not None:
             centre = _range(spec.notch.frequency_hz, LOWEST_NOTCH * spec.bandwidth_hz, HIGHEST_NOTCH / ts)
@@ -143,8 +175,10 @@ class Task:
                 _range(spec.notch.depth, 0.01, 1.0),
             )
         ranges = [
-            (0.0, np.inf), (0.0, 0.0) if self.spec.structure == "pd" else (0.0, np.inf), (0.0, np.inf),
-            (0.0, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
+            free, free if integrates else fixed, free,
+            free if integrates and spec.reference_weights != "error" else fixed,
+            free if spec.reference_weights != "error" else fixed,
+            ((spec.level("min_filter_samples") or 0.0) * ts, 4.0 / (2 * np.pi * spec.bandwidth_hz)),
             (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else (1.0, 1.0), *notch,
         ]  # fmt: skip
         low, high = (np.array(ends, dtype=float) for ends in zip(*ranges, strict=True))
@@ -154,11 +188,14 @@ class Task:
         """Return a vector's numbers by name."""
         ts, notch = self.spec.sample_time_s, None
         if self.spec.notch is not None:
-            notch = Notch(frequency_hz=float(np.arctan(x[5]) / (np.pi * ts)), width=float(x[6]), depth=float(x[7]))
+            centre = float(np.arctan(x[NOTCH_W]) / (np.pi * ts))
+            notch = Notch(frequency_hz=centre, width=float(x[NOTCH_WIDTH]), depth=float(x[NOTCH_DEPTH]))
+        k_p, k_d = float(x[K_P]), float(x[K_D])
+        whole = self.spec.reference_weights != "measurement"
         return Gains(
-            k_p=float(x[0]), k_i=float(x[1]), k_d=float(x[2]), T_f=float(x[3]), k_r=self.k_ff + float(x[0]),
-            c=float(self.spec.reference_weights != "measurement"), notch=notch,
-            observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[4])),
+            k_p=k_p, k_i=float(x[K_I]), k_d=k_d, T_f=float(x[T_F]), k_r=self.k_ff + k_p - float(x[W_R]),
+            c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole), notch=notch,
+            observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[T_Q])),
         )  # fmt: skip
 
     def law_of(self, x: LawNumbers) -> Law:
@@ -173,7 +210,7 @@ class Task:
         """Tell whether every plant's loop is stable, by its eigenvalues."""
         law = self.law_of(x)
         loops = (Loop(plant=plant, law=law) for plant in self.plants)
-        return all(np.max(np.abs(loop.eigenvalues())) < 1.0 for loop in loops)
+        return all(np.max(np.abs(loop.eigenvalues())) < STABLE for loop in loops)
 
     def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:
         """Return the responses of the plants, or of some of them, at frequencies."""
@@ -195,17 +232,16 @@ class Task:
 
     def terms(self, grid: Grid, x: LawNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
-        observer = None if self.nominal is None else (x[4], grid.kept, grid.inverse)
-        notch = None if self.spec.notch is None else (x[5], x[6], x[7])
-        return evaluate_terms(grid.q, self.spec.sample_time_s, x[3], observer, notch)
+        observer = None if self.nominal is None else (x[T_Q], grid.kept, grid.inverse)
+        notch = None if self.spec.notch is None else (x[NOTCH_W], x[NOTCH_WIDTH], x[NOTCH_DEPTH])
+        return evaluate_terms(grid.q, self.spec.sample_time_s, x[T_F], observer, notch)
 
     def law(self, grid: Grid, x: LawNumbers) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"]]:
         """Return C_r and C_y on a grid."""
         series, integral, rate, observer = self.terms(grid, x)
-        both = x[0] + x[1] * integral
-        c_y = series * (both + x[2] * rate + observer)
-        on_reference = x[2] * rate if self.spec.reference_weights != "measurement" else 0.0
-        return series * (both + on_reference + self.k_ff), c_y
+        both = x[K_P] + x[K_I] * integral
+        c_r = series * (both + self.k_ff - x[W_R] + (x[K_D] - x[W_C]) * rate)
+        return c_r, series * (both + x[K_D] * rate + observer)
 
     def usage(self, grid: Grid, x: LawNumbers) -> dict[str, Float[np.ndarray, "k m"]]:
         """Return how much of each limit is used, by its name, with one row for each of the first plants it is for."""
@@ -226,48 +262,59 @@ class Task:
         c_r: Complex[np.ndarray, "*n m"],
     ) -> dict[str, np.ndarray]:
         """Return the usage of some limits on plants p."""
-        levels, open_loop = self.levels(), p * c_y
+        open_loop = p * c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
         for name in names:
             curve = CURVES[name]
-            size, allowed = np.abs(curve.numerator(p, c_y, c_r, open_loop)), levels[name] * distance
-            usage = allowed / np.maximum(size, 1e-12) if curve.floor else size / allowed
-            out[name] = usage if curve.until_hz is None else np.where(f <= self.until_hz(name), usage, 0.0)
+            size, allowed = np.abs(curve.numerator(p, c_y, c_r, open_loop)), self.level(name, f) * distance
+            out[name] = allowed / np.maximum(size, 1e-12) if curve.floor else size / allowed
         return out
 
-    def until_hz(self, name: str) -> float:
-        """Return up to where a curve is looked at, a little beyond what is asked: that is one of the frequencies."""
+    def band_hz(self, name: str) -> tuple[float, float]:
+        """Return from where to where a curve is looked at; finite ends are among the frequencies."""
         curve, allowed = CURVES[name], self.spec.allowed(BY_NAME[name])
-        if curve.until_hz is None or allowed is None:
-            return np.inf
-        return curve.until_hz(allowed, self.spec.bandwidth_hz) * (1 + 1e-9)
+        low, high = (
+            None if end is None or allowed is None else end(allowed, self.spec.bandwidth_hz)
+            for end in (curve.from_hz, curve.until_hz)
+        )
+        return 0.0 if low is None else low, np.inf if high is None else high
 
     def design_usage(
         self, grid: Grid, position: int, c_y: Complex[np.ndarray, "*n m"], c_r: Complex[np.ndarray, "*n m"]
     ) -> dict[str, np.ndarray]:
         """Return the usage of the limits that one of the grid's plants keeps as the design plant, sliding or stuck."""
-        row, names = grid.rows[position], SCOPES["design plant"]
+        row = grid.rows[position]
+        out = self.curves(self.design_limits(row), grid.f, grid.p[position], c_y, c_r)
+        return out | (self.port_usage(grid, c_y) if row == 0 else {})
+
+    def design_limits(self, row: int) -> tuple[str, ...]:
+        """Return the limits that a plant keeps as the design plant, sliding or stuck; none if it is another."""
         if row >= self.design_states:
+            return ()
+        return tuple(name for name in SCOPES["design plant"] if row == 0 or BY_NAME[name].stuck_too)
+
+    def port_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
+        """Return the usage of the passive band, where one is asked for."""
+        if self.port is None:
             return {}
-        if row:
-            names = tuple(name for name in names if BY_NAME[name].stuck_too)
-        out = self.curves(names, grid.f, grid.p[position], c_y, c_r)
-        if self.port is not None and row == 0:
-            one = 1.0 + grid.port * c_y
-            cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
-            out[PASSIVE] = np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)
-        return out
+        one = 1.0 + grid.port * c_y
+        cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
+        return {PASSIVE: np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)}
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""
         port, spec, band, law = None, self.spec, self.spec.passive_band_hz, self.law_of(x).balanced()
         if self.port is not None and band is not None:
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
+        filter_samples = float(x[T_F] / spec.sample_time_s) if x[K_D] > 0.0 else np.inf
         return [
-            MeasuredLoop(name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port)
+            MeasuredLoop(
+                name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,
+                filter_samples=filter_samples,
+            )
             for i, name in enumerate(self.names)
-        ]
+        ]  # fmt: skip
 
     def weights(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
@@ -331,10 +378,7 @@ def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
         np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES),
     )
     ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]
-    for name, curve in CURVES.items():
-        allowed = spec.allowed(BY_NAME[name])
-        if curve.until_hz is not None and allowed is not None and BY_NAME[name].reserve == "curve":
-            ends.append(curve.until_hz(allowed, spec.bandwidth_hz))
+    ends += [end for name in CURVES for end in task.band_hz(name)]
     grid = np.unique(np.concatenate([slow[:-1], base, extra, ends]))
     return grid[(grid >= LOWEST_HZ) & (grid < nyquist)]
 

@@ -1,15 +1,23 @@
 r"""Find starts for the tuner: a scan of laws that have the bandwidth exactly, and one that is always stable.
 
-With the other numbers given, the design plant's bandwidth is a quadratic equation in k_p. Let :math:`a = P g` with
-g the series part, and :math:`R = k_\mathrm{ff} + k_i I + k_d D`, :math:`Y = k_i I + k_d D + O` (terms of `LawTerms`;
-D is absent from R with the derivative on the measurement). Then at :math:`f_b`
+With the other numbers given, the design plant's bandwidth is a quadratic equation in one of them. Let :math:`a = P g`
+with g the series part, :math:`Y = k_i I + k_d D + O` and :math:`R = 1/P(0) + k_i I + (k_d - w_c) D` (terms of
+`LawTerms`). Where the reference's weight k_r is fixed, that number is k_p: at :math:`f_b`
 
 .. math::
     2\,|a|^2 |k_p + R|^2 = |1 + a Y + a k_p|^2 \iff
     |a|^2 k_p^2 + 2\,\mathrm{Re}(2|a|^2 R - a\,\overline{(1 + aY)})\,k_p + 2|a|^2|R|^2 - |1 + aY|^2 = 0 .
 
-The scan solves it over a grid of the others and ranks both roots by the largest usage of a limit on a coarse set of
-frequencies, then by the objective. Since the plants are stable, next to no feedback is a start that is always valid.
+Where it is free, that number is w_r, which leaves the loop as it is:
+
+.. math::
+    |k_p + R - w_r| = \rho = \frac{|1 + a (k_p + Y)|}{\sqrt2\,|a|} \iff
+    w_r = k_p + \mathrm{Re}\,R \pm \sqrt{\rho^2 - (\mathrm{Im}\,R)^2} .
+
+The scan solves these over a grid of the others and ranks both roots by the largest usage of a limit on a coarse set of
+frequencies, then by the objective. With k_r free the loops alone are ranked first, by the limits that the reference's
+path does not enter, and only some are given weights. Since the plants are stable, next to no feedback is a start that
+is always valid.
 """
 
 from __future__ import annotations
@@ -18,24 +26,42 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
+from seaopt.control.laws.limits import BY_NAME
+from seaopt.control.laws.structures import LawTerms
 from seaopt.control.tuning.optimisation_problem import (
     HIGHEST_NOTCH,
     INTEGRAL_RAD_S,
+    K_D,
+    K_I,
+    K_P,
     LOWEST_NOTCH,
+    NOTCH_W,
     OBJECTIVE_HZ,
     SCOPES,
+    T_F,
+    T_Q,
+    TRACKING,
+    W_C,
+    W_R,
     Grid,
     LawNumbers,
     Task,
     find_light_modes,
 )
+from seaopt.records import record
 
-DERIVATIVE_GAINS = 24  # values of k_d
+DERIVATIVE_GAINS = 24  # values of k_d where k_p follows from it
+LOOP_GAINS = 12  # values of k_p and of k_d where the reference's weight follows from them
+LOOPS_WEIGHTED = 200  # of each shape
+INTEGRAL_RATES = 4  # values of k_i/(1 + k_p) then
+HOPELESS_MERIT = 10.0  # loops whose merit is worse than the best one's by this are given no weights
+WEIGHTS = (0.0, 0.5, 1.0)  # of w_c/k_d
 COARSE_FREQUENCIES = 90
 SCANNED_PLANTS = 4
 PASSIVE_FREQUENCIES = 20  # of the passive band
+Shape = tuple[float, ...]  # T_f, T_q, notch_w, notch_width, notch_depth
 LEAST_TURN = -0.3 * np.pi  # of 1 + L from the lowest frequency to the highest: less is an encirclement
 
 
@@ -72,18 +98,18 @@ def find_starts(task: Task, grid: Grid, count: int) -> list[LawNumbers]:
 def make_rest_start(task: Task) -> LawNumbers:
     """Return the law with next to no feedback, stable because the plants are."""
     ts = task.spec.sample_time_s
-    return task.tidy(np.array([0.0, task.least_rate, 0.0, ts, 10.0, 0.3, 0.5, 1.0]))
+    return task.tidy(np.array([0.0, 0.0, 0.0, 0.0, 0.0, ts, 10.0, 0.3, 0.5, 1.0]))
 
 
 def _are_alike(task: Task, x: LawNumbers, other: LawNumbers) -> bool:
     """Tell whether two starts lead to the same place: valleys differ by notch, observer or integral."""
     apart = np.abs(np.log((x + 1e-4) / (other + 1e-4)))
     if task.spec.notch is not None:
-        apart = apart[5:]
+        apart = apart[NOTCH_W:]
     elif task.nominal is not None:
-        apart = apart[[1, 4]]
+        apart = apart[[K_I, T_Q]]
     elif task.spec.structure == "pid":
-        apart = apart[1]
+        apart = apart[K_I]
     return bool(np.max(apart) < 0.4)
 
 
@@ -105,19 +131,19 @@ def _thin_grid(task: Task, grid: Grid) -> Grid:
     return replace(coarse, p=coarse.p[:SCANNED_PLANTS], rows=coarse.rows[:SCANNED_PLANTS])
 
 
-def _list_shapes(task: Task) -> Iterator[tuple[float, float, float, float, float]]:
+def _list_shapes(task: Task) -> Iterator[Shape]:
     """Yield (T_f, T_q, notch_w, notch_width, notch_depth) to try."""
-    low, high = task.bounds()
+    low, high = task.bounds(make_rest_start(task))
     spec, ts = task.spec, task.spec.sample_time_s
     unit = 1 / (2 * np.pi * spec.bandwidth_hz)
-    filters = np.geomspace(0.15 * ts, min(0.7 * unit, high[3]), 5 if spec.notch is None else 3)
+    filters = np.geomspace(max(0.15 * ts, low[T_F]), min(0.7 * unit, high[T_F]), 5 if spec.notch is None else 3)
     # An output that swings at a few tenths of a hertz bears only a slow observer.
     lags = [0.5 * unit, 2.0 * unit, 8.0 * unit, 0.5, 3.0] if task.nominal is not None else [1.0]
-    notches = _list_notches(task) if spec.notch is not None else [(low[5], low[6], low[7])]
+    notches = _list_notches(task) if spec.notch is not None else [tuple(low[NOTCH_W:])]
     for t_f in filters:
         for t_q in lags:
             for notch in notches:
-                yield (*np.clip((t_f, t_q, *notch), low[3:], high[3:]),)
+                yield (*np.clip((t_f, t_q, *notch), low[T_F:], high[T_F:]),)
 
 
 def _list_notches(task: Task) -> list[tuple[float, float, float]]:
@@ -135,38 +161,119 @@ def _list_notches(task: Task) -> list[tuple[float, float, float]]:
     ]
 
 
-def _rank_shape(
-    task: Task, grid: Grid, shape: tuple[float, float, float, float, float]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 8"]]:
+@record(eq=False)
+class _Scan:
+    """The laws of one shape, with their terms on the scan's frequencies, of which number `at` is the bandwidth."""
+
+    task: Task
+    grid: Grid
+    shape: Shape
+    terms: LawTerms
+    at: int
+
+    @property
+    def through(self) -> complex:
+        """The design plant times the series part, at the bandwidth."""
+        return complex(self.grid.p[0, self.at] * self.terms.series[self.at])
+
+    @property
+    def inverse(self) -> float:
+        """The inverse of the plant at the bandwidth, in which gains are counted."""
+        return 1.0 / max(abs(self.grid.p[0, self.at]), 1e-6)
+
+    @property
+    def derivatives(self) -> float:
+        """The k_d that makes as much of an error at the bandwidth as a k_p of `inverse`."""
+        return self.inverse / float(abs(self.terms.rate[self.at]))
+
+    def measurement(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
+        """Return C_y of laws, without the series part."""
+        k_p, k_i, k_d, _, _ = gains.T[:, :, None]
+        return k_p + k_i * self.terms.integral + k_d * self.terms.rate + self.terms.observer
+
+    def reference(self, gains: Float[np.ndarray, "n 5"]) -> Complex[np.ndarray, "n m"]:
+        """Return C_r of laws, without the series part."""
+        k_p, k_i, k_d, w_r, w_c = gains.T[:, :, None]
+        return self.task.k_ff + k_p - w_r + k_i * self.terms.integral + (k_d - w_c) * self.terms.rate
+
+
+def _rank_shape(task: Task, grid: Grid, shape: Shape) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
     """Return merits (less is better) and numbers of the laws of one shape."""
-    spec, at = task.spec, int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
-    series, integral, rate, more = task.terms(grid, np.array([0.0, 0.0, 0.0, *shape]))
-    series, more = (np.broadcast_to(term, grid.f.shape) for term in (series, more))
-    k_d, k_i = (v.ravel() for v in np.meshgrid(*_list_gains(task, grid, at, abs(rate[at]))))
-    on_reference = rate if spec.reference_weights != "measurement" else 0.0 * rate
-    slope = k_i[:, None] * integral + task.k_ff + k_d[:, None] * on_reference
-    back = k_i[:, None] * integral + k_d[:, None] * rate + more
-    k_p = _solve_bandwidth(grid.p[0, at] * series[at], slope[:, at], back[:, at])
-    keep = np.isfinite(k_p) & (k_p >= 0.0)
-    which = np.flatnonzero(keep) % k_d.size
-    k_p, k_d, k_i, slope, back = k_p[keep], k_d[which], k_i[which], slope[which], back[which]
-    merit = _measure_merit(task, grid, series * (k_p[:, None] + back), series * (k_p[:, None] + slope))
-    merit += np.maximum(0.0, np.log(np.maximum(task.least_rate * (1 + k_p), 1e-12) / np.maximum(k_i, 1e-12)))
-    points = np.column_stack([k_p, k_i, k_d, np.tile(shape, (k_p.size, 1))])
-    return merit, points
+    terms = task.terms(grid, np.array([0.0, 0.0, 0.0, 0.0, 0.0, *shape]))
+    terms = LawTerms(*(np.broadcast_to(term, grid.f.shape) for term in terms))
+    at = int(np.argmin(np.abs(grid.f - task.spec.bandwidth_hz)))
+    scan = _Scan(task=task, grid=grid, shape=shape, terms=terms, at=at)
+    parts = [_scan_fixed_weight(scan)]
+    if task.spec.structure != "pd" and task.spec.reference_weights != "error":
+        parts.append(_scan_free_weight(scan))
+    merit, gains = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return merit, np.column_stack([gains, np.tile(shape, (merit.size, 1))])
 
 
-def _list_gains(
-    task: Task, grid: Grid, at: int, rate: float
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
-    """Return values of k_d and k_i, in units of the inverse of the plant at the bandwidth."""
-    inverse = 1.0 / max(abs(grid.p[0, at]), 1e-6)
-    k_d = np.concatenate([[0.0], np.geomspace(0.02, 20.0, DERIVATIVE_GAINS)]) * inverse / rate
-    if task.spec.structure == "pd":
-        return k_d, np.zeros(1)
-    slowest = 1.3 * INTEGRAL_RAD_S * (1 + np.array([0.1, 1.0]) * inverse)
-    k_i = np.append(slowest, max(0.05 * 2 * np.pi * task.spec.bandwidth_hz * inverse, 2.0 * slowest[1]))
-    return k_d, k_i if task.nominal is None else np.array([0.0, k_i[2]])
+def _scan_fixed_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+    """Return merits and gains of laws with w_r = 0: k_p makes the bandwidth."""
+    k_d = np.concatenate([[0.0], np.geomspace(0.02, 20.0, DERIVATIVE_GAINS)]) * scan.derivatives
+    grids = np.meshgrid(k_d, _list_integrals(scan), _list_weights(scan.task), indexing="ij")
+    k_d, k_i, weight = (values.ravel() for values in grids)
+    gains = np.column_stack([0.0 * k_d, k_i, k_d, 0.0 * k_d, weight * k_d])[(k_d > 0.0) | (weight == weight[0])]
+    k_p = _solve_bandwidth(scan.through, scan.reference(gains)[:, scan.at], scan.measurement(gains)[:, scan.at])
+    gains = np.tile(gains, (2, 1))
+    gains[:, K_P] = k_p
+    gains = gains[np.isfinite(k_p) & (k_p >= 0.0)]
+    c_y, c_r = (scan.terms.series * law for law in (scan.measurement(gains), scan.reference(gains)))
+    return _judge_loops(scan, c_y) + _judge_tracking(scan, c_y, c_r) + _price_missing_integral(scan, gains), gains
+
+
+def _scan_free_weight(scan: _Scan) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+    """Return merits and gains of laws of which w_r makes the bandwidth, of the loops that promise most."""
+    k_p = np.geomspace(0.03, 10.0, LOOP_GAINS) * max(scan.inverse, 1.0)
+    k_d = np.concatenate([[0.0], np.geomspace(0.03, 10.0, LOOP_GAINS)]) * scan.derivatives
+    rates = np.geomspace(1.3 * INTEGRAL_RAD_S, 2 * np.pi * scan.task.spec.bandwidth_hz, INTEGRAL_RATES)
+    k_p, k_d, rate = (values.ravel() for values in np.meshgrid(k_p, k_d, rates, indexing="ij"))
+    gains = np.column_stack([k_p, rate * (1.0 + k_p), k_d, 0.0 * k_p, 0.0 * k_p])
+    c_y = scan.terms.series * scan.measurement(gains)
+    merit = _judge_loops(scan, c_y)
+    weights = np.repeat(_list_weights(scan.task), 2)  # for both roots
+    chosen = np.repeat(_choose_loops(merit), weights.size)
+    gains, c_y, merit = gains[chosen], c_y[chosen], merit[chosen]
+    gains[:, W_C] = np.resize(weights, chosen.size) * gains[:, K_D]
+    whole = scan.reference(gains)[:, scan.at]
+    size = np.abs(1.0 + scan.grid.p[0, scan.at] * c_y[:, scan.at]) / (np.sqrt(2.0) * abs(scan.through))
+    with np.errstate(invalid="ignore"):
+        gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)
+    keep = (gains[:, W_R] >= 0.0) & (gains[:, W_R] <= scan.task.k_ff + gains[:, K_P])
+    gains, c_y, merit = gains[keep], c_y[keep], merit[keep]
+    return merit + _judge_tracking(scan, c_y, scan.terms.series * scan.reference(gains)), gains
+
+
+def _choose_loops(merit: Float[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+    """Return the loops that are given weights: half of them the best, half spread over what keeps its limits."""
+    order = np.argsort(merit)
+    best, rest = np.split(order, [LOOPS_WEIGHTED // 2])
+    rest = rest[merit[rest] < merit[order[0]] + HOPELESS_MERIT]
+    return np.concatenate([best, rest[:: 1 + rest.size // (LOOPS_WEIGHTED // 2)]])
+
+
+def _list_weights(task: Task) -> tuple[float, ...]:
+    """Return values of w_c/k_d to try."""
+    return {"tuned": WEIGHTS, "error": (0.0,), "measurement": (1.0,)}[task.spec.reference_weights]
+
+
+def _list_integrals(scan: _Scan) -> Float[np.ndarray, " n"]:
+    """Return values of k_i to try where k_p is not known yet."""
+    if scan.task.spec.structure == "pd":
+        return np.zeros(1)
+    slowest = 1.3 * INTEGRAL_RAD_S * (1 + np.array([0.1, 1.0]) * scan.inverse)
+    fast = max(0.05 * 2 * np.pi * scan.task.spec.bandwidth_hz * scan.inverse, 2.0 * slowest[1])
+    return np.append(slowest, fast) if scan.task.nominal is None else np.array([0.0, fast])
+
+
+def _price_missing_integral(scan: _Scan, gains: Float[np.ndarray, "n 5"]) -> Float[np.ndarray, " n"]:
+    """Return what a k_i counts that is below the least; beside an observer it will be none."""
+    if scan.task.spec.structure != "pid":
+        return np.zeros(gains.shape[0])
+    least = INTEGRAL_RAD_S * (1 + gains[:, K_P])
+    return np.maximum(0.0, np.log(least / np.maximum(gains[:, K_I], 1e-12)))
 
 
 def _solve_bandwidth(
@@ -181,15 +288,15 @@ def _solve_bandwidth(
     return np.concatenate([(-half + root) / size, (-half - root) / size])
 
 
-def _measure_merit(
-    task: Task, grid: Grid, c_y: Complex[np.ndarray, "n m"], c_r: Complex[np.ndarray, "n m"]
-) -> np.ndarray:
-    """Return the objective where the limits are kept, and what is worse than any objective where they are not."""
+def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
+    """Return the logarithm of the objective, and what is worse than any where a limit on the loop is broken."""
+    task, grid = scan.task, scan.grid
     weights, worst = task.weights(grid.f), np.zeros(c_y.shape[0])
     value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
     for row, p in enumerate(grid.p):
-        usage = task.curves(SCOPES["every plant"], grid.f, p, c_y, c_r)
-        usage |= task.design_usage(grid, row, c_y, c_r)
+        own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
+        usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid.f, p, c_y, c_y)
+        usage |= task.port_usage(grid, c_y) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = 1.0 + p * c_y
@@ -199,6 +306,25 @@ def _measure_merit(
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
         elif row < task.design_states:
             value = np.maximum(value, np.max(np.abs(c_y / distance), axis=1))
-    broken = np.log(np.maximum(worst, 1.0))
-    size = np.min(value) if value.size else 1.0
-    return np.log(value / size) + 20.0 * broken + np.where(turned < LEAST_TURN, 50.0, 0.0)
+    return np.log(value) + _price(worst) + np.where(turned < LEAST_TURN, 50.0, 0.0)
+
+
+def _judge_tracking(
+    scan: _Scan, c_y: Complex[np.ndarray, "n m"], c_r: Complex[np.ndarray, "n m"]
+) -> Float[np.ndarray, " n"]:
+    """Return what limits on the reference's path count that are broken."""
+    task, grid, worst = scan.task, scan.grid, np.zeros(c_y.shape[0])
+    for row in range(task.design_states):
+        names = _imposed(task, tuple(name for name in task.design_limits(row) if name in TRACKING))
+        for curve in task.curves(names, grid.f, grid.p[row], c_y, c_r).values():
+            worst = np.maximum(worst, np.max(curve, axis=1))
+    return _price(worst)
+
+
+def _imposed(task: Task, names: tuple[str, ...]) -> list[str]:
+    """Return the limits that the specification imposes."""
+    return [name for name in names if task.spec.allowed(BY_NAME[name]) is not None]
+
+
+def _price(worst: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    return 20.0 * np.log(np.maximum(worst, 1.0))

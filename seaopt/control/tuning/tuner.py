@@ -1,24 +1,18 @@
 r"""Tune a controller: place a bandwidth under limits on several plants at once, for `so.tune`.
 
-The law is eight numbers at most: gains k_p, k_i, k_d; filters T_f, T_q; a notch's frequency, width and depth. Every
-limit is a curve over frequency on every plant (`seaopt.control.tuning.optimisation_problem`), and the design plant's
-bandwidth an equality. That is solved in four steps, each the next one's start:
-
-1. a scan over filters and two gains, the third from the bandwidth equality in closed form (`find_starts`);
-2. from the best, successive quadratic programs in the gains, the convex-concave procedure (`convex_concave`);
-3. an interior-point method in all numbers at once, on exact derivatives (`interior_point`);
-4. a recheck on frequencies that resolve every pole of plants and closed loops; where a limit is broken between the
-   frequencies, those are added and step 3 is repeated.
+The law is ten numbers at most: gains k_p, k_i, k_d; weights k_r, c of the reference; filters T_f, T_q; a notch's
+frequency, width and depth. Every limit is a curve over frequency on every plant
+(`seaopt.control.tuning.optimisation_problem`), and the design plant's bandwidth an equality. That is solved by
+`seaopt.control.tuning.solution`.
 
 The result is then measured by `Loop.figures`, which uses none of these frequencies. What is returned as feasible has
 been measured to be so. Where limits cannot all be kept, the result misses them by one common factor, the least
-found, and the largest bandwidth at which they can be kept is found by bisection.
+found, and the bandwidths at which they can be kept are looked for (`seaopt.control.tuning.possible_bandwidths`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex
@@ -27,30 +21,22 @@ from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
-from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
+from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Nominal
-from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken
+from seaopt.control.laws.verdict import PossibleBandwidths, explain_broken, judge_all, list_active, list_broken
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import sample
-from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.feasibility import check_current, check_delay
-from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Grid, LawNumbers, Task, place_frequencies
-from seaopt.control.tuning.starts import find_starts
+from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, LawNumbers, Task
+from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
+from seaopt.control.tuning.solution import solve
 from seaopt.errors import ControlError, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import find_dry_friction, split_friction
-
-STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
-STARTS_REFINED = 2  # one more with an observer, all with a notch
-RECHECKS = 3
-BANDWIDTH_RESOLUTION = 0.01  # to which the largest bandwidth is found
-HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more is not looked for elsewhere
-BANDWIDTHS_PROBED = 5  # when the lowest cannot be met
 
 
 def tune(
@@ -80,7 +66,7 @@ def tune(
     -------
     Controller
         With `feasible` False, and the limits that block in `active_constraints`, when the limits cannot all be met;
-        it is then the controller that misses them least, and `largest_bandwidth_hz` is what is possible.
+        it is then the controller that misses them least, and `possible` has the bandwidths that keep them.
 
     Raises
     ------
@@ -106,13 +92,13 @@ def tune(
     command = command_of(plant, values, spec.measured)
     check_current(spec, task.k_ff, command, find_dry_friction(plant, values))
     x, loops = solve(task)
-    largest = None
+    possible = None
     if list_broken(judge_all(spec, loops, task.design_states)):
-        largest, near = find_largest_bandwidth(task, x)
+        possible, near = find_possible_bandwidths(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
-        if near is not None:
-            x, loops = solve(task, (x, near))
-    return make_controller(task, x, loops, (plant, params), largest)
+        if near:
+            x, loops = solve(task, (x, *near))
+    return make_controller(task, x, loops, (plant, params), possible)
 
 
 def make_task(
@@ -182,107 +168,12 @@ def _draw_plants(
     return out
 
 
-def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> tuple[LawNumbers, list[MeasuredLoop]]:
-    """Find the best numbers, and return them with every plant's loop.
-
-    Parameters
-    ----------
-    task : Task
-        What is to be tuned.
-    warm : sequence of arrays, shape (8,)
-        Numbers to start from besides those of the scan, which then tries one less.
-
-    """
-    grid = task.grid(place_frequencies(task))
-    x = find_best(task, grid, warm)
-    for _ in range(RECHECKS):
-        missed = _find_missed(task, x, grid)
-        if not missed.size:
-            break
-        grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
-        x = refine(task, grid, x)
-    return x, task.measure(x)
-
-
-def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = ()) -> LawNumbers:
-    """Find the best numbers on a grid."""
-    more = task.nominal is not None or task.spec.notch is not None
-    warm = [task.tidy(x) for x in warm]
-    first = [x for x in warm if task.is_stable(x)] + find_starts(task, grid, STARTS_TRIED + 2 * more - bool(warm))
-    ranked = sorted((improve(task, grid, x) for x in first), key=lambda pair: pair[0])
-    count = len(ranked) if task.spec.notch is not None else STARTS_REFINED + more
-    chosen: list[LawNumbers] = []
-    for _, x in ranked:
-        if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
-            chosen.append(x)
-    return min((refine(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
-
-
-def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:
-    """Return frequencies between the grid's at which more of a limit is used than anywhere on it."""
-    allowed = {name: max(1.0, float(np.max(curve))) for name, curve in task.usage(grid, x).items()}
-    out: list[float] = []
-    for row in range(len(task.plants)):
-        dense = task.loop(x, row).grid()
-        f = dense[(dense >= LOWEST_HZ) & (dense < grid.f[-1])]
-        for name, curve in task.usage(task.grid(f, [row]), x).items():
-            top = int(np.argmax(curve))
-            if curve[0, top] > allowed[name] * (1.0 + max(0.4 * task.spec.reserve, 1e-6)):
-                out.append(float(f[top]))
-    return np.array([f for f in out if np.min(np.abs(grid.f / f - 1.0)) > 1e-7])
-
-
-def find_largest_bandwidth(task: Task, x: LawNumbers) -> tuple[float, LawNumbers | None]:
-    """Return the largest bandwidth in range that keeps the limits, and its numbers; 0 and None if there is none.
-
-    Found by bisection from the bandwidth asked, which does not keep them, towards the lowest; if that does not either,
-    a few others are tried first. It is right to a hundredth, if limits that can be kept at one bandwidth can be kept
-    at a lower one.
-    """
-    spec, asked = task.spec, task.spec.bandwidth_hz
-    low = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
-    near: list[LawNumbers] = []
-
-    def possible(bandwidth_hz: float) -> bool:
-        feasible = _find_feasible(
-            replace(task, spec=replace(spec, bandwidth_hz=bandwidth_hz)), near[-1] if near else x, near=bool(near)
-        )
-        near.extend([] if feasible is None else [feasible])
-        return feasible is not None
-
-    tried = [low, *np.geomspace(low, asked, BANDWIDTHS_PROBED + 2)[-2:0:-1]] if low < asked else []
-    first = next((k for k, f in enumerate(tried) if possible(float(f))), None)
-    if first is None:
-        return 0.0, None
-    lower, upper = tried[first], tried[first - 1] if first > 1 else asked
-    while upper / lower > 1.0 + BANDWIDTH_RESOLUTION:
-        middle = float(np.sqrt(lower * upper))
-        lower, upper = (middle, upper) if possible(middle) else (lower, middle)
-    return float(lower), near[-1]
-
-
-def _find_feasible(task: Task, x: LawNumbers, *, near: bool) -> LawNumbers | None:
-    """Return numbers that keep all limits on the frequencies looked at, or None: from x first, then from anywhere.
-
-    Near a bandwidth that is possible what x misses clearly is not looked for anywhere else.
-    """
-    grid = task.grid(place_frequencies(task))
-    x = task.tidy(x)
-    if task.is_stable(x):
-        x = refine(task, grid, x)
-        usage, _ = task.rank(grid, x)
-        if usage == 0.0 or (near and usage > HOPELESS_USAGE):
-            return x if usage == 0.0 else None
-    x = find_best(task, grid, [x])
-    return x if task.rank(grid, x)[0] == 0.0 else None
-
-
 def make_controller(
     task: Task,
     x: LawNumbers,
     loops: Sequence[MeasuredLoop],
     design: tuple[Plant, ParameterSet],
-    largest: float | None = None,
+    possible: PossibleBandwidths | None = None,
 ) -> Controller:
     """Return the controller of tuned numbers."""
     spec, gains = task.spec, task.gains(x)
@@ -303,7 +194,7 @@ def make_controller(
         design=design,
         observer=gains.observer,
         blocked_by=tuple(explain_broken(spec, verdicts, loops[0], task.loop(x))),
-        largest_bandwidth_hz=largest,
+        possible=None if not broken else possible,
     )
 
 

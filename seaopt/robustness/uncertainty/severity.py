@@ -68,7 +68,7 @@ def severities(
 
 def limits(controller: Controller) -> tuple[float, float]:
     """Return the limits on Ms and Mt; infinite where none is imposed."""
-    ms, mt = controller.spec.max_sensitivity, controller.spec.max_complementary
+    ms, mt = controller.spec.level("max_sensitivity"), controller.spec.level("max_complementary")
     return np.inf if ms is None else ms, np.inf if mt is None else mt
 
 

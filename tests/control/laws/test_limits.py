@@ -28,7 +28,7 @@ def figures(stand, thor):
     loop = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).close(stand, thor)
     return replace(
         loop.figures(), stable=True, spectral_radius=0.999, ms=1.4, mt=1.1, disk_margin=0.8, reference_peak=1.0,
-        noise_gain=10.0, sensitivity_bandwidth_hz=8.0, bandwidth_hz=30.1,
+        noise_gain=10.0, sensitivity_bandwidth_hz=8.0, bandwidth_hz=30.1, droop_db=0.5, return_hz=None,
     )  # fmt: skip
 
 
@@ -84,7 +84,7 @@ def test_the_range_of_a_field_is_the_rows(limit):
 def test_nothing_is_broken_or_active_with_room_to_spare(figures):
     verdicts = judge_all(SPEC, loops(figures))
     assert list_broken(verdicts) == list_active(SPEC, verdicts) == []
-    assert len(verdicts) == 2 * 4 + 5
+    assert len(verdicts) == 2 * 4 + 8
 
 
 # What the figures become; just within the limit, and just beyond it.
@@ -96,6 +96,8 @@ EDGES = {
     "max_reference_peak": ({"reference_peak": 1.2}, {"reference_peak": 1.21}),
     "max_noise_gain": ({"noise_gain": 25.0}, {"noise_gain": 25.1}),
     "min_sensitivity_bandwidth_hz": ({"sensitivity_bandwidth_hz": 5.995}, {"sensitivity_bandwidth_hz": 5.993}),
+    "max_droop_db": ({"droop_db": 1.0}, {"droop_db": 1.01}),
+    "shoulder_hz": ({"return_hz": 89.6}, {"return_hz": 89.5}),
     "bandwidth_hz": ({"bandwidth_hz": 30.149}, {"bandwidth_hz": None}),
 }
 
@@ -122,7 +124,24 @@ def test_a_passive_band_needs_a_held_loop_that_does_not_grow(figures, cosine, he
     assert list_broken(verdicts) == ["passive_band_hz"] * broken
 
 
-def test_what_is_left_out_is_not_judged(figures):
+DEFAULTS = {
+    "stability": 1.0, "max_sensitivity": 1.7, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_droop_db": 1.0,
+    "min_sensitivity_bandwidth_hz": 6.0, "bandwidth_hz": 30.0, "shoulder_hz": 90.0, "min_filter_samples": 1.0,
+}  # fmt: skip
+
+
+def test_what_is_left_out_has_its_default_and_false_lifts_it(figures):
     verdicts = judge_all(so.ControllerSpec(bandwidth_hz=30), loops(figures)[:1])
-    assert [verdict.limit.name for verdict in verdicts] == ["stability", "min_sensitivity_bandwidth_hz", "bandwidth_hz"]
-    assert verdicts[1].allowed == 6.0
+    assert {verdict.limit.name: verdict.allowed for verdict in verdicts} == DEFAULTS
+    optional = [name for name in DEFAULTS if name not in ("stability", "bandwidth_hz", "shoulder_hz")]
+    spec = so.ControllerSpec(bandwidth_hz=30, **dict.fromkeys(optional, False))
+    assert set(spec.lifted) == set(optional)
+    kept = judge_all(spec, loops(figures)[:1])
+    assert [verdict.limit.name for verdict in kept] == ["stability", "bandwidth_hz", "shoulder_hz"]
+    none = so.ControllerSpec(bandwidth_hz=30, **dict.fromkeys(optional))
+    assert judge_all(none, loops(figures)[:1])[1].allowed == 1.7
+
+
+def test_a_filter_that_is_faster_than_the_sampling_is_refused(figures):
+    loop = replace(loops(figures)[0], filter_samples=0.99)
+    assert list_broken(judge_all(SPEC, [loop])) == ["min_filter_samples"]

@@ -29,7 +29,9 @@ def figures(params):
 
 @lru_cache(maxsize=1)
 def tuned():
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_reference_peak=1.3, max_noise_gain=25)
+    spec = so.ControllerSpec(
+        bandwidth_hz=30, max_sensitivity=1.6, max_reference_peak=1.3, max_noise_gain=25, reference_weights="error"
+    )
     return so.tune(high_impedance(), so.plants.thor(), spec)
 
 

@@ -15,6 +15,8 @@ from seaopt.plants import high_impedance
 
 QUIET = {"bandwidth_hz": 30, "max_sensitivity": 1.6, "objective": "noise"}
 BAND = (1.0, 60.0)
+LIFTED = dict.fromkeys(["max_complementary", "max_reference_peak", "max_droop_db", "min_filter_samples"], False)
+LIFTED["reference_weights"] = "error"
 
 
 def real_part(controller, thor, f):
@@ -33,7 +35,7 @@ def real_part(controller, thor, f):
     "spec",
     [
         QUIET,
-        {"bandwidth_hz": 30, "max_sensitivity": 2.2, "delay_samples": 2},
+        {"bandwidth_hz": 30, "max_sensitivity": 2.2, "delay_samples": 2, **LIFTED},
         {"bandwidth_hz": 15, "max_sensitivity": 2.5, "max_noise_gain": 10},
         {"bandwidth_hz": 30, "max_sensitivity": 1.6, "objective": "noise", "structure": "pid_dob"},
     ],

@@ -54,11 +54,13 @@ def test_it_is_as_good_as_a_long_global_search(stand, thor):
 
     from seaopt.control.tuning.tuner import disturbance, make_task
 
-    spec = so.ControllerSpec(structure="pd", bandwidth_hz=30, **{**LIMITS, "max_noise_gain": 25})
+    spec = so.ControllerSpec(
+        structure="pd", reference_weights="error", bandwidth_hz=30, **{**LIMITS, "max_noise_gain": 25}
+    )
     task = make_task(stand, thor, spec, {})
 
     def cost(v):
-        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), np.exp(v[2]), 1, 1, 1, 1])
+        x = np.array([np.exp(v[0]), 0.0, np.exp(v[1]), 0.0, 0.0, np.exp(v[2]), 1, 1, 1, 1])
         loop = task.loop(x)
         f = np.geomspace(0.1, 499, 200)
         open_loop, tracking, noise = independent(loop, np.r_[f, 30.0])
@@ -98,9 +100,11 @@ def test_noise_objective_is_quieter(stand, swing, thor):
 
 def test_derivative_on_the_measurement(stand, swing, thor):
     controller = tuned(
-        stand, swing, thor, bandwidth_hz=30, reference_weights="measurement", max_noise_gain=200, max_complementary=None
-    )
+        stand, swing, thor, bandwidth_hz=30, reference_weights="measurement", max_noise_gain=200,
+        max_complementary=False, max_droop_db=False, min_filter_samples=False,
+    )  # fmt: skip
     assert controller.feasible
+    assert controller.gains["c"] == 0.0
     assert controller.achieved.bandwidth_hz == pytest.approx(30, rel=0.005)
 
 
@@ -227,11 +231,14 @@ def test_a_damaged_controller_json_is_refused(stand, thor, changes):
 
 def test_a_derivative_that_nothing_filters_is_said(stand, thor):
     """The figure is the peak of |C_y S| over frequency, recomputed; a limit, or an objective, takes the note away."""
-    free = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    (note,) = free.notes
+    unfiltered = {"bandwidth_hz": 30, "min_filter_samples": False}
+    free = so.tune(stand, thor, so.ControllerSpec(**unfiltered))
+    lifted, note = free.notes
+    assert lifted.startswith("min_filter_samples")
     assert "1 N of noise on F1 makes up to " in note and "give max_noise_gain" in note
     _, _, noise = independent(free.close(stand, thor), np.linspace(0.1, 499.9, 20_000))
     assert float(note.split("up to ")[1].split(" N")[0]) == pytest.approx(np.abs(noise).max(), rel=5e-3)
     assert f"note: {note}" in repr(free)
     for spec in ({"max_noise_gain": 25}, {"objective": "noise"}):
-        assert so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, **spec)).notes == ()
+        assert so.tune(stand, thor, so.ControllerSpec(**unfiltered, **spec)).notes == (lifted,)
+    assert so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).notes == ()

@@ -126,7 +126,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
 
 def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand, thor):
     """An integrator pushes against 300 N of static friction: 41 N at 4.75 Hz by the spectrum of the last 8 s."""
-    hunter = so.tune(stand, thor, replace(controller.spec, max_noise_gain=None))
+    hunter = so.tune(stand, thor, replace(controller.spec, max_noise_gain=None, reference_weights="error"))
     gains = Gains(**{**hunter.gains, "k_i": hunter.gains["k_i"] + 1.0})
     hunter = replace(hunter, law=gains.law("pid", hunter.sample_time_s))
     plant = so.plants.high_impedance(parts=["stribeck"])

@@ -17,8 +17,10 @@ from tests.laws import law_of, scaled
 from tests.stick_slip import Mass, simulate
 
 SPEC = so.ControllerSpec(
-    bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3, delay_samples=2, current_limit_A=10
-)
+    bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25, max_reference_peak=1.3, delay_samples=2,
+    current_limit_A=10, max_complementary=False, max_droop_db=False, min_filter_samples=False,
+    reference_weights="error",
+)  # fmt: skip
 GAINS = {"reference": 1.0, "measurement": 0.2}
 
 
@@ -54,7 +56,7 @@ def test_steps_overshoot_as_the_independent_simulator_says(blind, stand, rubbing
 
 
 def test_where_no_peak_is_asked_for_the_certificate_says_that_none_is_judged(blind, stand, rubbing):
-    lifted = replace(blind, spec=replace(SPEC, max_reference_peak=None))
+    lifted = replace(blind, spec=replace(SPEC, max_reference_peak=False))
     certificate = so.certify(lifted, {"stand": stand}, rubbing)
     assert not any(row.name == "step_overshoot" for row in certificate.requirements)
     assert any("overshoot" in note for note in certificate.notes)
@@ -62,7 +64,7 @@ def test_where_no_peak_is_asked_for_the_certificate_says_that_none_is_judged(bli
 
 def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
     """A proportional law of static gain 1/(1 + 0.2): every step ends a sixth short."""
-    pd = so.tune(stand, rubbing.update(f_c=0.0), replace(SPEC, current_limit_A=None, max_reference_peak=None))
+    pd = so.tune(stand, rubbing.update(f_c=0.0), replace(SPEC, current_limit_A=None, max_reference_peak=False))
     law = law_of([GAINS["measurement"]], reference=([GAINS["reference"]], [1.0]))
     short = replace(pd, law=law, design=(stand, rubbing))
     found = verify(short, {"stand": stand}, rubbing, scenarios=step_scenarios)

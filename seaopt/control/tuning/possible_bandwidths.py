@@ -1,0 +1,114 @@
+"""Find the bandwidths that keep the limits where the one asked does not, for the tuner's answer.
+
+What is possible is not always an interval that begins at the lowest: below a resonance a law may need more feedback
+than above it. So the range is probed outwards from the bandwidth asked, in steps of a sixth, down and up; the ends of
+what is possible next to it are found by bisection, and the largest of all from the top of the range down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.interior_point import refine
+from seaopt.control.tuning.optimisation_problem import LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.starts import find_starts
+
+PROBE_RATIO = 7.0 / 6.0  # of a probe to the next
+RESOLUTION = 0.01  # to which the end of what is possible is found
+STARTS_TRIED = 2
+PROMISING_USAGE = 1.5  # after the quadratic programs; what misses by more is not refined
+REFINEMENTS = 3  # solutions of the interior-point method
+HIGHEST_BANDWIDTH = 0.249  # of the sample rate
+FAR = 1e3  # how much further away a law counts that does not keep the limits
+HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more is not looked for elsewhere
+
+
+def find_possible_bandwidths(task: Task, x: LawNumbers) -> tuple[PossibleBandwidths, list[LawNumbers]]:
+    """Return the bandwidths in range that keep the limits, and the numbers of the laws at those next to the one asked.
+
+    Parameters
+    ----------
+    task : Task
+        Of a bandwidth that does not keep them.
+    x : array, shape (10,)
+        The numbers that miss them least there.
+
+    """
+    return _Probes(task, x).find()
+
+
+class _Probes:
+    """What was found at the bandwidths tried: how much of a limit is used, 0 where all are kept, and the numbers."""
+
+    def __init__(self, task: Task, x: LawNumbers) -> None:
+        self.task, self.asked = task, task.spec.bandwidth_hz
+        self.tried: dict[float, tuple[float, LawNumbers]] = {self.asked: (np.inf, x)}
+
+    def find(self) -> tuple[PossibleBandwidths, list[LawNumbers]]:
+        """Return what `find_possible_bandwidths` does."""
+        spec = self.task.spec
+        lowest = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
+        highest = min(spec.bandwidth_range_hz[1], HIGHEST_BANDWIDTH * spec.sample_rate_hz)
+        up = self._list_steps(highest)
+        below, above = (self._find_end(steps, self.asked) for steps in (self._list_steps(lowest), up))
+        largest = below if above is None else self._find_end([*reversed(up), above], None)
+        nearest = tuple(f for f in (below, above) if f is not None)
+        missed, closest = min((usage, f) for f, (usage, _) in self.tried.items())
+        possible = PossibleBandwidths(
+            nearest_hz=nearest, largest_hz=largest, closest_hz=closest, missed_by=max(missed - 1.0, 0.0)
+        )
+        return possible, [self.tried[f][1] for f in nearest]
+
+    def _list_steps(self, end: float) -> list[float]:
+        """Return the bandwidths to probe from the one asked, which is not among them, to an end of the range."""
+        count = int(np.ceil(abs(np.log(end / self.asked)) / np.log(PROBE_RATIO)))
+        return [float(f) for f in np.geomspace(self.asked, end, count + 1)[1:]]
+
+    def _find_end(self, steps: Sequence[float], outside: float | None) -> float | None:
+        """Return the first bandwidth that keeps the limits, moved towards the one before, which does not."""
+        for inside in steps:
+            if self._keeps(inside):
+                break
+            outside = inside
+        else:
+            return None
+        while outside is not None and abs(np.log(outside / inside)) > RESOLUTION:
+            middle = float(np.sqrt(inside * outside))
+            inside, outside = (middle, outside) if self._keeps(middle) else (inside, middle)
+        return inside
+
+    def _keeps(self, bandwidth_hz: float) -> bool:
+        """Tell whether a law was found that keeps the limits on the frequencies looked at."""
+        if bandwidth_hz not in self.tried:
+            self.tried[bandwidth_hz] = self._tune(bandwidth_hz)
+        return self.tried[bandwidth_hz][0] == 0.0
+
+    def _tune(self, bandwidth_hz: float) -> tuple[float, LawNumbers]:
+        """Return usage and numbers: from the nearest bandwidth's law first, one that keeps the limits if there is any.
+
+        Close to a bandwidth that is possible, what misses clearly from there is not looked for anywhere else.
+        """
+        task = replace(self.task, spec=replace(self.task.spec, bandwidth_hz=bandwidth_hz))
+        grid = task.grid(place_frequencies(task))
+        apart, kept, start = min(
+            (abs(np.log(f / bandwidth_hz)) + FAR * (usage > 0.0), usage == 0.0, f)
+            for f, (usage, _) in self.tried.items()
+        )
+        x = task.tidy(self.tried[start][1])
+        if kept and task.is_stable(x):
+            x = refine(task, grid, x)
+            usage, _ = task.rank(grid, x)
+            if usage == 0.0 or (apart < np.log(PROBE_RATIO) and usage > HOPELESS_USAGE):
+                return usage, x
+        starts = [x, *find_starts(task, grid, STARTS_TRIED)]
+        x = min((improve(task, grid, one) for one in starts if task.is_stable(one)), key=lambda pair: pair[0])[1]
+        usage, _ = task.rank(grid, x)
+        if usage > PROMISING_USAGE:
+            return usage, x
+        x = refine(task, grid, x, REFINEMENTS)
+        return task.rank(grid, x)[0], x
