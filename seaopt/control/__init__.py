@@ -4,6 +4,7 @@ from seaopt.control.deploy.export import export
 from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
+from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch
@@ -27,9 +28,9 @@ from seaopt.control.tuning.tuner import tune
 
 __all__ = [
     "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "Law", "LawState", "Loop",
-    "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity", "RunnableLaw",
-    "SampledLoop", "TransferFunction", "close_loop", "command_of", "corners", "draw", "estimate_noise", "estimator",
-    "export", "export_mpc", "force_mpc", "margins", "nu_gap", "passivity", "passivity_rows", "realise", "run_loop",
-    "runnable", "sample", "sweep", "tune",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "GateState", "Law", "LawState",
+    "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity",
+    "PlausibilityGate", "RunnableLaw", "SampledLoop", "TransferFunction", "close_loop", "command_of", "corners",
+    "draw", "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "margins", "nu_gap", "passivity",
+    "passivity_rows", "realise", "run_loop", "runnable", "sample", "sweep", "tune",
 ]  # fmt: skip

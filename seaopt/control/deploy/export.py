@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from seaopt.control.laws.controller import GAIN_UNITS, Controller
+from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, realise
 from seaopt.errors import ControlError, FileError
 from seaopt.files import write_text
@@ -50,6 +51,7 @@ def export(
     name: str = "force_law",
     current_limit_A: float | None = None,
     tracking_time_s: float | None = None,
+    gate: PlausibilityGate | None = None,
     allow_infeasible: bool = False,
 ) -> tuple[Path, ...]:
     """Write a controller as C99, with its gains as a C header and as a MATLAB script.
@@ -66,6 +68,8 @@ def export(
         Prefix of every name in C; characters that C does not allow become underscores.
     current_limit_A, tracking_time_s : float, optional
         As in `seaopt.control.laws.realisation.runnable`.
+    gate : PlausibilityGate, optional
+        Which readings the law believes, and what it does about the others.
     allow_infeasible : bool
         Also write a controller that misses its limits; the files state it.
 
@@ -106,7 +110,7 @@ def export(
     if not stored["feasible"] and not allow_infeasible:
         missed = ", ".join(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
-    law = _law(stored, current_limit_A, tracking_time_s)
+    law = _law(stored, current_limit_A, tracking_time_s, gate)
     context = _describe(stored, law) | {
         "achieved": figures,
         "precision": precision,
@@ -162,12 +166,16 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
     return [f"{whence}: {', '.join(parts) or 'nothing that was measured'}."]
 
 
-def _law(stored: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None) -> RunnableLaw:
+def _law(
+    stored: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None,
+    gate: PlausibilityGate | None,
+) -> RunnableLaw:  # fmt: skip
     return realise(
         stored["law"],
         per_effort=stored["command"].per_effort,
         current_limit_A=stored["spec"].current_limit_A if current_limit_A is None else current_limit_A,
         tracking_time_s=tracking_time_s,
+        gate=gate,
     )
 
 
@@ -184,6 +192,8 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         "order": law.c.size,
         "storage": max(law.c.size, 1),
         "integrators": law.integrators,
+        "gated": law.gate is not None,
+        "max_held": law.gate.max_held if law.gate is not None else 0,
     }
 
 
@@ -229,6 +239,14 @@ def _numbers(
         "per_effort": number(law.per_effort),
         "per_effort_unit": stored["command"].per_effort_unit,
         "sample_time_s": number(law.sample_time_s),
+        "gate": {}
+        if law.gate is None
+        else {
+            "low": number(law.gate.range_N[0]),
+            "high": number(law.gate.range_N[1]),
+            "step": number(law.gate.max_step_N),
+            "ramp": number(law.gate.ramp_A_per_s * law.sample_time_s),
+        },
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
             {"name": _identifier(key), "value": number(float(value)), "unit": GAIN_UNITS.get(key, "")}

@@ -35,6 +35,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.loops.law import Law
 from seaopt.errors import ControlError
 from seaopt.records import record
@@ -54,12 +55,20 @@ class LawState:
         The last command.
     held : int
         Samples in a row that were not used because a number in them was not finite.
+    gate : GateState
+        What the plausibility gate, where there is one, has seen.
 
     """
 
     x: Vector
     current_A: float = 0.0
     held: int = 0
+    gate: GateState = GateState()
+
+    @property
+    def status(self) -> str:
+        """Tell "ok", "held" (a reading was not used) or "fault" (the command goes to zero until the law is reset)."""
+        return "held" if self.held and not self.gate.fault else self.gate.status
 
 
 @record(eq=False)
@@ -82,6 +91,8 @@ class RunnableLaw:
         The command is this times F: A/N or A/(N m).
     current_limit_A : float
         The command's largest magnitude; infinite where there is no limit.
+    gate : PlausibilityGate, optional
+        Which readings are believed.
 
     """
 
@@ -97,6 +108,7 @@ class RunnableLaw:
     sample_time_s: float
     per_effort: float
     current_limit_A: float
+    gate: PlausibilityGate | None = None
 
     @property
     def force_limit_N(self) -> float:
@@ -145,18 +157,25 @@ class RunnableLaw:
         """Return the current (A) to command at this sample, and the next state.
 
         A sample with a number that is not finite, in its inputs or in what would follow, is not used: the last command
-        is held, the state stays, and `held` counts.
+        is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and takes the
+        command to zero at a fault.
         """
+        seen = state.gate
+        if self.gate is not None:
+            measurement, seen = self.gate.screen(seen, measurement)
+            if seen.fault:
+                current = self.gate.ramp(state.current_A, self.sample_time_s)
+                return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen)
         with np.errstate(all="ignore"):
             force = float(self.c @ state.x) + self.d_reference * reference - self.d_measurement * measurement
             applied = min(max(force, -self.force_limit_N), self.force_limit_N)
             x = self.a @ state.x + self.b_reference * reference - self.b_measurement * measurement
             x += self.anti_windup * (applied - force)
         if not (math.isfinite(force) and np.all(np.isfinite(x))):
-            return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1)
+            return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1, gate=seen)
         current = applied * self.per_effort
         current = min(max(current, -self.current_limit_A), self.current_limit_A)  # a limit to the last bit
-        return current, LawState(x=x, current_A=current)
+        return current, LawState(x=x, current_A=current, gate=seen)
 
     def run(
         self,
@@ -173,8 +192,9 @@ class RunnableLaw:
 
 
 def runnable(
-    controller: Controller, *, current_limit_A: float | None = None, tracking_time_s: float | None = None
-) -> RunnableLaw:
+    controller: Controller, *, current_limit_A: float | None = None, tracking_time_s: float | None = None,
+    gate: PlausibilityGate | None = None,
+) -> RunnableLaw:  # fmt: skip
     """Return a controller's law ready to run.
 
     Parameters
@@ -185,6 +205,8 @@ def runnable(
         The specification's if left out; infinite where neither is given.
     tracking_time_s : float, optional
         T_t of the anti-windup; the module's docstring has the default.
+    gate : PlausibilityGate, optional
+        Which readings are believed.
 
     Raises
     ------
@@ -207,12 +229,14 @@ def runnable(
         per_effort=controller.command.per_effort,
         current_limit_A=limit,
         tracking_time_s=tracking_time_s,
+        gate=gate,
     )
 
 
 def realise(
-    law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None
-) -> RunnableLaw:
+    law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None,
+    gate: PlausibilityGate | None = None,
+) -> RunnableLaw:  # fmt: skip
     """Return a law of one measured signal with limit and anti-windup.
 
     Parameters
@@ -225,6 +249,8 @@ def realise(
         None: no limit.
     tracking_time_s : float, optional
         T_t; the module's docstring has the default.
+    gate : PlausibilityGate, optional
+        Which readings are believed.
 
     Raises
     ------
@@ -260,6 +286,7 @@ def realise(
         sample_time_s=law.sample_time_s,
         per_effort=per_effort,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
+        gate=gate,
     )
 
 

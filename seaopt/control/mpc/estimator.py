@@ -168,9 +168,9 @@ class Estimator:
     def correct(
         self, state: EstimatorState, y: Float[np.ndarray, " ny"], applied: Float[np.ndarray, " nu"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " ny"]]:
-        """Return z with this sample's measurement, and the innovation; a NaN measurement corrects nothing."""
+        """Return z with this sample's measurement, and the innovation; one that is not finite corrects nothing."""
         innovation = y - self.offset - self.C @ state.predicted - self.D @ applied
-        return state.predicted + self.gain @ np.where(np.isnan(innovation), 0.0, innovation), innovation
+        return state.predicted + self.gain @ np.where(np.isfinite(innovation), innovation, 0.0), innovation
 
     def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
         """Process one sample: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""

@@ -60,12 +60,16 @@ def _format_data(mpc: ForceMPC) -> str:
     rows = prediction.knots.size + len(prediction.M)
     sizes = {
         "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": spec.delay_samples,
-        "KNOTS": prediction.knots.size, "ROWS": rows,
+        "KNOTS": prediction.knots.size, "ROWS": rows, "GATE": int(mpc.gate is not None),
+        "MAX_HELD": 0 if mpc.gate is None else mpc.gate.max_held,
     }  # fmt: skip
     numbers = {
         "limit": spec.current_limit_A, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
         "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO,
     }  # fmt: skip
+    if mpc.gate is not None:
+        (numbers["low"], numbers["high"]), numbers["step"] = mpc.gate.range_N, mpc.gate.max_step_N
+        numbers["ramp"] = mpc.gate.ramp_A_per_s * spec.sample_time_s
     arrays = {
         "A": kalman.A, "B": kalman.B[:, 0], "C": kalman.C[0], "gain": kalman.gain[:, 0], "rest": mpc.rest,
         "F": prediction.F, "M": prediction.M, "shift": mpc.shift,

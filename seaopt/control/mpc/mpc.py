@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import command_of
+from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -58,6 +59,8 @@ class MPCState:
         The currents planned at the knots, A.
     dual : array, shape (m,)
         Of the last program, where the next starts.
+    gate : GateState
+        What the plausibility gate, where there is one, has seen; its `status` is "ok", "held" or "fault".
 
     """
 
@@ -65,6 +68,7 @@ class MPCState:
     current_A: float
     plan: Float[np.ndarray, " n"]
     dual: Float[np.ndarray, " m"]
+    gate: GateState = GateState()
 
 
 @record(eq=False)
@@ -124,6 +128,8 @@ class ForceMPC:
         The plant's state at rest per ampere.
     shift : array, shape (n, n)
         Shifts the plan at the knots by one sample.
+    gate : PlausibilityGate, optional
+        Which measurements are believed; the others are predicted, and at a fault the current goes to zero.
 
     """
 
@@ -136,6 +142,7 @@ class ForceMPC:
     rest: Float[np.ndarray, " nx"]
     shift: Float[np.ndarray, "n n"]
     solver: Any
+    gate: PlausibilityGate | None = None
 
     @property
     def start(self) -> MPCState:
@@ -144,7 +151,7 @@ class ForceMPC:
         return MPCState(kalman=self.kalman.start, current_A=0.0, plan=np.zeros(n), dual=np.zeros(m))
 
     def step(self, state: MPCState, reference_N: float, measurement_N: float) -> MPCStep:
-        """Return the current for a reference and a measured force; a NaN measurement is predicted instead.
+        """Return the current for a reference and a measured force; one that is not finite is predicted instead.
 
         Raises
         ------
@@ -155,13 +162,18 @@ class ForceMPC:
         began = time.perf_counter()
         if not np.isfinite(reference_N):
             raise ControlError(f"reference_N = {reference_N}: not a force; hold the last one instead")
-        limit, last = self.spec.current_limit_A, state.current_A
+        limit, last, seen = self.spec.current_limit_A, state.current_A, state.gate
+        if self.gate is not None:
+            _, seen = self.gate.screen(seen, measurement_N)
+            measurement_N = np.nan if seen.held else measurement_N
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
         xi, u_s, target = self._targets(ahead, reference_N)
         q, low, high = self.program(xi, u_s, last)
         first = (self.shift @ state.plan - u_s) / limit
         theta, dual, status, info = solve_program(self.solver, q, low, high, first, state.dual)
         status = status or self._fault(theta, low, high)
+        if self.gate is not None and seen.fault:
+            status, u_s = "sensor fault", self.gate.ramp(last, self.spec.sample_time_s)
         if status:
             theta, dual = np.zeros_like(q), np.zeros_like(low)
             plan = np.full(q.size, u_s)
@@ -173,7 +185,7 @@ class ForceMPC:
         kalman = self._advance(state.kalman, corrected, innovation, current)
         return MPCStep(
             current_A=current, solved=not status, status=status or "solved", target_N=target,
-            state=MPCState(kalman=kalman, current_A=current, plan=plan, dual=dual),
+            state=MPCState(kalman=kalman, current_A=current, plan=plan, dual=dual, gate=seen),
             force_N=float(self.kalman.C[0] @ corrected), iterations=int(info.iter), solve_time_s=float(info.run_time),
             step_time_s=time.perf_counter() - began,
         )  # fmt: skip
@@ -292,7 +304,9 @@ class ForceMPC:
     _repr_html_ = html_text
 
 
-def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceMPC:
+def force_mpc(
+    plant: Plant, params: ParameterSet | Fit, spec: MPCSpec, *, gate: PlausibilityGate | None = None
+) -> ForceMPC:
     """Return a force controller that plans within current and slew limits.
 
     Parameters
@@ -301,6 +315,8 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
         The design plant, the test stand as a rule, and its parameters; its first input is the motor current.
     spec : MPCSpec
         Limits and bandwidth.
+    gate : PlausibilityGate, optional
+        Which measurements are believed.
 
     Raises
     ------
@@ -347,6 +363,7 @@ def force_mpc(plant: Plant, params: ParameterSet | Fit, spec: MPCSpec) -> ForceM
     return ForceMPC(
         spec=spec, design=(plant, values), kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
+        gate=gate,
     )  # fmt: skip
 
 

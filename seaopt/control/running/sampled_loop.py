@@ -60,6 +60,8 @@ class SampledLoop:
                 f'measured = "{self.measured}" is not an output of {plant.name}; '
                 + suggestion(self.measured, plant.outputs)
             )
+        if self.law.gate is not None:
+            raise SimulationError("law has a plausibility gate, which this simulation leaves out; use close_loop")
         for what in ("current_step_A", "longest_delay_s"):
             if not getattr(self, what) >= 0.0:
                 raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")

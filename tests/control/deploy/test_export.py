@@ -73,7 +73,15 @@ class Compiled:
         order = int(re.search(r"_ORDER (\d+)", (folder / "law.h").read_text())[1])
 
         class Law(ctypes.Structure):
-            _fields_ = (("x", real * max(order, 1)), ("current_A", real), ("held", ctypes.c_ulong))
+            _fields_ = (
+                ("x", real * max(order, 1)),
+                ("current_A", real),
+                ("held", ctypes.c_ulong),
+                ("status", ctypes.c_int),
+                ("refused", ctypes.c_ulong),
+                ("measurement_N", real),
+                ("known", ctypes.c_int),
+            )  # fmt: skip; the last three are there with a gate
 
         self.law, self.library = Law(), ctypes.CDLL(str(library))
         self.library.law_step.argtypes = [ctypes.POINTER(Law), real, real]

@@ -1,4 +1,4 @@
-/* Lines of reference and measurement (N) in; current (A), solved, iterations and the step's time (s) out. */
+/* Lines of reference and measurement (N) in; current (A), solved, iterations, the step's time (s) and status out. */
 #include <stdio.h>
 #include <time.h>
 
@@ -12,7 +12,7 @@ int main(void) {
     clock_t began = clock();
     double current = (double)force_mpc_step(&controller, (OSQPFloat)reference, (OSQPFloat)measurement);
     double took = (double)(clock() - began) / CLOCKS_PER_SEC;
-    printf("%.17g %d %d %.9f\n", current, controller.solved, controller.iterations, took);
+    printf("%.17g %d %d %.9f %d\n", current, controller.solved, controller.iterations, took, controller.status);
   }
   return 0;
 }

@@ -68,13 +68,35 @@ static int solve(force_mpc *s, const OSQPFloat *error, OSQPFloat rest) {
   return 1;
 }
 
+#if FORCE_MPC_GATE
+/* Whether a measurement is believed: in range, and no further from the last than the plant moves since. */
+static int believed(force_mpc *s, OSQPFloat measurement) {
+  OSQPFloat moved = measurement > s->measurement ? measurement - s->measurement : s->measurement - measurement;
+  if (s->refused > FORCE_MPC_MAX_HELD) return 0;
+  if (!(measurement >= mpc_low && measurement <= mpc_high) ||
+      (s->known && !(moved <= mpc_step * (OSQPFloat)(s->refused + 1)))) {
+    s->refused++;
+    return 0;
+  }
+  s->measurement = measurement;
+  s->known = 1;
+  s->refused = 0;
+  return 1;
+}
+#endif
+
 void force_mpc_reset(force_mpc *s) { memset(s, 0, sizeof *s); }
 
 OSQPFloat force_mpc_step(force_mpc *s, OSQPFloat reference, OSQPFloat measurement) {
   OSQPFloat ahead[STATES], error[PLANT + 1];
   if (finite_number(reference)) s->reference = reference;
   OSQPFloat innovation = measurement - mpc_offset - dot(mpc_C, s->z, STATES);
-  if (finite_number(innovation))
+  int used = finite_number(innovation);
+#if FORCE_MPC_GATE
+  used = believed(s, measurement);
+#endif
+  s->status = used ? FORCE_MPC_OK : FORCE_MPC_HELD;
+  if (used)
     for (int i = 0; i < STATES; i++) s->z[i] += mpc_gain[i] * innovation;
   s->force = dot(mpc_C, s->z, STATES);
 
@@ -86,6 +108,13 @@ OSQPFloat force_mpc_step(force_mpc *s, OSQPFloat reference, OSQPFloat measuremen
   error[PLANT] = s->current - rest;
 
   s->solved = solve(s, error, rest);
+#if FORCE_MPC_GATE
+  if (s->refused > FORCE_MPC_MAX_HELD) {
+    s->status = FORCE_MPC_FAULT;
+    s->solved = 0;
+    rest = s->current > mpc_ramp ? s->current - mpc_ramp : s->current < -mpc_ramp ? s->current + mpc_ramp : 0;
+  }
+#endif
   if (!s->solved) {
     for (int i = 0; i < KNOTS; i++) s->plan[i] = rest;
     memset(s->dual, 0, sizeof s->dual);

@@ -17,7 +17,15 @@ typedef struct {
   OSQPFloat dual[FORCE_MPC_ROWS];
   int solved;                     /* 0: the last command is the safe one, not the solver's */
   int iterations;
+  int status;                     /* FORCE_MPC_OK, _HELD or _FAULT */
+  unsigned long refused;          /* measurements in a row that were not believed */
+  OSQPFloat measurement;          /* the last that was (N) */
+  int known;                      /* whether there was one */
 } force_mpc;
+
+/* The measurement was used; it was predicted instead; a fault: the current goes to zero until a reset. The last is
+ * reported with a plausibility gate alone (FORCE_MPC_GATE). */
+enum { FORCE_MPC_OK, FORCE_MPC_HELD, FORCE_MPC_FAULT };
 
 /* At rest at zero. */
 void force_mpc_reset(force_mpc *s);

@@ -1,0 +1,175 @@
+r"""A gate in front of a running law: readings that cannot be true are bridged, a sensor that stays wrong is a fault.
+
+A reading is plausible if it is a number within its range and no further from the last plausible one than the plant
+moves in the time since: with h readings refused in between, `max_step_N` (h + 1), so that a force that really has
+moved is believed again as soon as it can have got there. Up to `max_held` readings in a row that are not plausible are
+replaced by the last that was. One more is a fault: from then on the law stands still, the command goes to zero at
+`ramp_A_per_s`, and stays there until the law is reset, for a sensor that comes back is not one to trust.
+
+The most that a sampled plant can move between two samples while the effort stays within :math:`\pm F` is
+
+.. math:: F \sum_k |h_{k+1} - h_k| , \qquad h \text{ its response to an effort of one at one sample,}
+
+reached by an effort that has the signs of these terms. A link that the world pushes moves further: `of_controller`
+takes a factor for that.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from seaopt.control.laws.controller import Controller
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+SETTLED = 1e-12  # of the largest term: a response below it is over
+MOST_TERMS = 200_000
+
+
+@record
+class GateState:
+    """The last plausible reading (NaN: none yet), how many in a row were not, and whether that became a fault."""
+
+    measurement: float = math.nan
+    held: int = 0
+    fault: bool = False
+
+    @property
+    def status(self) -> str:
+        """Tell "ok", "held" or "fault"."""
+        return "fault" if self.fault else "held" if self.held else "ok"
+
+
+@record
+class PlausibilityGate:
+    """Which readings a running law believes, and what it does about the others.
+
+    Parameters
+    ----------
+    range_N : (low, high)
+        Of the sensor, in units of the measured effort.
+    max_step_N : float
+        Largest change from one sample to the next.
+    max_held : int
+        Readings in a row that are bridged.
+    ramp_A_per_s : float
+        How fast the command goes to zero at a fault.
+
+    Raises
+    ------
+    ControlError
+        A value is out of range.
+
+    Examples
+    --------
+    >>> gate = PlausibilityGate(range_N=(-2000, 2000), max_step_N=100, max_held=2, ramp_A_per_s=50)
+    >>> state = GateState(measurement=10.0)
+    >>> for reading in (20.0, 1e4, float("nan"), float("nan")):
+    ...     used, state = gate.screen(state, reading)
+    ...     print(used, state.status)
+    20.0 ok
+    20.0 held
+    20.0 held
+    20.0 fault
+
+    """
+
+    range_N: tuple[float, float]
+    max_step_N: float
+    max_held: int
+    ramp_A_per_s: float
+
+    def __post_init__(self) -> None:
+        low, high = self.range_N
+        if not -math.inf < low < high < math.inf:
+            raise ControlError(f"range_N = ({low:g}, {high:g}) is not a range; give finite low < high")
+        for name in ("max_step_N", "ramp_A_per_s"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ControlError(f"{name} = {value:g} is not positive and finite; give a positive number")
+        if isinstance(self.max_held, bool) or self.max_held != int(self.max_held) or self.max_held < 0:
+            raise ControlError(f"max_held = {self.max_held!r} is not a number of samples; give 0, 1, ...")
+
+    def screen(self, state: GateState, measurement: float) -> tuple[float, GateState]:
+        """Return the reading to use, and the next state; NaN where there was none yet."""
+        if state.fault:
+            return state.measurement, state
+        low, high = self.range_N
+        known = not math.isnan(state.measurement)
+        moved = abs(measurement - state.measurement) if known else 0.0
+        if low <= measurement <= high and moved <= self.max_step_N * (state.held + 1):
+            return measurement, GateState(measurement=measurement)
+        held = state.held + 1
+        return state.measurement, GateState(measurement=state.measurement, held=held, fault=held > self.max_held)
+
+    def ramp(self, current_A: float, sample_time_s: float) -> float:
+        """Return the command a sample later, at a fault."""
+        step = self.ramp_A_per_s * sample_time_s
+        return math.copysign(max(abs(current_A) - step, 0.0), current_A)
+
+    @classmethod
+    def of_controller(
+        cls, controller: Controller, *, range_N: tuple[float, float], max_held: int = 5, ramp_s: float = 0.1,
+        margin: float = 3.0,
+    ) -> PlausibilityGate:  # fmt: skip
+        """Return a gate with the step that the design plant makes at most, times a margin for what the world does.
+
+        Parameters
+        ----------
+        controller : Controller
+            With its design plant and a current limit.
+        range_N : (low, high)
+            Of the sensor.
+        max_held : int
+            Readings in a row that are bridged.
+        ramp_s : float
+            Time in which the command goes from the current limit to zero at a fault.
+        margin : float
+            On the step, for forces from outside.
+
+        Raises
+        ------
+        ControlError
+            The controller has no current limit or no design plant, or the plant does not come to rest by itself.
+
+        Examples
+        --------
+        >>> import seaopt as so
+        >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+        >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
+        >>> gate = PlausibilityGate.of_controller(controller, range_N=(-4000.0, 4000.0))
+        >>> print(f"{gate.max_step_N:.0f} N, {gate.ramp_A_per_s:.0f} A/s")
+        473 N, 90 A/s
+
+
+        """
+        limit = controller.spec.current_limit_A
+        if limit is None or controller.design is None:
+            raise ControlError("the controller has no current limit or no design plant; give max_step_N yourself")
+        plant = controller.close(*controller.design).plant
+        step = largest_step(plant, limit / controller.command.per_effort)
+        return cls(range_N=range_N, max_step_N=margin * step, max_held=max_held, ramp_A_per_s=limit / ramp_s)
+
+
+def largest_step(plant: DigitalPlant, effort_limit: float) -> float:
+    """Return how far a plant's output moves at most between two samples while its effort is within a limit.
+
+    Raises
+    ------
+    ControlError
+        The plant does not come to rest by itself.
+
+    """
+    if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) >= 1.0:
+        raise ControlError("the plant does not come to rest by itself, so that no step is the largest; give max_step_N")
+    x, before, total, largest = plant.b, plant.d, abs(plant.d), abs(plant.d)
+    for _ in range(MOST_TERMS):
+        now = float(plant.c @ x)
+        total += abs(now - before)
+        largest, before, x = max(largest, abs(now)), now, plant.a @ x
+        if np.linalg.norm(plant.c) * np.linalg.norm(x) <= SETTLED * largest:
+            break
+    return effort_limit * (total + abs(before))
