@@ -24,7 +24,7 @@ NEWTON_STEPS = 8
 
 @dataclass(frozen=True)
 class Mass:
-    """An actuator with its links fixed: kg, N s/m, N/m, N; v_s and v_st in m/s, v_s = 0 for a jump."""
+    """An actuator with its links fixed: kg, N s/m, N/m, N; v_s and v_st in m/s, v_s = 0 for a jump; half the play."""
 
     m: float
     b: float
@@ -33,6 +33,7 @@ class Mass:
     f_s: float = 0.0
     v_s: float = 0.0
     v_st: float = 1.0
+    play: float = 0.0
 
     @classmethod
     def of(cls, p: Mapping[str, float], *, jump: bool = False) -> Mass:
@@ -41,6 +42,7 @@ class Mass:
         return cls(
             m=p["J"] / r**2 + p["m_l"], b=p["b_r"] / r**2, k=p["k"], f_c=p["f_c"], f_s=p.get("f_s", 0.0),
             v_s=0.0 if jump else p["v_s"], v_st=p.get("v_st", 1.0),
+            play=p.get("g_b", 0.0),
         )  # fmt: skip
 
 
@@ -78,9 +80,8 @@ def simulate(
     """
     period = laws[0]["sample_time_s"]
     n = reference.shape[1]
-    m, b, k, f_c, f_s, v_s, v_st = (
-        np.array([getattr(each, name) for each in masses]) for name in ("m", "b", "k", "f_c", "f_s", "v_s", "v_st")
-    )
+    names = ("m", "b", "k", "f_c", "f_s", "v_s", "v_st", "play")
+    m, b, k, f_c, f_s, v_s, v_st, play = (np.array([getattr(each, name) for each in masses]) for name in names)
     f_s = np.maximum(f_s, f_c)
     h = period / substeps
     steps = [_DifferenceEquations(laws, path) for path in ("reference", "measurement")]
@@ -88,19 +89,19 @@ def simulate(
     effort, force = np.zeros((len(masses), n)), np.zeros((len(masses), n))
     q, largest = np.zeros(len(masses)), np.zeros(len(masses))
     v = np.zeros(len(masses)) if velocity is None else np.array(velocity, dtype=float)
-    inertia = m + THETA * h * (b + THETA * h * k)
     for sample in range(n):
-        force[:, sample] = k * q
+        force[:, sample] = k * (q - np.clip(q, -play, play))
         effort[:, sample] = steps[0].step(reference[:, sample]) - steps[1].step(force[:, sample])
         before = sample - delays
         applied = np.where(before >= 0, effort[np.arange(len(masses)), np.maximum(before, 0)], 0.0)
         for _ in range(substeps):
             level = f_c + (f_s - f_c) * np.exp(-((v / v_st) ** 2))
-            push = m * v + THETA * h * (applied - k * q)
+            push = m * v + THETA * h * (applied - k * (q - np.clip(q, -play, play)))
+            inertia = m + THETA * h * (b + THETA * h * k * (np.abs(q) >= play))
             mean = _solve_velocity(inertia, push, THETA * h * level, v_s)
             q = q + h * mean
             v = (mean - (1.0 - THETA) * v) / THETA
-            largest = np.maximum(largest, np.abs(k * q))
+            largest = np.maximum(largest, np.abs(k * (q - np.clip(q, -play, play))))
     return Runs(time=period * np.arange(n), force=force, effort=effort, largest=largest)
 
 

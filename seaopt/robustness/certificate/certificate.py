@@ -42,14 +42,14 @@ from seaopt.robustness.certificate.simulated import (
 from seaopt.robustness.uncertainty.delay_margin import LONGEST_DELAY, sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
-from seaopt.robustness.verification.limit_cycles import FrictionCycle, list_step_cycles, seek_limit_cycles
+from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
 from seaopt.robustness.verification.verification import Verification
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
 ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
 MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
-FRICTION_CYCLE = "friction_cycle_N"
+LIMIT_CYCLE = "limit_cycle_N"
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",
@@ -195,8 +195,9 @@ class Certificate:
         The results of `with_simulation`.
     steps : Verification, str or None
         The simulated steps that every plant is judged by; the reason where they cannot be simulated.
-    cycles : mapping of name to tuple of FrictionCycle
-        Of each model whose friction is not proved harmless: limit cycles predicted and simulated.
+    cycles : mapping of name to tuple of FoundCycle
+        Of each model whose friction is not proved harmless, or whose play makes some: limit cycles predicted and
+        simulated.
     brackets : mapping of name to Bracket
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
@@ -220,7 +221,7 @@ class Certificate:
     varied: tuple[Varied, ...] = ()
     simulated: Simulated | None = None
     steps: Verification | str | None = None
-    cycles: Mapping[str, tuple[FrictionCycle, ...]] = field(default_factory=dict[str, tuple[FrictionCycle, ...]])
+    cycles: Mapping[str, tuple[FoundCycle, ...]] = field(default_factory=dict[str, tuple[FoundCycle, ...]])
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
     friction_draws: Mapping[str, FrictionDraws] = field(default_factory=dict[str, FrictionDraws])
@@ -285,19 +286,20 @@ class Certificate:
     def play_steps(self) -> Certificate:
         """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
         steps = simulate_steps(self.controller, self.models, self.parameters, self._draws())
-        cycles = {
-            name: seek_limit_cycles(self.controller, self.models[name], self.parameters)
-            + (list_step_cycles(steps, name) if isinstance(steps, Verification) else ())
-            for name, margin in self.friction.items()
-            if not margin.proved
-        }
+        cycles: dict[str, tuple[FoundCycle, ...]] = {}
+        for name, model in self.models.items():
+            proved = name not in self.friction or self.friction[name].proved
+            found = seek_limit_cycles(self.controller, model, self.parameters, proved=proved)
+            if found or not proved:
+                ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
+                cycles[name] = (*found, *ends)
         return replace(self, steps=steps, cycles=cycles)
 
     def _require_cycles(self) -> list[Requirement]:
         """Return the limit cycles that last; those that steps end in are required of the steps."""
         return [
             Requirement(
-                name=FRICTION_CYCLE, limit=0.0, value=np.inf if cycle.simulated_N is None else cycle.simulated_N,
+                name=LIMIT_CYCLE, limit=0.0, value=np.inf if cycle.simulated_N is None else cycle.simulated_N,
                 met=False, where=f"{name}: {cycle}",
             )
             for name, cycles in self.cycles.items()
@@ -403,13 +405,7 @@ class Certificate:
                 | {"worst": self._worst_dict(name)}
                 for name, figures in self.plants.items()
             },
-            "friction": {
-                name: {"sector_stable": True if margin.proved else self._find_instability(name)}
-                | _list_fields(margin)
-                | {"limit_cycles": [cycle.to_dict() for cycle in self.cycles.get(name, ())]}
-                | {"draws": _list_fields(self.friction_draws[name]) if name in self.friction_draws else None}
-                for name, margin in self.friction.items()
-            },
+            "friction": {name: self._friction_dict(name) for name in dict.fromkeys((*self.friction, *self.cycles))},
             "monte_carlo": _list_fields(self.monte_carlo),
             "varied": [_list_fields(varied) for varied in self.varied],
             "remarks": list(self.remarks),
@@ -436,7 +432,10 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        friction = [f"{name}: {margin}{self._describe_proof(name)}" for name, margin in self.friction.items()]
+        friction = [
+            f"{name}: {self.friction.get(name, 'play')}{self._describe_proof(name)}"
+            for name in dict.fromkeys((*self.friction, *self.cycles))
+        ]
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
@@ -455,6 +454,16 @@ class Certificate:
         """Return what draws and predicted limit cycles add to a plant's proof, or to that there is none."""
         drawn = f"; {self.friction_draws[name]}" if name in self.friction_draws else ""
         return drawn + self._describe_cycles(name)
+
+    def _friction_dict(self, name: str) -> dict[str, Any]:
+        """Return what friction and play do to a plant; a plant with play alone has no sector."""
+        margin, cycles = self.friction.get(name), self.cycles.get(name, ())
+        stable = True if margin is not None and margin.proved and not cycles else self._find_instability(name)
+        proof: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
+        if margin is not None:
+            draws = _list_fields(self.friction_draws[name]) if name in self.friction_draws else None
+            proof |= _list_fields(margin) | {"draws": draws}
+        return proof
 
     def _find_instability(self, name: str) -> bool | None:
         """Return False where an oscillation lasts in a simulation, None where nothing is proved either way."""

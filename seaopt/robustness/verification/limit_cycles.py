@@ -1,4 +1,4 @@
-"""Limit cycles of friction looked for by simulation, where stability is not proved, for the certificate.
+"""Limit cycles of friction and of play, looked for by simulation, for the certificate.
 
 A cycle that the describing function predicts is started from: the plant in the predicted state, pushed beyond it, law
 and commands at rest, a reference of zero. What is left after many periods has found itself, whatever was predicted.
@@ -14,6 +14,7 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
+from seaopt.control.laws.play_cycles import predict_play_cycles
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import SimulationError
@@ -31,7 +32,7 @@ FLOOR = 0.05  # of the predicted force: a smaller oscillation is one that dies o
 
 
 @record
-class FrictionCycle:
+class FoundCycle:
     """A limit cycle: predicted, and what the simulation that starts there does.
 
     Parameters
@@ -82,21 +83,25 @@ class FrictionCycle:
         return "; ".join(parts)
 
 
-def seek_limit_cycles(controller: Controller, plant: Plant, params: ParameterSet) -> tuple[FrictionCycle, ...]:
-    """Return the limit cycles that friction may make, predicted and simulated, at rest at zero.
+def seek_limit_cycles(
+    controller: Controller, plant: Plant, params: ParameterSet, *, proved: bool = False
+) -> tuple[FoundCycle, ...]:
+    """Return the limit cycles that friction, unless it is proved to make none, and play may make, at rest at zero.
 
-    A plant that cannot be simulated has none here; its steps say why.
+    They are predicted and simulated. A plant that cannot be simulated has none here; its steps say why.
     """
+    predicted = () if proved else predict_limit_cycles(controller, plant, params)
+    predicted += predict_play_cycles(controller, plant, params)
     try:
-        return tuple(_simulate(controller, plant, params, c) for c in predict_limit_cycles(controller, plant, params))
+        return tuple(_simulate(controller, plant, params, cycle) for cycle in predicted)
     except SimulationError:
         return ()
 
 
-def list_step_cycles(runs: Verification, plant: str) -> tuple[FrictionCycle, ...]:
+def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
     """Return the oscillations that steps on a plant end in, at its nominal parameters."""
     return tuple(
-        FrictionCycle(
+        FoundCycle(
             predicted=None,
             simulated_N=row.limit_cycle_N,
             simulated_hz=row.limit_cycle_hz,
@@ -107,7 +112,7 @@ def list_step_cycles(runs: Verification, plant: str) -> tuple[FrictionCycle, ...
     )
 
 
-def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle: LimitCycle) -> FrictionCycle:
+def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle: LimitCycle) -> FoundCycle:
     period = controller.sample_time_s
     loop = SampledLoop(
         plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
@@ -118,12 +123,12 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
     force = run.outputs[loop.measured][0]
     if not np.all(np.isfinite(force)):
-        return FrictionCycle(predicted=cycle, simulated_N=None, simulated_hz=None, runs_away=True)
+        return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None, runs_away=True)
     end = force[-int(JUDGED * force.size) :]
     line = find_oscillation(end, period, floor=FLOOR * cycle.force_N, lowest_hz=0.3 * cycle.frequency_hz)
     if line is None or not (line.sustained or line.growing):
-        return FrictionCycle(predicted=cycle, simulated_N=None, simulated_hz=None)
-    return FrictionCycle(
+        return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None)
+    return FoundCycle(
         predicted=cycle, simulated_N=None if line.growing else line.amplitude,
         simulated_hz=None if line.growing else line.frequency_hz, runs_away=line.growing,
     )  # fmt: skip

@@ -10,6 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
+from seaopt.control.laws.play_cycles import predict_play_cycles
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
 from seaopt.robustness.verification.limit_cycles import seek_limit_cycles
@@ -112,7 +113,7 @@ def test_a_cycle_that_the_current_holds_fails_the_certificate(blind, stand, rubb
     assert friction["sector_stable"] is False
     cycle = friction["limit_cycles"][0]
     assert cycle["simulated"]["frequency_hz"] == pytest.approx(cycle["predicted"]["frequency_hz"], rel=0.1)
-    (row,) = [row for row in certificate.requirements if row.name == "friction_cycle_N"]
+    (row,) = [row for row in certificate.requirements if row.name == "limit_cycle_N"]
     assert not row.met and row.value == cycle["simulated"]["force_N"]
 
 
@@ -125,3 +126,24 @@ def test_near_the_edge_nothing_is_predicted_and_stability_is_proved(blind, stand
     certificate = so.certify(edge, {"stand": stand}, rubbing)
     assert certificate.to_dict()["friction"]["stand"]["sector_stable"] is True
     assert certificate.cycles == {}
+
+
+def test_play_makes_the_cycle_of_an_independent_simulator(stand, thor):
+    """An integral and little damping: within the play the spring is soft, and the loop grows into it."""
+    loose = so.plants.high_impedance(parts=["backlash"])
+    params = loose.complete(thor).update(g_b=5e-5, eps_b=1e-6, b_r=2e-5)
+    tight = so.tune(stand, thor.update(b_r=2e-5), so.ControllerSpec(bandwidth_hz=20))
+    ahead, back = laws.multiply_out("pid", 1e-3, k_p=0.07, k_i=85.0, k_d=0.036, T_f=1e-3, k_r=1.07)
+    controller = replace(tight, law=laws.law_of(back.num, back.den, (ahead.num, ahead.den)))
+    assert predict_play_cycles(controller, stand, thor) == ()
+    (found,) = seek_limit_cycles(controller, loose, params)
+    assert found.predicted.stable and found.lasts
+    mass = Mass.of({name: params[name].value for name in params})
+    runs = simulate([mass], [controller.to_dict()], np.zeros((1, 3000)), substeps=20, velocity=np.array([0.03]))
+    end = runs.force[0, -2048:]
+    spectrum = np.abs(np.fft.rfft(end * np.hanning(2048), 16384)) / 512.0
+    top = int(np.argmax(spectrum))
+    assert found.simulated_hz == pytest.approx(top / 16.384, rel=0.01)
+    assert found.simulated_N == pytest.approx(spectrum[top], rel=0.03)
+    assert found.predicted.frequency_hz == pytest.approx(top / 16.384, rel=0.03)
+    assert found.predicted.force_N == pytest.approx(spectrum[top], rel=0.1)
