@@ -51,6 +51,7 @@ SLOWEST = 10.0  # times slower than the bandwidth: the slowest oscillation that 
 LINE_PERIODS = 8.0  # of the slowest oscillation, in the window
 SHORTER = 4.0  # times shorter: the second window
 STILL_PERIODS = 4.0  # where no link moves: of the slowest oscillation that is distinct from a drift
+VISIBLE = 0.01  # of a step: a smaller oscillation about it is none
 NOMINAL = "nominal"
 LOST = ("overflow", "unstable")  # kinds of fault that explain every other of the same run
 
@@ -264,6 +265,8 @@ def _judge_oscillation(
         lasting = period * (window.stop - window.start)
         lowest = max(spec.bandwidth_hz / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
         floor = _noise_floor(stage, trace, run)
+        if scenario.settling_s is not None:  # what creeps against friction is no pure exponential
+            floor = max(floor, VISIBLE * abs(scenario.phases[-1].force_N))
         if not view.instability:
             floor = max(floor, LINE_SIGMAS * view.force_std(lowest))
         line = find_oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
