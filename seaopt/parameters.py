@@ -36,6 +36,8 @@ class Parameter:
         A few words.
     identified : bool
         False where a fit gave the value and its data cannot identify it: other values fit as well.
+    plausible : (low, high) or None
+        What such actuators have, in `unit`: a fit that ends outside is warned of.
 
     """
 
@@ -49,6 +51,7 @@ class Parameter:
     std: float | None = None
     description: str = ""
     identified: bool = True
+    plausible: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.value):

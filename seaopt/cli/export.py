@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.cli.provenance import FILES, check_unedited, digest
-from seaopt.cli.session import SCHEMAS
+from seaopt.cli.session import SCHEMAS, UNMET
 from seaopt.control.deploy.export import export
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
 
 
 def export_controller(results: Path, target: Path, json: bool, **options: Any) -> bool:
-    """Write the controller of `results` to `target`, say what was written, and tell whether it is feasible.
+    """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
+
+    It may where it is feasible, on a fit that is met.
 
     Raises
     ------
@@ -32,10 +34,14 @@ def export_controller(results: Path, target: Path, json: bool, **options: Any) -
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     written = [str(file) for file in export(content, target, **options)]
+    met = content.get("fit_met", True) is True
     if json:
-        sys.stdout.write(to_json({"schema": "seaopt/export/1", "feasible": content["feasible"], "files": written}))
+        result = {"schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met, "files": written}
+        sys.stdout.write(to_json(result))
     else:
+        if not met:
+            sys.stdout.write(f"not met: {UNMET}\n")
         if not content["feasible"]:
             sys.stdout.write(f"not met: {', '.join(content['active_constraints'])}\n")
         sys.stdout.write(f"wrote {', '.join(written)}\n")
-    return content["feasible"]
+    return content["feasible"] and met

@@ -34,7 +34,7 @@ from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
 SCHEMAS = {
-    "fit": "seaopt/fit/1",
+    "fit": "seaopt/fit/2",
     "frf": "seaopt/frf/1",
     "tune": "seaopt/controller/2",
     "sweep": "seaopt/frontier/1",
@@ -49,6 +49,7 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
+UNMET = "on a fit that is not met"
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
     "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
@@ -205,10 +206,17 @@ class Session:
                     f"{asked[name]}; correct one of them, or run seaopt tune {self.problem.source} again"
                 )
 
+    def fit_met(self) -> bool:
+        """Tell whether what is designed with is a fit that is met, or no fit at all."""
+        source = self.parameters()
+        return isinstance(source, ParameterSet) or source.met
+
     def _write(self, stage: str, content: dict[str, Any]) -> None:
-        """Write a result with the digests of what it was made from, and of itself, and with what made it."""
+        """Write a result with the digests of what it was made from and of itself, what made it, and if its fit is met."""
         versions = {"seaopt": __version__, "python": platform.python_version(), "machine": platform.machine()}
         content = content | {"provenance": content.get("provenance", {}) | versions}
+        if stage not in ("fit", "frf"):
+            content = content | {"fit_met": self.fit_met()}
         made_from = digest_sources(self.problem, stage, self.folder) | {"content": digest_content(content)}
         self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": made_from}))
 
@@ -274,6 +282,7 @@ class Session:
             experiments,
             self.problem.parameters,
             callback=lambda iteration, cost: tell(f"iteration {iteration}, cost {cost:.6g}"),
+            alternatives=tuple(self.problem.plants.values()),
             **self.problem.fit_options,
         )
         tell(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}")
@@ -395,11 +404,14 @@ class Session:
             return result.verdict() if result is not None else []
         joint = self.results.get("joint") if stage == "tune" else None
         tuned = [(joint.status == "certified", f"Joint tuning: {joint.summary}")] if joint is not None else []
-        return tuned + verdict(
+        lines = tuned + verdict(
             result if stage == "fit" else None,
             result if stage == "tune" else None,
             result if stage == "certify" else None,
         )
+        if stage not in ("tune", "certify", "sweep") or self.fit_met():
+            return lines
+        return [(False, f"{text} – {UNMET}") for _, text in lines] or [(False, UNMET)]
 
     def show(self, as_json: bool, stages: list[str]) -> None:
         """Print the results of the stages on stdout."""

@@ -11,11 +11,11 @@ from seaopt.estimation.experiment_design.design import (
     design_experiment,
     expected_covariance,
 )
+from seaopt.estimation.judgement.fit import fit
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.losses import Huber, SoftL1, Squares
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import DerivedFigure, ModelledOutputs, Nuisance, OutputFit
-from seaopt.estimation.result.fit import fit
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.identifiability import Identifiability, warn_unidentified
 from seaopt.estimation.solver.methods import Method, OutputError, PredictionError

@@ -7,23 +7,40 @@ from dataclasses import replace
 from seaopt.parameters import Parameter, ParameterSet
 
 ACTUATOR = (
-    Parameter(name="m_l", value=0.646, unit="kg", min=0.0, description="translational sprung mass"),
-    Parameter(name="k", value=655e3, unit="N/m", min=0.0, description="spring stiffness"),
-    Parameter(name="l", value=0.002, unit="m", min=1e-9, description="ball-screw lead"),
-    Parameter(name="N_p", value=3.0, unit="-", min=1e-9, description="pulley reduction"),
-    Parameter(name="K_tau", value=0.0255, unit="N m/A", min=0.0, description="motor torque constant"),
-    Parameter(name="J", value=3.31e-6, unit="kg m^2", min=0.0, description="motor and transmission inertia"),
-    Parameter(name="b_r", value=1.31e-4, unit="N m s", min=0.0, description="rotary viscous damping"),
-    Parameter(name="eta", value=1.0, unit="-", min=0.0, description="transmission efficiency"),
-    Parameter(name="f_c", value=0.0, unit="N", min=0.0, description="Coulomb friction at the screw"),
+    Parameter(
+        name="m_l", value=0.646, unit="kg", min=0.0, description="translational sprung mass", plausible=(0.001, 1000)
+    ),
+    Parameter(name="k", value=655e3, unit="N/m", min=0.0, description="spring stiffness", plausible=(1000, 1e09)),
+    Parameter(name="l", value=0.002, unit="m", min=1e-9, description="ball-screw lead", plausible=(0.0001, 0.2)),
+    Parameter(name="N_p", value=3.0, unit="-", min=1e-9, description="pulley reduction", plausible=(0.02, 1000)),
+    Parameter(
+        name="K_tau", value=0.0255, unit="N m/A", min=0.0, description="motor torque constant", plausible=(0.001, 20)
+    ),
+    Parameter(
+        name="J",
+        value=3.31e-6,
+        unit="kg m^2",
+        min=0.0,
+        description="motor and transmission inertia",
+        plausible=(1e-09, 1),
+    ),
+    Parameter(
+        name="b_r", value=1.31e-4, unit="N m s", min=0.0, description="rotary viscous damping", plausible=(0, 10)
+    ),
+    Parameter(name="eta", value=1.0, unit="-", min=0.0, description="transmission efficiency", plausible=(0.25, 1.25)),
+    Parameter(
+        name="f_c", value=0.0, unit="N", min=0.0, description="Coulomb friction at the screw", plausible=(0, 100000)
+    ),
     Parameter(name="v_s", value=1e-3, unit="m/s", min=1e-9, description="smoothing speed of f_c"),
 )
 PENDULUM = (
-    Parameter(name="I_p", value=0.36, unit="kg m^2", min=1e-9, description="inertia about the pivot"),
-    Parameter(name="m", value=4.0, unit="kg", min=0.0, description="pendulum mass"),
-    Parameter(name="L", value=0.3, unit="m", min=0.0, description="centre of mass to pivot"),
-    Parameter(name="L_a", value=0.0725, unit="m", min=0.0, description="lever arm"),
-    Parameter(name="d", value=0.0, unit="N m s", min=0.0, description="pivot damping"),
+    Parameter(
+        name="I_p", value=0.36, unit="kg m^2", min=1e-9, description="inertia about the pivot", plausible=(1e-07, 1000)
+    ),
+    Parameter(name="m", value=4.0, unit="kg", min=0.0, description="pendulum mass", plausible=(0, 10000)),
+    Parameter(name="L", value=0.3, unit="m", min=0.0, description="centre of mass to pivot", plausible=(0, 10)),
+    Parameter(name="L_a", value=0.0725, unit="m", min=0.0, description="lever arm", plausible=(0, 10)),
+    Parameter(name="d", value=0.0, unit="N m s", min=0.0, description="pivot damping", plausible=(0, 10000)),
 )
 GRAVITY = Parameter(name="g", value=9.81, unit="m/s^2", description="gravity")
 

@@ -14,14 +14,16 @@ from seaopt.plants.plant import Plant
 from seaopt.plants.roles import Actuation, Port, Sensing, SeriesSpring
 
 _PARAMETERS = (
-    Parameter(name="J_m", value=1e-4, unit="kg m^2", min=1e-15, description="motor inertia"),
-    Parameter(name="b_r", value=1e-4, unit="N m s", min=0.0, description="motor damping"),
-    Parameter(name="K_tau", value=0.05, unit="N m/A", min=0.0, description="motor torque constant"),
-    Parameter(name="N", value=50.0, unit="-", min=1e-9, description="gear ratio"),
-    Parameter(name="k_s", value=300.0, unit="N m/rad", min=0.0, description="spring stiffness"),
-    Parameter(name="c_s", value=0.0, unit="N m s/rad", min=0.0, description="spring damping"),
-    Parameter(name="J_l", value=0.1, unit="kg m^2", min=1e-15, description="link inertia"),
-    Parameter(name="d_l", value=0.0, unit="N m s/rad", min=0.0, description="link damping"),
+    Parameter(name="J_m", value=1e-4, unit="kg m^2", min=1e-15, description="motor inertia", plausible=(1e-10, 10)),
+    Parameter(name="b_r", value=1e-4, unit="N m s", min=0.0, description="motor damping", plausible=(0, 100)),
+    Parameter(
+        name="K_tau", value=0.05, unit="N m/A", min=0.0, description="motor torque constant", plausible=(0.0001, 100)
+    ),
+    Parameter(name="N", value=50.0, unit="-", min=1e-9, description="gear ratio", plausible=(0.02, 10000)),
+    Parameter(name="k_s", value=300.0, unit="N m/rad", min=0.0, description="spring stiffness", plausible=(0.01, 1e08)),
+    Parameter(name="c_s", value=0.0, unit="N m s/rad", min=0.0, description="spring damping", plausible=(0, 1e06)),
+    Parameter(name="J_l", value=0.1, unit="kg m^2", min=1e-15, description="link inertia", plausible=(1e-08, 100000)),
+    Parameter(name="d_l", value=0.0, unit="N m s/rad", min=0.0, description="link damping", plausible=(0, 100000)),
 )
 
 

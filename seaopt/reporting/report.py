@@ -250,7 +250,7 @@ def verdict(
     """Return one line per stage: whether it is met, and what to say."""
     lines: list[tuple[bool, str]] = []
     if fit is not None:
-        lines.append((fit.ok, f"Fit: {fit.status.replace('_', ' ')} – {fit.message}"))
+        lines.append((fit.met, f"Fit: {fit.verdict}"))
     if controller is not None:
         what = "every limit met" if controller.feasible else "not met: " + ", ".join(controller.active_constraints)
         lines.append((controller.feasible, f"Controller at {controller.spec.bandwidth_hz:g} Hz: {what}"))

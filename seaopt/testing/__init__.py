@@ -31,7 +31,7 @@ def assert_recovered(
     Raises
     ------
     AssertionError
-        The fit did not converge, or a parameter is too far off; the message is a table of all of them.
+        The fit is not met, or a parameter is too far off; the message is a table of all of them.
     SeaoptError
         `truth` lacks a free parameter.
 
@@ -41,7 +41,7 @@ def assert_recovered(
 
     """
     rows: list[str] = []
-    failed = not fit.ok
+    failed = not fit.met
     for name in fit.covariance.names:
         if name not in truth:
             raise SeaoptError(f'truth has no "{name}", which the fit estimated; {suggestion(name, truth)}')
@@ -60,4 +60,4 @@ def assert_recovered(
         )
     if failed:
         limit = f"{sigmas:g} std" + (f" and {within:.2%}" if within is not None else "")
-        raise AssertionError("\n".join([f"fit {fit.status} ({fit.message}); allowed {limit}:", *rows]))
+        raise AssertionError("\n".join([f"fit {fit.verdict}; allowed {limit}:", *rows]))

@@ -26,7 +26,7 @@ def test_run_leaves_everything(done):
     assert "fitting the logs" in done.stderr
     assert "warning" not in done.stderr and "not identif" not in done.stdout
     fit = json.loads((done.results / "fit.json").read_text(encoding="utf-8"))
-    assert fit["schema"] == "seaopt/fit/1"
+    assert fit["schema"] == "seaopt/fit/2"
     assert fit["status"] == "converged"
     for field in ("cost", "iterations", "samples", "provenance", "derived", "covariance", "outputs", "identifiability"):
         assert field in fit

@@ -421,7 +421,7 @@ def _explain(
     sentences += [
         f"{name} ended as {fit.status.replace('_', ' ')} and may explain more than was found: {fit.message}"
         for name, fit in fits.items()
-        if not fit.ok
+        if fit.status != "converged"
     ]
     return tuple(sentences)
 

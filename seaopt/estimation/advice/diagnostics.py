@@ -21,7 +21,7 @@ from seaopt.estimation.advice.forecasts import (
     simulate_freely,
     split_samples,
 )
-from seaopt.estimation.advice.score_test import SIGNIFICANCE, Culprit, ScoreTest, correlate_with_inputs, find_culprit
+from seaopt.estimation.judgement.score_test import SIGNIFICANCE, Culprit, ScoreTest, correlate_with_inputs, find_culprit
 from seaopt.estimation.problem.correlation import INPUT_LAGS, QUANTILE, CrossCorrelation, autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitOutput
 from seaopt.estimation.problem.residual_statistics import (
@@ -216,7 +216,7 @@ def diagnose(fit: Fit) -> Diagnostics:
         outputs[output.experiment.name][output.name] = _diagnose_output(output, residuals, free, ahead, whiteness_p)
     leverage, at_bound = measure_leverage(minimum), _find_at_bound(minimum)
     tests, culprit = find_culprit(minimum, fit, residuals)
-    sentences = [] if fit.ok else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
+    sentences = [] if fit.status == "converged" else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
     sentences += [f"{name} lies on its bound: widen the bound, or fix it there and say why" for name in at_bound]
     sentences += [*_advise_on_outputs(fit, outputs, residuals, free, culprit), *_advise_on_leverage(leverage)]
     return Diagnostics(

@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.records import record
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+
+@record
+class FitFinding:
+    """One thing that whoever uses a fit should know.
+
+    Parameters
+    ----------
+    severity : "error", "warning" or "note"
+        The fit is not to be used; look at it; for information.
+    kind : str
+        For programs: "explained", "residual", "cause", "bound", "range", "samples", "held_out", "status", ...
+    where : str
+        EXPERIMENT.OUTPUT, an experiment, a parameter, or empty.
+    text : str
+        What it is and what to do.
+
+    """
+
+    severity: Severity
+    kind: str
+    where: str
+    text: str
 
 
 @record
@@ -32,6 +59,11 @@ class OutputFit:
         The output's.
     whiteness_p : float
         Ljung-Box p-value of the weighted residual; small means coloured.
+    explained : float or None
+        Share of the output's energy (in the fit's band) that the model accounts for; None without diagnostics.
+    explainable : float or None
+        The share that some model of the inputs could account for, by coherence and by a flexible predictor; None where
+        the log is too short to tell.
 
     """
 
@@ -43,6 +75,8 @@ class OutputFit:
     whiteness_p: float
     band_fit_percent: float | None = None
     one_step_fit_percent: float | None = None
+    explained: float | None = None
+    explainable: float | None = None
 
 
 @record

@@ -15,7 +15,7 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.estimation.result.findings import DerivedFigure, ModelledOutputs, Nuisance, OutputFit
+from seaopt.estimation.result.findings import DerivedFigure, FitFinding, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.solver.methods import Method
 from seaopt.formatting import html_text
@@ -25,7 +25,7 @@ from seaopt.records import record
 from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
 
-FIT_SCHEMA = "seaopt/fit/1"
+FIT_SCHEMA = "seaopt/fit/2"
 
 
 @record(eq=False)
@@ -76,6 +76,8 @@ class Fit:
         Number of all unknowns, those of the experiments included, sigmas not.
     method : str
         "output_error", "multiple_shooting" or "prediction_error".
+    findings : tuple of FitFinding
+        What is wrong with it, errors first; empty without diagnostics.
     notes : tuple of str
         What was done to the logs, and which samples had no weight, one sentence each.
     experiments : tuple of Experiment
@@ -103,14 +105,30 @@ class Fit:
     log_likelihood: float = math.nan
     unknowns: int = 0
     method: str = "output_error"
+    findings: tuple[FitFinding, ...] = ()
     notes: tuple[str, ...] = ()
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
     minimum: Minimum | None = field(default=None, repr=False)
 
     @property
-    def ok(self) -> bool:
-        """Whether the search converged and every free parameter is identified."""
-        return self.status == "converged"
+    def met(self) -> bool:
+        """Whether it may be used: it converged, identifies every free parameter, and no finding is an error."""
+        return self.status == "converged" and not self.errors
+
+    @property
+    def errors(self) -> tuple[FitFinding, ...]:
+        """The findings that forbid to use it."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def verdict(self) -> str:
+        """What to say of it in one line."""
+        if self.met:
+            return f"{self.status} ({self.message})"
+        if self.status != "converged":
+            return f"{self.status.replace('_', ' ')}: {self.message}"
+        first, *more = self.errors
+        return f"{first.where}: {first.text}" + (f" (and {len(more)} more)" if more else "")
 
     @property
     def aic(self) -> float:
@@ -176,9 +194,11 @@ class Fit:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of fit.json (schema seaopt/fit/1)."""
+        """Return the content of fit.json (schema seaopt/fit/2)."""
         return {
             "schema": FIT_SCHEMA,
+            "met": self.met,
+            "findings": [_fields(finding) for finding in self.findings],
             "status": self.status,
             "message": self.message,
             "cost": self.cost,
@@ -229,7 +249,11 @@ class Fit:
         return cls(**read_fit(content), experiments=experiments)
 
     def __repr__(self) -> str:
-        lines = [f"Fit: {self.status} ({self.message})"]
+        lines = [f"Fit: {'met' if self.met else 'NOT MET'}, {self.status} ({self.message})"]
+        lines += [
+            f"  {finding.severity}: {f'{finding.where}: ' if finding.where else ''}{finding.text}"
+            for finding in self.findings
+        ]
         lines.append(f"  {self.samples} samples, {self.iterations} iterations, {self.wall_s:.2f} s")
         free = ParameterSet(parameter for parameter in self.parameters.values() if parameter.free)
         lines += [f"  {line}" for line in repr(free).splitlines()]
@@ -266,4 +290,5 @@ def _parameter_dict(parameter: Parameter) -> dict[str, Any]:
         "value": parameter.value, "unit": parameter.unit, "free": parameter.free, "std": parameter.std, "ci95": ci95,
         "at_bound": parameter.at_bound, "min": parameter.min, "max": parameter.max, "prior_std": parameter.prior_std,
         "description": parameter.description, "identified": parameter.identified,
+        "plausible": None if parameter.plausible is None else list(parameter.plausible),
     }  # fmt: skip

@@ -24,7 +24,7 @@ from seaopt.documents import (
 )
 from seaopt.errors import FileError
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.estimation.result.findings import DerivedFigure, Nuisance, OutputFit
+from seaopt.estimation.result.findings import DerivedFigure, FitFinding, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.files import plain
 from seaopt.parameters import Parameter, ParameterSet
@@ -44,6 +44,7 @@ class StoredParameter(ResultTable):
     prior_std: Number | None = None
     description: str = ""
     identified: Flag | None = None
+    plausible: tuple[Number, Number] | None = None
 
     def restore(self, name: str) -> Parameter:
         """Return the parameter; one that is free and has no std has an infinite one."""
@@ -52,6 +53,7 @@ class StoredParameter(ResultTable):
         return Parameter(
             name=name, value=self.value, unit=self.unit, free=self.free, min=self.min, max=self.max,
             prior_std=self.prior_std, description=self.description, std=std, identified=identified,
+            plausible=self.plausible,
         )  # fmt: skip
 
 
@@ -89,6 +91,15 @@ class StoredCovariance(ResultTable):
         return Covariance(names=tuple(self.names), matrix=matrix)
 
 
+class StoredFinding(ResultTable):
+    """What is wrong with a fit."""
+
+    severity: Literal["error", "warning", "note"]
+    kind: str
+    where: str
+    text: str
+
+
 class StoredOutput(ResultTable):
     """How well an output is explained."""
 
@@ -100,6 +111,8 @@ class StoredOutput(ResultTable):
     whiteness_p: NullIsNaN
     band_fit_percent: Number | None = None
     one_step_fit_percent: Number | None = None
+    explained: Number | None = None
+    explainable: Number | None = None
 
 
 class StoredExperiment(ResultTable):
@@ -150,6 +163,8 @@ class StoredProvenance(ResultTable):
 class StoredFit(ResultTable):
     """A fit.json."""
 
+    met: Flag
+    findings: list[StoredFinding]
     status: Literal["converged", "max_iterations", "stalled", "not_identifiable"]
     message: str
     parameters: dict[str, StoredParameter]
@@ -205,5 +220,6 @@ def read_fit(content: Mapping[str, Any]) -> dict[str, Any]:
         },
         "nuisance": {name: experiment.restore() for name, experiment in stored.experiments.items()},
         "identifiability": stored.identifiability.restore(),
+        "findings": tuple(FitFinding(**finding.model_dump()) for finding in stored.findings),
         "notes": tuple(stored.notes),
     }

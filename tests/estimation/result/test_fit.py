@@ -299,18 +299,18 @@ def test_fit_json_round_trip(stand, short_log, thor, tmp_path):
     from seaopt.files import read_json, write_json
 
     path = write_json(tmp_path / "fit.json", fit.to_dict())
-    again = so.Fit.from_dict(read_json(path, "seaopt/fit/1"), (bench,))
+    again = so.Fit.from_dict(read_json(path, "seaopt/fit/2"), (bench,))
     assert again.parameters["J"] == fit.parameters["J"]
     np.testing.assert_allclose(again.covariance.matrix, fit.covariance.matrix)
     np.testing.assert_allclose(again.predict(bench).model["F1"], fit.predict(bench).model["F1"])
     assert repr(again) == repr(fit)
     overflown = replace(fit, step_error_sigma=np.inf, step_error_parameter=np.inf)
     write_json(path, overflown.to_dict())
-    stored = so.Fit.from_dict(read_json(path, "seaopt/fit/1"))
+    stored = so.Fit.from_dict(read_json(path, "seaopt/fit/2"))
     assert stored.step_error_sigma == stored.step_error_parameter == np.inf
     path.write_text(path.read_text().replace('"covariance"', '"covarience"'))
     with pytest.raises(FileError, match="covariance"):
-        so.Fit.from_dict(read_json(path, "seaopt/fit/1"))
+        so.Fit.from_dict(read_json(path, "seaopt/fit/2"))
 
 
 @pytest.mark.parametrize(

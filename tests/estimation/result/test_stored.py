@@ -11,7 +11,8 @@ import seaopt as so
 from seaopt.errors import FileError
 
 CONTENT = {
-    "schema": "seaopt/fit/1", "status": "converged", "message": "the cost no longer falls", "cost": 1.5,
+    "schema": "seaopt/fit/2", "met": True, "findings": [],
+    "status": "converged", "message": "the cost no longer falls", "cost": 1.5,
     "iterations": 3, "samples": 800, "provenance": {"wall_s": 0.1}, "later": "keys that are not read may stand here",
     "parameters": {
         "J": {"value": 3e-6, "unit": "kg m^2", "free": True, "std": 1e-9, "min": 1e-8, "max": None},

@@ -14,10 +14,10 @@ from scipy.optimize import least_squares
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
 from seaopt.errors import EstimationError
+from seaopt.estimation.judgement.fit import check_choices, complete_parameters
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.steady_state_filter import kalman_gain
-from seaopt.estimation.result.fit import check_choices, complete_parameters
 
 PROBLEMS = Path(__file__).resolve().parents[3] / "problems"
 METHODS = {
@@ -454,7 +454,7 @@ def test_noise_alone_is_not_called_a_fit(stand, thor, method):
         time=np.arange(n) / 400, I=rng.normal(size=n), F1=rng.normal(size=n), F2=rng.normal(size=n)
     )
     fit = so.fit([experiment(stand, log)], thor.update(J=1e-6).free("J", "b_r", "eta"), method=METHODS[method])
-    assert not fit.ok
+    assert not fit.met
     assert "explains nothing" in fit.message or "hardly show" in fit.message
 
 
@@ -462,7 +462,7 @@ def test_a_flipped_sign_is_said(stand, thor):
     log = noisy(stand, thor)
     flipped = so.Log.from_arrays(time=log.time, I=-log["I"], F1=log["F1"], F2=log["F2"])
     fit = so.fit([experiment(stand, flipped)], thor.free("J", "b_r", "eta"))
-    assert not fit.ok
+    assert not fit.met
     assert "sign" in fit.message
 
 

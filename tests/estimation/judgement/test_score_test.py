@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING
 from seaopt.estimation import diagnose
-from seaopt.estimation.advice.score_test import run_score_tests
+from seaopt.estimation.judgement.score_test import run_score_tests
 from seaopt.files import to_json
 
 NOISE = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})

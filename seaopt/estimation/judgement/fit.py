@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import EstimationError
+from seaopt.estimation.judgement.judge import judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
@@ -17,6 +18,7 @@ from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
 from seaopt.simulation.simulate import input_samples
 
 
@@ -29,6 +31,7 @@ def fit(
     band_hz: tuple[float, float] | None = None,
     holdout: float = 0.0,
     diagnostics: bool = True,
+    alternatives: Sequence[Plant] = (),
     callback: Callback | None = None,
 ) -> Fit:
     """Fit the free parameters of `params` to one or several experiments that share them.
@@ -48,8 +51,10 @@ def fit(
     holdout : float
         The last fraction of each log is kept back, for validation.
     diagnostics : bool
-        False leaves out what needs the residuals of every sample: the stds are then those for white residuals, and
-        the outputs' figures are missing.
+        False leaves out what needs the residuals of every sample: the stds are then those for white residuals, the
+        outputs' figures are missing, and the fit is not judged.
+    alternatives : sequence of Plant
+        Other plants that may have been on the bench: where a log is not explained, they are tried.
     callback : callable, optional
         Called with (iteration, cost).
 
@@ -89,7 +94,8 @@ def fit(
         holdout=holdout, noise=chosen.models_noise,
     )  # fmt: skip
     _check_samples(problem)
-    return summarise(chosen.solve(problem, callback), chosen, diagnostics, started)
+    result = summarise(chosen.solve(problem, callback), chosen, diagnostics, started)
+    return judge(result, alternatives) if diagnostics else result
 
 
 def check_choices(method: Any, loss: Any, band_hz: Any) -> None:

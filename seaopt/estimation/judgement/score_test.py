@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.estimation.problem.correlation import CrossCorrelation, cross_correlation
+from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
@@ -181,52 +182,70 @@ def find_culprit(
     )
 
 
-def run_score_tests(minimum: Minimum, fit: Fit) -> dict[str, ScoreTest]:
+def run_score_tests(
+    minimum: Minimum, fit: Fit, names: tuple[str, ...] | None = None, data: Mapping[str, Experiment] | None = None
+) -> dict[str, ScoreTest]:
     """Test each parameter that was fixed, that which would do most first; without those the free ones stand for.
 
-    A parameter that would make a linear plant nonlinear, such as friction fixed at zero, is not tested: the other plant
-    is stepped and not discretised, and has to be fitted.
+    A parameter that would make a linear plant nonlinear, such as friction fixed at zero, is not tested unless it is
+    named: the other plant is stepped and not discretised.
+
+    Parameters
+    ----------
+    minimum, fit : Minimum and Fit
+        Where, and of what.
+    names : tuple of str, optional
+        The parameters to test; those that leave linear plants linear, if left out.
+    data : mapping of name to Experiment, optional
+        Experiments with a free delay, which is then tested too, under the name EXPERIMENT.delay_s.
+
     """
-    names = _find_candidates(minimum.problem, fit)
-    if not names:
+    names, data = find_candidates(minimum.problem, fit)[0] if names is None else names, data or {}
+    if not names and not data:
         return {}
-    trial, z = minimum.problem.rebuild(_free(fit, names), minimum.z)
+    trial, z = minimum.problem.rebuild(free_more(fit, names), minimum.z, data)
     here = trial.evaluate(z)
     if not np.isfinite(here.cost):
         return {}
-    places = np.array([trial.unknowns.names.index(name) for name in names])
+    units = {name: fit.parameters[name].unit for name in names} | {f"{name}.delay_s": "s" for name in data}
+    places = np.array([trial.unknowns.names.index(name) for name in units])
     score, information, variance = _compute_scores(trial, here, places)
     chosen = np.flatnonzero((information > REDUNDANT * np.diag(here.hessian)[places]) & (variance > 0.0))
     order = sorted(chosen, key=lambda i: score[i] ** 2 / information[i], reverse=True)
-    return {names[i]: _test(fit, names[i], score[i], information[i], variance[i], chosen.size) for i in order}
+    rows = list(units.items())
+    return {
+        rows[i][0]: _test(float(here.z[places[i]]), rows[i][1], score[i], information[i], variance[i], chosen.size)
+        for i in order
+    }
 
 
-def _test(fit: Fit, name: str, score: float, information: float, variance: float, count: int) -> ScoreTest:
+def _test(value: float, unit: str, score: float, information: float, variance: float, count: int) -> ScoreTest:
     from scipy.special import erfc  # deferred: scipy is slow to load
 
-    parameter, chi2 = fit.parameters[name], float(score**2 / variance)
+    chi2 = float(score**2 / variance)
     return ScoreTest(
-        value=parameter.value, unit=parameter.unit, chi2=chi2,
-        p=min(count * float(erfc(np.sqrt(0.5 * chi2))), 1.0), preferred=float(parameter.value - score / information),
+        value=value, unit=unit, chi2=chi2,
+        p=min(count * float(erfc(np.sqrt(0.5 * chi2))), 1.0), preferred=float(value - score / information),
         fall=0.5 * float(score**2 / information),
     )  # fmt: skip
 
 
-def _find_candidates(problem: FitProblem, fit: Fit) -> tuple[str, ...]:
-    """Return the fixed parameters of the plants whose freedom leaves a linear plant linear."""
+def find_candidates(problem: FitProblem, fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the fixed parameters whose freedom leaves linear plants linear, and those that would not."""
     free = fit.parameters.free_names
-    candidates: list[str] = []
+    plain: list[str] = []
+    bending: list[str] = []
     for name in fit.parameters:
         users = [experiment for experiment in problem.experiments if name in experiment.data.plant.parameters]
         if name in free or not users:
             continue
         models = (make_model(e.data.plant, fit.parameters, (*free, name), e.data.outputs) for e in users)
-        if all(model.linear == e.model.linear for e, model in zip(users, models, strict=True)):
-            candidates.append(name)
-    return tuple(candidates)
+        same = all(model.linear == e.model.linear for e, model in zip(users, models, strict=True))
+        (plain if same else bending).append(name)
+    return tuple(plain), tuple(bending)
 
 
-def _free(fit: Fit, names: tuple[str, ...]) -> ParameterSet:
+def free_more(fit: Fit, names: tuple[str, ...]) -> ParameterSet:
     """Return the fit's parameters with more of them free."""
     return fit.parameters.with_parameters(
         *(replace(fit.parameters[name], free=True, prior_std=None, std=None) for name in names)
@@ -256,7 +275,7 @@ def _compute_scores(
 def _refit_with(minimum: Minimum, fit: Fit, name: str, *, diagnostics: bool) -> Fit | None:
     """Return the fit from the minimum with one more parameter free; None where that does not end inside its bounds."""
     started = time.perf_counter()
-    trial, z = minimum.problem.rebuild(_free(fit, (name,)), minimum.z)
+    trial, z = minimum.problem.rebuild(free_more(fit, (name,)), minimum.z)
     solved = settle(trial, trial.evaluate(z), REFIT_ITERATIONS, None)
     if not np.isfinite(solved.solution.evaluation.cost):
         return None

@@ -1,0 +1,1 @@
+"""What is wrong with a fit: findings, and which of them forbid to use it."""

@@ -1,0 +1,547 @@
+"""What would explain the logs better than a fit: other values, delays, channels, units, parts and plants, refitted.
+
+Each candidate is one change of the problem. It is refitted, and what it gains is the logarithm of its likelihood over
+the fit's, at each one's own residuals. The gain counts only beyond what chance gives a residual of this colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, free_more, run_score_tests
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
+from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
+from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.solver.settle import Solved, estimate_sigma
+from seaopt.estimation.solver.step_size import StepError, choose_first_steps
+from seaopt.formatting import join_words
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.parts import wrapped
+from seaopt.records import record
+from seaopt.units import unit_after
+
+ITERATIONS, ROUNDS, ROUGH = 15, 2, 1e-2  # of a refit, and how near to its minimum, in squared std
+MOST_SUBSTEPS = 8
+ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that chance does not give
+SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the cause, and others need not be tried
+HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
+MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
+MOST_REFITTED = 4  # fixed parameters
+LEAD = 40  # samples that signals are shifted by so that a delay may be negative
+FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
+UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
+LIKELY_GAINS = (0.05, 20.0)  # of sensors that are not of another unit
+SNAP = 0.1  # of a factor: an estimate so near is taken for it
+CLIP_QUANTILES = 1.0 - np.geomspace(1e-3, 0.4, 40)  # of what was measured: where it may be cut
+CLIPPED_SAMPLES = 20  # that have to be beyond a level
+CLIPPED_POWER = 0.2  # of a residual's
+
+V = TypeVar("V")
+
+
+@record(eq=False)
+class Cause:
+    """Another explanation of the logs.
+
+    Parameters
+    ----------
+    text, where : str
+        What it is, and of what.
+    gain : float
+        Logarithm of its likelihood over the fit's.
+    material : bool
+        Whether it takes half of a residual's power away, or moves an estimate beyond what the fit says.
+    solved : bool
+        Whether it leaves hardly anything of the residual of any output.
+    consequence : str
+        What it does to the residuals and the estimates.
+
+    """
+
+    text: str
+    where: str
+    gain: float
+    solved: bool
+    material: bool
+    consequence: str
+
+
+@record(eq=False)
+class _Candidate:
+    """A change to be refitted, and how to say what came of it: nothing where it came to nothing.
+
+    `delays` are unknowns whose refit starts from the best of `FIRST_DELAYS`, all alike, `gains` unknowns that start
+    from how a simulation compares with its output. Where `certain`, nothing but a mistake explains a gain.
+    """
+
+    where: str
+    experiments: tuple[Experiment, ...]
+    params: ParameterSet
+    describe: Callable[[Mapping[str, float]], str | None]
+    certain: bool = False
+    delays: tuple[str, ...] = ()
+    gains: tuple[str, ...] = ()
+
+
+def find_causes(
+    fit: Fit, residuals: ResidualsByExperiment, suspects: Mapping[str, ScoreTest], alternatives: Sequence[Plant], *,
+    poor: bool,
+) -> list[Cause]:  # fmt: skip
+    """Return what explains the logs better than the fit, the best first.
+
+    Parameters
+    ----------
+    fit : Fit
+        With its minimum.
+    residuals : mapping
+        Of the fit.
+    suspects : mapping of name to ScoreTest
+        What was fixed and is at odds with the logs.
+    alternatives : sequence of Plant
+        Other plants that may have been on the bench.
+    poor : bool
+        Whether the fit explains so little that its estimates are no start: what searches does so from its own.
+
+    """
+    minimum = fit.require_minimum("find_causes")
+    before = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
+    colour = _measure_colour(fit)
+    causes: list[Cause] = []
+    for candidate in _list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor):
+        try:
+            solved = _refit(minimum, candidate)
+        except SeaoptError:  # what does not make a problem explains nothing
+            continue
+        cause = None if solved is None else _weigh(fit, candidate, solved, before, colour, poor=poor)
+        if cause is not None:
+            causes.append(cause)
+            if poor and cause.solved:
+                break
+    return sorted(causes, key=lambda cause: cause.gain, reverse=True)
+
+
+def _measure_powers(here: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:
+    """Return, output by output, the residual's mean square over the measured one's, and how many samples count."""
+    rows = [
+        (squares / max(count, 1.0) / max(spread**2, 1e-300), count)
+        for e in problem.experiments
+        for squares, count, spread in zip(here.power[e.name].squares, here.power[e.name].counts, e.spread, strict=True)
+    ]
+    return np.maximum(np.array(rows, dtype=float), 1e-24)
+
+
+def _measure_colour(fit: Fit) -> float:
+    """Return how many times more than for white residuals the estimates vary: at least once."""
+    coloured, white = np.diag(fit.covariance.matrix), np.diag(fit.white_covariance.matrix)
+    known = np.isfinite(coloured) & np.isfinite(white) & (white > 0.0)
+    return float(max(1.0, np.max(coloured[known] / white[known], initial=1.0)))
+
+
+def _refit(minimum: Minimum, candidate: _Candidate) -> Solved | None:
+    """Return the minimum with the change: from the fit's, or from where its method finds a start."""
+    old = minimum.problem
+    problem = pose_problem(
+        candidate.experiments, candidate.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout,
+        noise=old.predicts,
+    )  # fmt: skip
+    names, z = problem.unknowns.names, problem.unknowns.start.copy()
+    if old.predicts:
+        solved = replace(minimum.method, max_iterations=ITERATIONS, search=False).solve(problem, None)
+        return solved if np.isfinite(solved.solution.evaluation.cost) else None
+    known = dict(zip(old.unknowns.names, minimum.z.tolist(), strict=True))
+    for i, name in enumerate(names):
+        if i >= problem.unknowns.shared:  # parameters start from the candidate's own
+            z[i] = known.get(name, z[i])
+    problem = problem.with_each(substeps=max(e.substeps for e in old.experiments))
+    if candidate.gains:
+        z = _compare_gains(problem, z, candidate.gains)
+    start = problem.evaluate(z)
+    for samples in FIRST_DELAYS if candidate.delays else ():
+        other = z.copy()
+        for name in candidate.delays:
+            i = names.index(name)
+            other[i] = np.clip(z[i] + samples * problem.experiments[0].period, problem.unknowns.low[i], None)
+        there = problem.evaluate(other)
+        start = there if there.cost < start.cost else start
+    return _minimise_roughly(problem, start)
+
+
+def _minimise_roughly(problem: FitProblem, start: Evaluation) -> Solved | None:
+    """Return a minimum that is near enough to tell a cause: sigma is estimated twice, the step chosen once."""
+    if not np.isfinite(start.cost):
+        return None
+    problem, here = choose_first_steps(problem, start)
+    problem = problem.with_each(substeps=min(MOST_SUBSTEPS, *(e.substeps for e in problem.experiments)))
+    unknowns, solution = problem.unknowns, None
+    for _ in range(ROUNDS):
+        problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
+        solution = minimise(
+            problem, problem.evaluate(here.z), unknowns.low, unknowns.high, decrement=ROUGH, max_iterations=ITERATIONS
+        )
+        here = solution.evaluation
+        if not np.isfinite(here.cost):
+            return None
+    assert solution is not None
+    return Solved(problem=problem, solution=solution, step_error=StepError())
+
+
+def _compare_gains(problem: FitProblem, z: Float[np.ndarray, " n"], gains: Sequence[str]) -> Float[np.ndarray, " n"]:
+    """Return the unknowns with each gain as a simulation compares with its output."""
+    z, residuals = z.copy(), compute_residuals(problem, z)
+    for output in problem.outputs:
+        measured = np.concatenate(output.measured)
+        model = measured + np.concatenate(residuals[output.experiment.name].raw_of(output.name))
+        good = np.isfinite(model)
+        model, measured = model[good] - np.mean(model[good]), measured[good] - np.mean(measured[good])
+        name = f"{output.experiment.name}.gain.{output.name}"
+        if name in gains:
+            size = float(model @ model)
+            z[problem.unknowns.names.index(name)] = float(model @ measured) / size if size > 0.0 else 1.0
+    return z
+
+
+def _weigh(
+    fit: Fit,
+    candidate: _Candidate,
+    solved: Solved,
+    before: Float[np.ndarray, "outputs 2"],
+    colour: float,
+    *,
+    poor: bool,
+) -> Cause | None:
+    """Return what a refit is worth; None where chance gives as much, or where it is no other explanation."""
+    after = _measure_powers(solved.solution.evaluation, solved.problem)
+    if len(after) != len(before):
+        return None
+    fall = np.log(before[:, 0] / after[:, 0])
+    gain = 0.5 * float(np.sum(before[:, 1] * fall)) / colour
+    values = dict(zip(solved.problem.unknowns.names, solved.solution.z.tolist(), strict=True))
+    left = float(np.min(after[:, 0] / before[:, 0]))
+    text = candidate.describe(values) if gain > ENOUGH and not (poor and left > HALVED) else None
+    if text is None:
+        return None
+    moved = [
+        (abs(values[name] - old.value) / max(abs(old.value), 1e-300), name)
+        for name, old in fit.parameters.items()
+        if name in fit.covariance.names and name in values
+        and abs(values[name] - old.value) > max(MOVED_STDS * (old.std or 0.0), MOVED_SHARE * abs(old.value))
+    ]  # fmt: skip
+    effects = [f"takes {100.0 * (1.0 - left):.3g} % of a residual's power away"] if left < 1.0 - 1e-3 else []
+    if moved:
+        name = max(moved)[1]
+        effects.append(f"moves {name} from {fit.parameters[name].value:.4g} to {values[name]:.4g}")
+    consequence = f" ({' and '.join(effects)})" if effects else ""
+    return Cause(
+        text=text,
+        where=candidate.where,
+        gain=gain,
+        solved=bool(np.all(after[:, 0] < SOLVED * before[:, 0])),
+        consequence=consequence,
+        material=bool(moved) or left < HALVED or candidate.certain,
+    )
+
+
+def _list_candidates(
+    fit: Fit, minimum: Minimum, residuals: ResidualsByExperiment, suspects: Mapping[str, ScoreTest],
+    alternatives: Sequence[Plant], *, poor: bool,
+) -> Iterator[_Candidate]:  # fmt: skip
+    """Yield the changes to try."""
+    first = minimum.problem.params
+    here = first if poor else fit.parameters
+    yield from _swap_channels(fit.experiments, here, poor=poor)
+    if poor:
+        yield from _free_gains(fit.experiments, first)
+    yield from _free_delays(fit.experiments, here)
+    yield from _free_parameters(fit, minimum, suspects)
+    yield from _clip_outputs(minimum.problem, residuals, here)
+    yield from _filter_outputs(fit.experiments, here)
+    for plant in alternatives if poor else ():
+        yield from _change_plant(fit.experiments, first, plant)
+
+
+def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTest]) -> Iterator[_Candidate]:
+    """Yield the fixed parameters that are at odds with the logs, and what would make a linear plant nonlinear."""
+    plain, bending = find_candidates(minimum.problem, fit)
+    tests = dict(suspects)
+    for name in bending[:MOST_REFITTED]:
+        tests |= run_score_tests(minimum, fit, (name,)) if name not in tests else {}
+    chosen = [name for name in tests if name in plain][:MOST_REFITTED] + [name for name in tests if name in bending]
+    for name in chosen:
+        parameter, test = fit.parameters[name], tests[name]
+        if name in bending and not parameter.min < test.preferred < parameter.max:
+            continue
+        start = test.preferred if name in bending else parameter.value
+        params = free_more(fit, (name,)).update(**{name: start})
+
+        def describe(values: Mapping[str, float], parameter: Parameter = parameter) -> str | None:
+            value, unit = values[parameter.name], unit_after(parameter.unit)
+            return (
+                f"{parameter.name} = {value:.4g}{unit} in place of {parameter.value:.4g}{unit}; free it, or correct it"
+            )
+
+        yield _Candidate(where=name, experiments=fit.experiments, params=params, describe=describe)
+
+
+def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
+    """Yield a delay of the inputs, and one for each output; negative where signals can be shifted."""
+    leads = [LEAD if len(e.stretches) == 1 and len(e.log) > 4 * LEAD else 0 for e in experiments]
+    known = [e.delay_s.value if isinstance(e.delay_s, Parameter) else e.delay_s for e in experiments]
+    if any(isinstance(e.delay_s, Parameter) and e.delay_s.free for e in experiments):
+        return
+    shifted = tuple(
+        _delay(_lead(e, lead), value + lead * e.log.period)
+        for e, lead, value in zip(experiments, leads, known, strict=True)
+    )
+
+    def describe_common(values: Mapping[str, float]) -> str | None:
+        words: list[str] = []
+        for e, lead, value in zip(experiments, leads, known, strict=True):
+            late = values[f"{e.name}.delay_s"] - lead * e.log.period - value
+            if abs(late) > 0.05 * e.log.period:
+                words.append(_say_late(e.name if len(experiments) > 1 else "", late, value))
+        return join_words(words) if words else None
+
+    names = tuple(f"{e.name}.delay_s" for e in experiments)
+    yield _Candidate(
+        where=experiments[0].name, experiments=shifted, params=params, describe=describe_common, delays=names
+    )
+    if all(len(e.outputs) == 1 for e in experiments):
+        return
+    apart = tuple(
+        replace(
+            e, outputs=(o,), name=f"{e.name}-{o}", sigma=_only(e.sigma, o), gain=_only(e.gain, o),
+            saturation=_only(e.saturation, o),
+            offset=_only(e.offset, o) if isinstance(e.offset, Mapping) else e.offset,
+        )
+        for e in shifted
+        for o in e.outputs
+    )  # fmt: skip
+
+    def describe_each(values: Mapping[str, float]) -> str | None:
+        words: list[str] = []
+        for e, lead, value in zip(experiments, leads, known, strict=True):
+            late = {o: values[f"{e.name}-{o}.delay_s"] - lead * e.log.period - value for o in e.outputs}
+            if np.ptp(list(late.values())) < 0.3 * e.log.period:
+                continue
+            words += [f"{o} is {_ahead(one)}" for o, one in late.items() if abs(one) > 0.3 * e.log.period]
+        return f"{join_words(words)}: correct the channels' stamps" if words else None
+
+    yield _Candidate(
+        where=experiments[0].name, experiments=apart, params=params, describe=describe_each,
+        delays=tuple(f"{e.name}.delay_s" for e in apart),
+    )  # fmt: skip
+
+
+def _say_late(where: str, late: float, value: float) -> str:
+    of = f" of {where}" if where else ""
+    if late > 0.0:
+        return f"a delay{of} of {1e3 * (value + late):.4g} ms; give delay_s, or free it"
+    return f"inputs{of} that are stamped {-1e3 * late:.4g} ms late; shift their channels"
+
+
+def _ahead(late: float) -> str:
+    return f"{1e3 * abs(late):.4g} ms {'late' if late > 0.0 else 'early'}"
+
+
+def _only(values: Mapping[str, V], name: str) -> dict[str, V]:
+    return {name: values[name]} if name in values else {}
+
+
+def _delay(experiment: Experiment, value: float) -> Experiment:
+    """Return the experiment with a free delay that starts at a value."""
+    return replace(experiment, delay_s=Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0))
+
+
+def _lead(experiment: Experiment, samples: int) -> Experiment:
+    """Return the experiment with its inputs so many samples early, without the outputs whose inputs are not known."""
+    if not samples:
+        return experiment
+    log = experiment.log
+    signals = dict(log.signals)
+    for name in experiment.plant.inputs:
+        if name in signals:
+            values = signals[name].values
+            led = np.concatenate([values[samples:], np.repeat(values[-1:], samples)])
+            signals[name] = replace(signals[name], values=led)
+    for name in experiment.outputs:
+        known = signals[name].values.copy()
+        known[:samples] = known[-samples:] = np.nan
+        signals[name] = replace(signals[name], values=known)
+    return replace(experiment, log=replace(log, signals=signals))
+
+
+def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *, poor: bool) -> Iterator[_Candidate]:
+    """Yield the outputs swapped in pairs; inputs with outputs too where hardly anything is explained."""
+    first = experiments[0]
+    inputs = [name for name in first.plant.inputs if name in first.log.signals] if poor else []
+    for one, other in combinations([*inputs, *first.outputs], 2):
+        if one in inputs and other in inputs:
+            continue
+        swapped = tuple(_swap(e, one, other) for e in experiments if {one, other} <= set(e.log.signals))
+        if len(swapped) < len(experiments):
+            continue
+
+        def describe(values: Mapping[str, float], one: str = one, other: str = other) -> str | None:
+            return f"the columns of {one} and {other} are swapped"
+
+        yield _Candidate(where=f"{one}, {other}", experiments=swapped, params=params, describe=describe, certain=True)
+
+
+def _swap(experiment: Experiment, one: str, other: str) -> Experiment:
+    """Return the experiment with the values of two channels swapped."""
+    signals = dict(experiment.log.signals)
+    signals[one] = replace(signals[one], values=experiment.log[other])
+    signals[other] = replace(signals[other], values=experiment.log[one])
+    sigma = {name: value for name, value in experiment.sigma.items() if name not in (one, other)}
+    return replace(experiment, log=replace(experiment.log, signals=signals), sigma=sigma)
+
+
+def _clip_outputs(problem: FitProblem, residuals: ResidualsByExperiment, params: ParameterSet) -> Iterator[_Candidate]:
+    """Yield the outputs as clipped by their amplifier, where a clipped model is nearer to what was measured."""
+    clipped = {e.name: {} for e in problem.experiments}
+    for output in problem.outputs:
+        measured = np.concatenate(output.measured)
+        model = measured + np.concatenate(residuals[output.experiment.name].raw_of(output.name))
+        ends = find_clipping(model, measured)
+        if ends is not None and output.name not in output.experiment.data.saturation:
+            clipped[output.experiment.name][output.name] = ends
+    if not any(clipped.values()):
+        return
+    experiments = tuple(
+        replace(e.data, saturation={**e.data.saturation, **{o: ends[:2] for o, ends in clipped[e.name].items()}})
+        for e in problem.experiments
+    )
+    words = [
+        f"{o} is clipped at {ends[2]:.4g} and {ends[3]:.4g}{unit_after(e.data.plant.outputs[o])}"
+        for e in problem.experiments
+        for o, ends in clipped[e.name].items()
+    ]
+
+    def describe(values: Mapping[str, float]) -> str | None:
+        return f"{join_words(words)}, ahead of its noise; declare saturation"
+
+    yield _Candidate(where=problem.experiments[0].name, experiments=experiments, params=params, describe=describe)
+
+
+def find_clipping(
+    model: Float[np.ndarray, " n"], measured: Float[np.ndarray, " n"]
+) -> tuple[float, float, float, float] | None:
+    """Return the range inside which nothing is clipped, and the ends at which a model would have to be, if any.
+
+    The model's outermost samples are cut at each of some levels; the level that leaves the least is taken where it
+    takes a part of the residual's power away.
+    """
+    good = np.isfinite(model) & np.isfinite(measured)
+    model, measured = model[good], measured[good]
+    if model.size < CLIPPED_SAMPLES:
+        return None
+    whole = float(np.sum((model - measured) ** 2))
+    ends: list[float] = []
+    gone = 0.0
+    for sign in (-1.0, 1.0):
+        x, y = sign * model, sign * measured
+        levels = np.quantile(y, CLIP_QUANTILES)
+        left = [float(np.sum((np.minimum(x, level) - y) ** 2)) for level in levels]
+        best = int(np.argmin(left))
+        clips = left[best] < whole and np.count_nonzero(x > levels[best]) >= CLIPPED_SAMPLES
+        gone += whole - left[best] if clips else 0.0
+        ends.append(sign * float(levels[best]) if clips else sign * np.inf)
+    if gone < CLIPPED_POWER * whole:
+        return None
+    noise = 3.0 * float(np.sqrt(max(whole - gone, 0.0) / model.size))
+    low, high = ends[0] + noise, ends[1] - noise
+    return (low, high, ends[0], ends[1]) if low < high else None
+
+
+def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
+    """Yield the outputs as read through a pole, all of them or one."""
+    first = experiments[0]
+    regulated = () if first.plant.sensing is None else first.plant.sensing.regulated
+    read = [name for name in first.outputs if name in regulated]
+    if "load_cell_hz" in first.plant.parameters or any(e.plant is not first.plant for e in experiments):
+        return
+    nyquist = 0.5 / first.log.period
+    groups = [tuple(read), *((name,) for name in read if len(read) > 1)] if read else []
+    for group in groups:
+        plant = wrapped(first.plant, ("load_cell",), outputs=group)
+        known = plant.complete(params)["load_cell_hz"]
+        pole = replace(known, value=0.3 * nyquist, free=True, max=100.0 * nyquist)
+
+        def describe(values: Mapping[str, float], group: tuple[str, ...] = group) -> str | None:
+            cut = values["load_cell_hz"]
+            if cut > 2.0 * nyquist:
+                return None
+            names = join_words([*group])
+            return f"{names} passed a low-pass of {cut:.3g} Hz; log it unfiltered, or add the part load_cell"
+
+        changed = tuple(replace(e, plant=plant) for e in experiments)
+        yield _Candidate(
+            where=join_words([*group]), experiments=changed, params=params.with_parameters(pole), describe=describe
+        )
+
+
+def _free_gains(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
+    """Yield a gain for each output: of wrong sign, or of another unit; one gain for all is the input's."""
+    free = Parameter(name="gain", value=1.0, unit="-", free=True)
+    changed = tuple(replace(e, gain=dict.fromkeys(e.outputs, free)) for e in experiments)
+    names = {f"{e.name}.gain.{o}": o for e in experiments for o in e.outputs}
+
+    def describe(values: Mapping[str, float]) -> str | None:
+        gains = [values[name] for name in names]
+        common = float(np.median(gains))
+        if len(gains) > 1 and all(abs(gain - common) < SNAP * abs(common) for gain in gains):
+            words = _say_gain(1.0 / common)
+            return (
+                words and f"{join_words([*experiments[0].plant.inputs])} {words}, or every output does by the inverse"
+            )
+        words = [f"{o} {said}" for name, o in names.items() if (said := _say_gain(values[name]))]
+        return join_words(list(dict.fromkeys(words))) if words else None
+
+    yield _Candidate(
+        where=experiments[0].name, experiments=changed, params=params, describe=describe, gains=tuple(names)
+    )
+
+
+def _say_gain(gain: float) -> str | None:
+    """Return what is wrong with a channel that reads so many times what it should; None of what is no sensor's gain."""
+    if abs(gain + 1.0) < SNAP:
+        return "has the wrong sign"
+    for factor, words in UNIT_FACTORS.items():
+        if abs(abs(gain) / factor - 1.0) < SNAP:
+            return f"reads {'-' if gain < 0.0 else ''}{words} times what it should: check its unit"
+    likely = LIKELY_GAINS[0] < abs(gain) < LIKELY_GAINS[1] and abs(gain - 1.0) > SNAP
+    return f"reads {gain:.3g} times what it should" if likely else None
+
+
+def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, plant: Plant) -> Iterator[_Candidate]:
+    """Yield another plant in place of the experiments' own."""
+    if any(e.plant.name == plant.name or not set(e.outputs) <= set(plant.outputs) for e in experiments):
+        return
+    if any(not set(plant.inputs) <= {*e.log.signals, *plant.optional_inputs} for e in experiments):
+        return
+    free = [name for name in params.free_names if name in plant.parameters]
+    if not free:
+        return
+    own = plant.complete(params.fix())
+    changed = tuple(
+        replace(e, plant=plant, initial_state=e.initial_state if isinstance(e.initial_state, str) else "estimate")
+        for e in experiments
+    )
+
+    def describe(values: Mapping[str, float]) -> str | None:
+        return f"the log is of the plant {plant.name}, not {experiments[0].plant.name}"
+
+    yield _Candidate(
+        where=experiments[0].name, experiments=changed, params=ParameterSet(own.values()).free(*free),
+        describe=describe,
+    )  # fmt: skip

@@ -1,0 +1,225 @@
+r"""What the inputs account for, of each output and of its residual, line by line of their spectra and without a model.
+
+With the spectra U (stretches by inputs) and Y (stretches) of K Hann-windowed stretches that overlap by half, what the
+inputs account for at one line is the projection of Y on U's columns, and
+
+.. math:: \gamma^2 = \frac{Y^H U (U^H U)^{-1} U^H Y}{Y^H Y}
+
+the multiple coherence (Bendat and Piersol, Random Data, 4th ed., ch. 7). Of noise that follows no input,
+:math:`1 - \gamma^2` is a beta variable of (K - m, m) for m inputs, whatever the noise's colour: its mean is taken off,
+and a residual's coherence is compared with it. Stretches long and short are looked at: long ones resolve modes, short
+ones average more.
+
+Lightly damped modes ring longer than any stretch. They are seen by a predictor of the output that knows its own past
+(ARX), simulated without it: what it explains is a lower bound of what a model could.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from seaopt.estimation.problem.correlation import load_transforms
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
+from seaopt.records import record
+
+STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
+SHORTEST = 32  # samples of a stretch
+FEWEST, MOST = 6, 256  # stretches that are averaged
+INDEPENDENT = 0.947  # averages per overlapping stretch (Welch 1967, Hann)
+OUTLIER = 4.0  # robust standard deviations beyond which a residual tells nothing of its spectrum
+OCTAVES = 24  # below the Nyquist frequency, at most
+
+
+@record(eq=False)
+class CoherentShare:
+    """What the inputs account for, of one output and of its residual.
+
+    Parameters
+    ----------
+    output : float
+        Share of the output's energy that they account for.
+    residual : float
+        The same of the residual.
+    p : float
+        Probability that a residual that follows no input has so coherent an octave (Bonferroni's bound).
+    band_hz : (low, high)
+        The octave whose residual is the least likely to be chance.
+    power : float
+        Power of the residual that the inputs account for, over the output's that they account for.
+
+    """
+
+    output: float
+    residual: float
+    p: float
+    band_hz: tuple[float, float]
+    power: float
+
+
+def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals) -> dict[str, CoherentShare]:
+    """Return what the inputs account for, by output; empty where the log is too short to tell, or nothing moves."""
+    inputs, outputs = _gather(experiment, residuals)
+    if not inputs:
+        return {}
+    shares: dict[str, CoherentShare] = {}
+    total = sum(len(rows) for rows in inputs)
+    lengths = sorted({2 * (min(max(2 * total // count, SHORTEST), total) // 2) for count in STRETCHES})
+    spectra = [one for length in lengths if (one := _make_spectra(inputs, outputs, length, experiment)) is not None]
+    for o, name in enumerate(experiment.data.outputs):
+        rows = [one.compare(o, len(lengths)) for one in spectra]
+        if not rows or not experiment.spread[o] > 0.0:
+            continue
+        best = min(rows, key=lambda row: row.p)
+        shares[name] = CoherentShare(
+            output=max(row.output for row in rows), residual=max(row.residual for row in rows), p=best.p,
+            band_hz=best.band_hz, power=max(row.power for row in rows),
+        )  # fmt: skip
+    return shares
+
+
+def _gather(
+    experiment: FitExperiment, residuals: ExperimentResiduals
+) -> tuple[list[Float[np.ndarray, "n m"]], list[Float[np.ndarray, "n ny2"]]]:
+    """Return the inputs that move and [measured, residual] of each output, of each segment's samples that count.
+
+    A sample that does not count is what the model says of it.
+    """
+    moving: list[Float[np.ndarray, "n m"]] = []
+    signals: list[Float[np.ndarray, "n ny2"]] = []
+    delay = round(experiment.slots.delay.value / experiment.period)
+    for segment, left in zip(experiment.segments, residuals.segments, strict=True):
+        samples = segment.samples
+        u = np.stack([np.asarray(channel)[samples.lead :] for channel in samples.u], axis=1)
+        if delay:
+            u = np.concatenate([np.repeat(u[:1], min(delay, len(u)), axis=0), u[: max(len(u) - delay, 0)]])
+        used = segment.mark_counted(0)
+        last = int(np.max(np.flatnonzero(np.any(used, axis=1)), initial=-1)) + 1
+        error = np.where(used, -left.raw, 0.0)
+        error = np.where(np.isfinite(error), error, 0.0)
+        measured = np.stack([np.asarray(channel) for channel in samples.y], axis=1)
+        measured = np.where(used, measured, measured + left.raw)
+        if last > 1 and np.all(np.isfinite(measured[:last])):
+            moving.append(u[:last])
+            signals.append(np.concatenate([measured, _tame(error, used)], axis=1)[:last])
+    if not moving:
+        return [], []
+    spread = np.ptp(np.concatenate(moving), axis=0)
+    chosen = np.flatnonzero(spread > 1e-12 * np.max(np.abs(np.concatenate(moving)), axis=0, initial=1e-300))
+    return ([rows[:, chosen] for rows in moving], signals) if chosen.size else ([], [])
+
+
+def _tame(error: Float[np.ndarray, "n ny"], used: Bool[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+    """Return a residual whose outliers are cut: one sample of heavy-tailed noise is all of a short stretch's power."""
+    tamed = error.copy()
+    for o in range(error.shape[1]):
+        kept = error[used[:, o], o]
+        if kept.size:
+            middle = float(np.median(kept))
+            scale = OUTLIER * 1.4826 * float(np.median(np.abs(kept - middle)))
+            tamed[:, o] = np.clip(error[:, o], middle - scale, middle + scale) if scale > 0.0 else error[:, o]
+    return tamed
+
+
+@record(eq=False)
+class _Row:
+    """What one length of stretch tells of one output."""
+
+    output: float
+    residual: float
+    p: float
+    band_hz: tuple[float, float]
+    power: float
+
+
+@record(eq=False)
+class _Spectra:
+    """Power of each signal at each line, the part that the inputs account for, and how many averages they are of."""
+
+    frequency_hz: Float[np.ndarray, " f"]
+    power: Float[np.ndarray, "f s"]
+    coherent: Float[np.ndarray, "f s"]
+    averages: float
+    inputs: int
+
+    def compare(self, o: int, trials: int) -> _Row:
+        """Return what the inputs account for of an output and of its residual; so many lengths are tried."""
+        by_chance = self.inputs / self.averages
+        ny = self.power.shape[1] // 2
+        unbiased = np.clip((self.coherent - by_chance * self.power) / (1.0 - by_chance), None, self.power)
+        of_output, of_residual = (
+            float(np.sum(unbiased[:, s])) / max(float(np.sum(self.power[:, s])), 1e-300) for s in (o, ny + o)
+        )
+        left = max(float(np.sum(unbiased[:, ny + o])), 0.0) / max(float(np.sum(unbiased[:, o])), 1e-300)
+        p, band = self._test(ny + o, trials)
+        return _Row(output=max(of_output, 0.0), residual=max(of_residual, 0.0), p=p, band_hz=band, power=left)
+
+    def _test(self, s: int, trials: int) -> tuple[float, tuple[float, float]]:
+        """Return the least p of the octaves, and its octave."""
+        from scipy.special import digamma, gammaincc, polygamma  # deferred: scipy is slow to load
+
+        f, k, m = self.frequency_hz, self.averages, float(self.inputs)
+        gamma2 = np.clip(self.coherent[:, s] / np.maximum(self.power[:, s], 1e-300), 0.0, 1.0 - 1e-12)
+        gamma2[self.power[:, s] <= 1e-20 * np.sum(self.power[:, s])] = 0.0
+        statistic = -np.log1p(-gamma2)
+        mean = float(digamma(k) - digamma(k - m))
+        variance = float(polygamma(1, k - m) - polygamma(1, k))
+        octave = np.floor(np.log2(f[-1] / f)).astype(int)
+        best, band, count = 1.0, (float(f[0]), float(f[-1])), 0
+        for one in np.unique(octave)[:OCTAVES]:
+            rows = octave == one
+            count += 1
+            # Neighbouring lines of a Hann window share two thirds of their amplitude: two lines tell as much as one.
+            n = max(0.5 * np.count_nonzero(rows), 1.0)
+            shape, scale = n * mean**2 / variance, variance / mean
+            p = float(gammaincc(shape, n * float(np.mean(statistic[rows])) / scale))
+            if p < best:
+                best, band = p, (float(f[rows][0]), float(f[rows][-1]))
+        return min(best * count * trials, 1.0), band
+
+
+def _make_spectra(
+    inputs: Sequence[Float[np.ndarray, "n m"]], outputs: Sequence[Float[np.ndarray, "n s"]], length: int,
+    experiment: FitExperiment,
+) -> _Spectra | None:  # fmt: skip
+    """Return the spectra over stretches of one length; None where there are too few of them."""
+    starts = [
+        (i, row) for i, rows in enumerate(inputs) for row in range(0, len(rows) - length + 1, max(length // 2, 1))
+    ]
+    if len(starts) > MOST:
+        starts = [starts[i] for i in np.linspace(0, len(starts) - 1, MOST).astype(int)]
+    averages, m = INDEPENDENT * len(starts), inputs[0].shape[1]
+    if len(starts) < FEWEST or averages < 2.0 * m + 1.0:
+        return None
+    window = np.hanning(length + 1)[:length]
+    u, y = (
+        np.stack([_transform(rows[i][a : a + length], window) for i, a in starts], axis=1) for rows in (inputs, outputs)
+    )
+    frequency = np.fft.rfftfreq(length, experiment.period)
+    low, high = experiment.band_hz or (0.0, np.inf)
+    kept = (frequency > 0.0) & (frequency >= low) & (frequency <= high)
+    if np.count_nonzero(kept) < 3:
+        return None
+    u, y = u[kept], y[kept]
+    coherent = _project(u, y)
+    return _Spectra(
+        frequency_hz=frequency[kept], power=np.sum(np.abs(y) ** 2, axis=1), coherent=coherent, averages=averages,
+        inputs=m,
+    )  # fmt: skip
+
+
+def _transform(cut: Float[np.ndarray, "n s"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "f s"]:
+    """Return the spectra of a stretch without its means."""
+    return np.asarray(load_transforms()[2]((cut - np.mean(cut, axis=0)) * window[:, None], axis=0))
+
+
+def _project(u: Complex[np.ndarray, "f k m"], y: Complex[np.ndarray, "f k s"]) -> Float[np.ndarray, "f s"]:
+    """Return the power of the projections of y on the columns of u, line by line."""
+    basis, triangle = np.linalg.qr(u)
+    size = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
+    seen = size > 1e-9 * np.max(size, axis=(0, 1))  # an input that is silent at a line accounts for nothing there
+    inside = np.einsum("fkm,fks->fms", np.conj(basis), y)
+    return np.sum(np.abs(inside) ** 2 * seen[:, :, None], axis=1)

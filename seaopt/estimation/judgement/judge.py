@@ -1,0 +1,253 @@
+"""The judgement of a fit: findings of each of its outputs and parameters, and what is likely to be the cause.
+
+Three looks are taken at every fit. What it explains is compared with what some model of the inputs could (see
+`coherence`). Its residual is held against the noise floor: what the inputs account for in it, the model lacks. And
+whatever was fixed, parameters and delays, is tested for being wrong (see `score_test`), for a wrong value may leave
+hardly any residual and yet move the estimates far. Only where one of them finds something are other explanations
+refitted (see `causes`), so that a good fit does not pay for them.
+
+A cause is an error where it takes half of a residual away or moves an estimate beyond its interval: the parameters of
+such a fit are not what it says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.estimation.judgement.causes import Cause, find_causes
+from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
+from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
+from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.result.findings import SEVERITIES, FitFinding, OutputFit
+from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.parameters import Parameter
+from seaopt.plants import Plant
+from seaopt.simulation import depends_on_time
+from seaopt.units import unit_after
+
+HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
+LITTLE = 0.02  # of an output's energy: where no model explains more, explaining less is no fault
+CHANCE = 1e-6  # probability below which a test is not chance
+SYSTEMATIC = 0.5  # of a residual's power: more than its noise
+LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
+SMALL = 1e-5  # below which a systematic residual is worth no word
+HELD_OUT = 0.9  # of the share explained over the samples used
+WORSE_HELD_OUT = 2.0  # times the rms over the samples used
+PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
+FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
+FAR = 3.0  # times beyond a plausible range
+
+
+def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
+    """Return the fit with what its outputs explain, and what is wrong with it.
+
+    Parameters
+    ----------
+    fit : Fit
+        With its minimum.
+    alternatives : sequence of Plant
+        Other plants that may have been on the bench, tried where this one does not explain the logs.
+
+    """
+    minimum = fit.require_minimum("judge")
+    residuals = minimum.residuals()
+    shares = {
+        experiment.name: measure_coherence(experiment, residuals[experiment.name])
+        for experiment in minimum.problem.experiments
+    }
+    outputs = _state_shares(fit, shares)
+    fit = replace(fit, outputs=outputs)
+    findings = [*_find_unexplained(fit, shares), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
+    findings += [*_find_implausible(fit), *_find_few_samples(fit, minimum)]
+    tests = _run_tests(fit, minimum)
+    suspects = {name: test for name, test in tests.items() if test.p < CHANCE}
+    wrong = bool(suspects) or any(finding.severity != "note" for finding in findings) or fit.status != "converged"
+    if wrong:
+        poor = any(finding.kind == "explained" for finding in findings) or fit.status == "not_identifiable"
+        causes = find_causes(fit, residuals, suspects, alternatives, poor=poor)
+        findings += _name_causes(fit, causes, suspects)
+    return _conclude(fit, findings)
+
+
+def _conclude(fit: Fit, findings: Sequence[FitFinding]) -> Fit:
+    """Return the fit with its findings, errors first; one that explains too little did not converge."""
+    ordered = tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+    unexplained = [one for one in ordered if one.kind == "explained" and one.severity == "error"]
+    if fit.status == "converged" and unexplained:
+        message = f"{unexplained[0].where}: {unexplained[0].text} ({fit.message})"
+        return replace(fit, status="stalled", message=message, findings=ordered)
+    return replace(fit, findings=ordered)
+
+
+def _state_shares(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -> dict[str, dict[str, OutputFit]]:
+    """Return the outputs with what is explained of them and what could be: at least what is."""
+    stated: dict[str, dict[str, OutputFit]] = {}
+    for name, row in fit.outputs.items():
+        stated[name] = {}
+        for output, one in row.items():
+            explained = _explained(one)
+            share = shares[name].get(output)
+            explainable = None if share is None else max(share.output, explained)
+            stated[name][output] = replace(one, explained=explained, explainable=explainable)
+    return stated
+
+
+def _explained(one: OutputFit) -> float:
+    percents = (one.band_fit_percent, one.fit_percent)
+    percent = next((value for value in percents if value is not None and math.isfinite(value)), 0.0)
+    return max(1.0 - (1.0 - percent / 100.0) ** 2, 0.0)
+
+
+def _find_unexplained(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -> Iterator[FitFinding]:
+    """Yield outputs that are explained less than they could be, and residuals that follow an input."""
+    for name, row in fit.outputs.items():
+        for output, one in row.items():
+            where = f"{name}.{output}"
+            share = shares[name].get(output)
+            if one.explained is None or one.explainable is None or share is None:
+                continue
+            ratio = one.explained / max(one.explainable, 1e-300)
+            if ratio < MOST and one.explainable > LITTLE:
+                text = (
+                    f"the model explains {100 * one.explained:.3g} % of its energy, and the inputs account for "
+                    f"{100 * one.explainable:.3g} %"
+                )
+                yield FitFinding(
+                    severity="error" if ratio < HALF else "warning", kind="explained", where=where, text=text
+                )
+            elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
+                low, high = share.band_hz
+                bad = share.residual > SYSTEMATIC and share.power > LARGE
+                text = (
+                    f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at "
+                    f"{low:.3g} to {high:.3g} Hz: the model lacks something, and the stds allow for noise alone"
+                )
+                yield FitFinding(severity="error" if bad else "warning", kind="residual", where=where, text=text)
+
+
+def _find_held_out(outputs: Mapping[str, Mapping[str, OutputFit]]) -> Iterator[FitFinding]:
+    """Yield outputs that are explained far less where they were held out."""
+    for name, row in outputs.items():
+        for output, one in row.items():
+            if one.holdout_fit_percent is None or not math.isfinite(one.holdout_fit_percent):
+                continue
+            held_out = max(1.0 - (1.0 - one.holdout_fit_percent / 100.0) ** 2, 0.0)
+            used = max(1.0 - (1.0 - one.fit_percent / 100.0) ** 2, 0.0)
+            worse = (1.0 - held_out) / max(1.0 - used, 1e-300)
+            if worse < WORSE_HELD_OUT**2 or held_out > 0.99 * used:
+                continue
+            yield FitFinding(
+                severity="error" if held_out < HELD_OUT * used else "warning", kind="held_out",
+                where=f"{name}.{output}",
+                text=f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held "
+                "out: the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or "
+                "fix parameters",
+            )  # fmt: skip
+
+
+def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
+    """Yield unknowns at a bound: errors where the logs want them far beyond it."""
+    unknowns, z = minimum.problem.unknowns, minimum.z
+    width = 1e-9 * np.maximum(np.abs(z), 1e-300)
+    touching = np.flatnonzero((z - unknowns.low <= width) | (unknowns.high - z <= width))
+    if not touching.size:
+        return
+    here = minimum.problem.evaluate(z)
+    for i in touching:
+        name, curvature = unknowns.names[i], float(here.hessian[i, i])
+        inward = 1.0 if z[i] - unknowns.low[i] <= width[i] else -1.0
+        push = inward * float(here.gradient[i]) / math.sqrt(max(curvature, 1e-300))
+        bad = push > PUSH
+        remedy = (
+            "the logs want it beyond: widen the bound, or look for what the model lacks"
+            if bad
+            else ("widen the bound, or fix it there and say why")
+        )
+        yield FitFinding(
+            severity="error" if bad else "note", kind="bound", where=name,
+            text=f"{name} = {z[i]:.4g} lies on its bound; {remedy}",
+        )  # fmt: skip
+
+
+def _find_implausible(fit: Fit) -> Iterator[FitFinding]:
+    """Yield free parameters of built-in plants that lie outside what such actuators have."""
+    plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
+    for name in fit.covariance.names:
+        known = next((plant.parameters[name] for plant in plants if name in plant.parameters), None)
+        if not isinstance(known, Parameter) or known.plausible is None:
+            continue
+        (low, high), parameter = known.plausible, fit.parameters[name]
+        value = parameter.value
+        if low <= value <= high or not parameter.identified:
+            continue
+        far = value > FAR * high or value * FAR < low
+        yield FitFinding(
+            severity="error" if far else "warning", kind="range", where=name,
+            text=f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: "
+            "check the units of inputs and outputs, such as mA read as A, and the fixed parameters",
+        )  # fmt: skip
+
+
+def _find_few_samples(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
+    """Yield that there are too few samples for the unknowns, so that neither values nor intervals can be trusted."""
+    power = minimum.problem.map(lambda experiment: _count(experiment))
+    samples, unknowns = sum(power), minimum.z.size
+    longest = max(power, default=0)
+    if longest < FEWEST_SAMPLES or samples < SAMPLES_PER_UNKNOWN * unknowns:
+        yield FitFinding(
+            severity="error", kind="samples", where="",
+            text=f"{samples} samples are too few for {unknowns} unknowns: nothing tests the model; log longer",
+        )  # fmt: skip
+
+
+def _count(experiment: FitExperiment) -> int:
+    return int(max(np.sum([segment.count_weighted() for segment in experiment.segments], axis=0)))
+
+
+def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
+    """Test fixed parameters and delays; where residuals are coloured, those that make linear plants nonlinear too."""
+    problem = minimum.problem
+    if fit.status == "not_identifiable":
+        return {}
+    plain, bending = find_candidates(problem, fit)
+    known = {
+        e.name: free_delay(e.data, e.slots.delay.value)
+        for e in problem.experiments
+        if e.slots.delay.index is None and not depends_on_time(e.model)
+    }
+    tests = run_score_tests(minimum, fit, plain, known)
+    white = all(one.whiteness_p > CHANCE for row in fit.outputs.values() for one in row.values())
+    for name in () if white else bending:
+        tests |= run_score_tests(minimum, fit, (name,))
+    return tests
+
+
+def free_delay(experiment: Experiment, value: float) -> Experiment:
+    """Return the experiment with its delay free."""
+    free = Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0)
+    return replace(experiment, delay_s=free)
+
+
+def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:
+    """Yield the explanation that is the most likely, and others that explain as much."""
+    if not causes:
+        for name in list(suspects)[:1]:
+            yield FitFinding(
+                severity="warning", kind="fixed", where=name,
+                text=f"{name} = {suspects[name].value:.4g} is fixed, and the logs are against it (chi-square "
+                f"{suspects[name].chi2:.3g} on one degree of freedom), but no other value alone explains them",
+            )  # fmt: skip
+        return
+    best = causes[0]
+    alike = [cause for cause in causes[1:] if cause.gain > 0.9 * best.gain]
+    words = "".join(f"; or {cause.text}, which explains as much" for cause in alike[:2])
+    yield FitFinding(
+        severity="error" if any(cause.material for cause in (best, *alike)) else "warning", kind="cause",
+        where=best.where,
+        text=f"likely cause: {best.text}{best.consequence}{words}",
+    )  # fmt: skip

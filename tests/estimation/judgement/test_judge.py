@@ -1,0 +1,160 @@
+"""Spoiled logs are found and their cause is named; honest ones are not accused. Logs come from scipy's integrators."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import seaopt as so
+from seaopt.estimation.judgement.causes import find_clipping
+from seaopt.estimation.judgement.coherence import measure_coherence
+
+RATE_HZ = 400.0
+K, M_L, J, B_R, K_TAU, RADIUS = 655e3, 0.646, 3.31e-6, 1.31e-4, 0.0255, 0.002 / (2 * math.pi * 3.0)
+
+
+def bench(seed=1, n=4000, noise_n=4.0, friction_n=0.0):
+    """Return what cells read of (J/r^2 + m_l) qdd = K_tau/r I - b_r/r^2 qd - k q - friction, held current."""
+    rng = np.random.default_rng(seed)
+    current = 3.0 * signal.lfilter([0.3], [1.0, -0.7], rng.normal(size=n))
+    moving, damping, gain = J / RADIUS**2 + M_L, B_R / RADIUS**2, K_TAU / RADIUS
+    a, b = np.array([[0.0, 1.0], [-K / moving, -damping / moving]]), np.array([[0.0], [1.0 / moving]])
+    fine = 10 if friction_n else 1
+    step = signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 1.0 / (fine * RATE_HZ))
+    x, states = np.zeros(2), np.empty((n, 2))
+    for i in range(n):
+        states[i] = x
+        for _ in range(fine):
+            x = step[0] @ x + step[1][:, 0] * (gain * current[i] - friction_n * math.tanh(x[1] / 1e-3))
+    force = gain * current - friction_n * np.tanh(states[:, 1] / 1e-3)
+    f1 = K * states[:, 0]
+    f2 = f1 + M_L * (states @ a[1] + force / moving)
+    return {"I": current, "F1": f1 + noise_n * rng.normal(size=n), "F2": f2 + noise_n * rng.normal(size=n)}
+
+
+def fit(columns, free=("J", "b_r"), plant=None, alternatives=(), start=None, **options):
+    """Return the fit of these columns, from starts that are half and twice the truth."""
+    n = columns["I"].size
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, **columns)
+    used = so.plants.high_impedance() if plant is None else plant
+    params = so.plants.thor().update(J=2e-6, b_r=2.5e-4, **(start or {})).free(*free)
+    one = so.Experiment(plant=used, log=log, outputs=("F1", "F2"), name="log")
+    return so.fit([one], params, alternatives=alternatives, **options)
+
+
+def kinds(result, severity="error"):
+    return {finding.kind for finding in result.findings if finding.severity == severity}
+
+
+def cause(result):
+    return next(finding.text for finding in result.findings if finding.kind == "cause")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_honest_log_is_met_and_explained_as_far_as_its_noise_allows(seed):
+    columns = bench(seed, noise_n=100.0)
+    result = fit(columns)
+    assert result.met and not kinds(result) and not kinds(result, "warning")
+    row = result.outputs["log"]["F1"]
+    allowed = 1.0 - 100.0**2 / np.var(columns["F1"])
+    assert row.explained == pytest.approx(allowed, abs=0.01)
+    assert row.explainable == pytest.approx(allowed, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda c: c | {"I": c["F1"], "F1": c["I"]}, "columns of I and F1"),
+        (lambda c: c | {"F1": c["F2"], "F2": c["F1"]}, "columns of F1 and F2"),
+        (lambda c: c | {"I": -c["I"]}, "I has the wrong sign"),
+        (lambda c: c | {"F1": c["F1"] / 4.448}, "F1 reads 1/4.448 times"),
+        (lambda c: c | {"I": 1e3 * c["I"]}, "I reads 1000 times"),
+        (
+            lambda c: {"I": c["I"][:-20], "F1": c["F1"][20:], "F2": c["F2"][20:]},
+            r"inputs that are stamped (49\.9\d|50\S*) ms late",
+        ),
+        (lambda c: {"I": c["I"][2:], "F1": c["F1"][:-2], "F2": c["F2"][:-2]}, r"a delay of (4\.9\d+|5|5\.0\d+) ms"),
+        (lambda c: c | {"F1": signal.lfilter([0.27], [1.0, -0.73], c["F1"])}, "F1 passed a low-pass"),
+    ],
+    ids=["swapped", "forces swapped", "sign", "pounds", "milliampere", "late input", "delay", "low-pass"],
+)
+def test_the_cause_of_a_spoiled_log_is_named(spoil, said):
+    result = fit(spoil(bench(noise_n=2.0)))
+    assert not result.met
+    assert re.search(said, cause(result)), cause(result)
+
+
+def test_friction_that_the_model_lacks_is_found():
+    result = fit(bench(friction_n=60.0, n=3000))
+    assert not result.met
+    assert "f_c = 6" in cause(result) or "f_c = 59" in cause(result)
+
+
+def test_a_wrong_fixed_stiffness_is_an_error_where_the_logs_tell():
+    result = fit(bench(noise_n=0.5), start={"k": 2 * K})
+    assert not result.met
+    assert re.search(r"k = 6\.\d+e\+05", cause(result))
+
+
+def test_another_plant_of_the_problem_is_named():
+    swing = so.plants.moving_output()
+    log = so.virtual_log(
+        swing, so.plants.thor(), so.bench.PAPER_SWING, duration_s=10, rate_hz=RATE_HZ, seed=1,
+        sensors=so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}),
+    )  # fmt: skip
+    result = fit({name: log[name] for name in ("I", "F1", "F2")}, alternatives=[swing])
+    assert not result.met
+    assert result.status != "converged"
+    assert swing.name in cause(result)
+
+
+def test_clipping_ahead_of_the_noise_is_found():
+    columns, rng = bench(noise_n=0.0), np.random.default_rng(5)
+    level = 1.5 * np.std(columns["F1"])
+    for name in ("F1", "F2"):
+        columns[name] = np.clip(columns[name], -level, level) + 4.0 * rng.normal(size=columns[name].size)
+    result = fit(columns)
+    assert not result.met and "clipped" in cause(result)
+    assert find_clipping(rng.normal(size=500), rng.normal(size=500)) is None
+
+
+def test_few_samples_bounds_and_implausible_values_are_errors():
+    columns = bench()
+    assert "samples" in kinds(fit({name: values[:40] for name, values in columns.items()}))
+    params = so.plants.thor().free("J", "b_r")
+    held = params.with_parameters(replace(params["J"], value=7e-6, min=6e-6))
+    log = so.Log.from_arrays(time=np.arange(4000) / RATE_HZ, **columns)
+    bounded = so.fit([so.Experiment(plant=so.plants.high_impedance(), log=log, outputs=("F1", "F2"))], held)
+    assert {"bound"} <= kinds(bounded) and not bounded.met
+    scaled = fit(columns | {"I": 1e3 * columns["I"]}, free=("J", "b_r", "eta"))
+    assert scaled.status == "converged" and kinds(scaled) == {"range"} and not scaled.met
+
+
+def test_the_coherence_of_a_residual_that_follows_nothing_is_chance():
+    """p is a bound: of 60 fits of white and coloured noise, hardly one is below 0.01, and none below 1e-4."""
+    low = []
+    for seed in range(20):
+        columns = bench(seed, n=2000, noise_n=0.0)
+        rng = np.random.default_rng(100 + seed)
+        for name in ("F1", "F2"):
+            noise = (
+                signal.lfilter([0.4], [1.0, -0.9], rng.normal(size=2000)) if seed % 2 else rng.standard_t(3, size=2000)
+            )
+            columns[name] = columns[name] + 10.0 * noise
+        minimum = fit(columns, diagnostics=False).require_minimum("test")
+        (one,) = minimum.problem.experiments
+        low += [share.p for share in measure_coherence(one, minimum.residuals()["log"]).values()]
+    assert np.mean(np.array(low) < 0.01) < 0.1 and min(low) > 1e-4
+
+
+def test_findings_are_stored_and_read_again():
+    result = fit({name: values[:60] for name, values in bench().items()})
+    content = result.to_dict()
+    assert content["schema"] == "seaopt/fit/2" and content["met"] is False
+    assert so.Fit.from_dict(content).findings == result.findings
+    assert {"explained", "explainable"} <= set(content["outputs"]["log"]["F1"])
