@@ -212,7 +212,7 @@ class Session:
         return isinstance(source, ParameterSet) or source.met
 
     def _write(self, stage: str, content: dict[str, Any]) -> None:
-        """Write a result with the digests of what it was made from and of itself, what made it, and if its fit is met."""
+        """Write a result with the digests of what it was made from and of itself, and whether its fit is met."""
         versions = {"seaopt": __version__, "python": platform.python_version(), "machine": platform.machine()}
         content = content | {"provenance": content.get("provenance", {}) | versions}
         if stage not in ("fit", "frf"):
