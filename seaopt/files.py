@@ -5,13 +5,53 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import secrets
+import stat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from seaopt.errors import FileError
+
+# What JSON may hold raw and a terminal would obey, and halves of characters, which are in names that are no text.
+_ESCAPED = re.compile(r"[\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def check_regular(path: Path) -> None:
+    """Refuse what is there and is not a regular file: reading a pipe or a device may never end.
+
+    Raises
+    ------
+    FileError
+        It is a pipe, a device, a socket or a folder.
+
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):  # whoever reads it says why it cannot be read
+        return
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a pipe, a device or a socket"
+        raise FileError(f"{path}: is {what}; give a regular file")
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a path of results at which no folder is or can be.
+
+    Raises
+    ------
+    FileError
+        It is a file, or no path of this system.
+
+    """
+    try:
+        is_file = path.exists() and not path.is_dir()
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: cannot be a folder ({describe_os_error(error)}); give another one with -o") from error
+    if is_file:
+        raise FileError(f"{path}: is a file; give a folder for the results with -o")
 
 
 def write_bytes(path: Path | str, content: bytes) -> Path:
@@ -68,7 +108,8 @@ def plain(value: Any) -> Any:
 
 def to_json(content: dict[str, Any]) -> str:
     """Return `content` as strict JSON (no NaN, no Infinity), indented."""
-    return json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return _ESCAPED.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
 
 
 def write_json(path: Path | str, content: dict[str, Any]) -> Path:
@@ -86,13 +127,14 @@ def read_json(path: Path | str, schema: str) -> dict[str, Any]:
 
     """
     source = Path(path)
+    check_regular(source)
     try:
         content = json.loads(source.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise FileError(f"{source}: no such file; run the earlier stage first") from error
     except OSError as error:
         raise FileError(f"{source}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FileError(f"{source}: not valid JSON ({error}); run its stage again") from error
     found = content.get("schema") if isinstance(content, dict) else None
     if found != schema:

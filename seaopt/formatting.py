@@ -7,12 +7,15 @@ missing number, an infinite one and a range look the same everywhere.
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 MISSING = "–"
+# All control characters but tab and line feed, what turns the direction of text, and halves of characters.
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def format_number(value: Any, digits: int = 4, missing: str = MISSING) -> str:
@@ -42,6 +45,18 @@ def format_figure(value: Any, unit: str = "", digits: int = 4, missing: str = MI
     """
     number = format_number(value, digits, missing)
     return number if number == missing else f"{number} {unit}".rstrip()
+
+
+def printable(text: str) -> str:
+    r"""Return a text that a terminal shows and does not obey: control characters, and bytes of a name that are no text.
+
+    Examples
+    --------
+    >>> print(printable("F1\x1b]0;title\x07"))
+    F1\x1b]0;title\x07
+
+    """
+    return _UNPRINTABLE.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
 
 
 def format_band(ends: tuple[float, float] | None, unit: str = "", missing: str = "none") -> str:

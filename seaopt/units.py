@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 DIMENSIONLESS = frozenset({"", "-", "1"})
 _SYNONYMS = {"usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC"}
 _HEADER = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+# Python would work for years on 9^9^9^9.
+_POWER = re.compile(r"(?:\^|\*\*)[\s(+-]*(\d*)")
+_POWER_OF_POWER = re.compile(r"(?:\^|\*\*)\s*\(?\s*[-+]?\s*[\d.]+\s*\)?\s*(?:\^|\*\*)")
+MAX_POWERS = 6
 _TOKEN = re.compile(r"[A-Za-zµμΩ°%]+")
 
 
@@ -40,6 +44,10 @@ def _parse(unit: str) -> Any:
         return _registry().dimensionless
     if len(unit) > 80 or not re.fullmatch(r"[\w *\t/^().·µμ°%Ω+-]+", unit):
         raise UnitError(f'unit "{unit[:80]}" cannot be read; write it like "N", "kg m^2" or "rad/s"')
+    powers = _POWER.findall(unit)
+    nested = _POWER_OF_POWER.search(unit) or (len(powers) > 1 and re.search(r"\)\s*(?:\^|\*\*)", unit))
+    if nested or len(powers) > MAX_POWERS or any(len(digits) > 2 for digits in powers):
+        raise UnitError(f'unit "{unit}" raises to a power that no unit has; write it like "N", "kg m^2" or "rad/s"')
     try:
         return _registry().Unit(_pint_text(unit))
     except Exception as error:  # pint raises many kinds, tokenizer errors among them

@@ -115,6 +115,8 @@ class Multisine:
         return out
 
 
+MOST_SAMPLES = 100_000_000  # 0.8 GB a channel
+
 Excitation = tuple[Chirp | Noise | Multisine, ...]
 
 # The paper's two experiments: chirp of 480.6 N (2 A) with noise of 240.3 N (1 A); noise of 841 N, which is 3.5 A
@@ -158,6 +160,11 @@ def excite(
     n = round(duration_s * rate_hz)
     if n < 2:
         raise SimulationError(f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g} gives {n} samples; lengthen it")
+    if n > MOST_SAMPLES:
+        raise SimulationError(
+            f"duration_s = {duration_s:g} at rate_hz = {rate_hz:g} gives {n} samples, more than {MOST_SAMPLES}"
+            "; shorten it"
+        )
     if not parts:
         raise SimulationError("excitation is empty; give a chirp, a noise, a multisine, or several")
     time = np.arange(n) / rate_hz

@@ -10,10 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError, SeaoptError
-from seaopt.files import to_json, write_json
+from seaopt.files import check_folder, to_json, write_json
 from seaopt.formatting import format_table
 from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, contents, read_table
 from seaopt.logs.log.alignment import Rule
@@ -22,6 +21,8 @@ from seaopt.logs.reading.selection import ClockError, is_time_name
 from seaopt.signals import Table
 
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
+MAX_DIGITS = 9  # of a count
+MOST_LINES = 200  # of channels, and of findings
 STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
@@ -38,8 +39,8 @@ def inspect_log(
         The log cannot be read, or an option is malformed.
 
     """
-    if folder is not None and folder.exists() and not folder.is_dir():
-        raise LogError(f"{folder}: is a file; give a folder for the results with -o")
+    if folder is not None:
+        check_folder(folder)
     headers, unit_of = _parse_pairs("--channel", channels), _parse_pairs("--unit", units)
     for name in unit_of:
         if name != "time" and name not in headers:
@@ -113,7 +114,7 @@ def _parse_counter(option: str | None) -> Counter | None:
     if option is None:
         return None
     ((column, count),) = _parse_pairs("--counter", [option]).items()
-    if not count.isdecimal():
+    if not count.isdecimal() or len(count) > MAX_DIGITS:
         raise SeaoptError(f'--counter "{option}": "{count}" is not how many samples a count stands for; give 1 or more')
     return Counter(column=column, samples_per_count=int(count))
 
@@ -131,7 +132,7 @@ def _parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def _print_report(quality: Quality, written: list[Path]) -> None:
-    console = Console(soft_wrap=True)
+    console = Terminal(soft_wrap=True)
     plain: dict[str, Any] = {"highlight": False, "markup": False}
     console.print(f"{quality.source}: {quality.summary}", **plain)
     for note in quality.notes:
@@ -139,11 +140,15 @@ def _print_report(quality: Quality, written: list[Path]) -> None:
     rows = map(format_channel, quality.channels.values())
     head, *lines = format_table(rows, CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2))
     console.print(head, style="dim", **plain)
-    for line in lines:
+    for line in lines[:MOST_LINES]:
         console.print(line, **plain)
-    for finding in quality.findings:
+    if len(lines) > MOST_LINES:
+        console.print(f"... and {len(lines) - MOST_LINES} more channels: --json and -o list all of them", **plain)
+    for finding in quality.findings[:MOST_LINES]:
         console.print(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ", **plain)
         console.print(finding.sentence, **plain)
+    if len(quality.findings) > MOST_LINES:
+        console.print(f"... and {len(quality.findings) - MOST_LINES} more findings", **plain)
     if not quality.findings:
         console.print("No problem found.", **plain)
     if written:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
+from seaopt.cli.terminal import prepare_streams
 from seaopt.errors import SeaoptError
+from seaopt.formatting import printable
 
 INTERRUPTED = 130  # exit code, as a shell's
 
@@ -156,7 +159,7 @@ def inspect(
     if listed:
         from seaopt.logs import contents
 
-        typer.echo(contents(log))
+        typer.echo(printable(repr(contents(log))))
         return
     inspect_log(
         log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
@@ -246,10 +249,24 @@ def schema(
 
 def main() -> None:
     """Run the command line; a SeaoptError is one line on stderr and exit code 2."""
+    prepare_streams()
     try:
-        app(standalone_mode=True)
+        try:
+            app(standalone_mode=True)
+        finally:
+            sys.stdout.flush()
     except SeaoptError as error:
-        sys.stderr.write(f"seaopt: {' '.join(str(error).split())}\n")
-        raise SystemExit(2) from None
+        _end(str(error))
     except BrokenPipeError:
         raise SystemExit(0) from None
+    except MemoryError:
+        _end("does not fit in memory; take a shorter log, fewer columns, or fewer samples")
+    except OSError as error:  # files are written with errors of our own: this is stdout
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
+        _end(f"stdout: cannot be written ({error.strerror or error}); free its disk, or write elsewhere")
+
+
+def _end(text: str) -> NoReturn:
+    """Write one line on stderr, as a terminal may see it, and leave with the exit code of bad input."""
+    sys.stderr.write(f"seaopt: {printable(' '.join(text.split()))}\n")
+    raise SystemExit(2)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.errors import ProblemError
-from seaopt.files import plain
+from seaopt.files import check_regular, plain
 from seaopt.problem import Problem
 from seaopt.problem.schema import ControllerTable
 from seaopt.robustness.uncertainty.draws import find_modes
@@ -31,6 +31,7 @@ ROBUSTNESS = "[robustness]"  # the digest of what a design took from there
 
 def digest(path: Path) -> str:
     """Return the SHA-256 of a result in a file, as `digest_content`; of its bytes where it is damaged."""
+    check_regular(path)
     raw = path.read_bytes()
     try:
         content = json.loads(raw)

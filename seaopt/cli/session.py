@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
+from seaopt.cli.terminal import Terminal
 from seaopt.control import Controller, ControllerSpec, sweep, tune
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, fit, warn_unidentified
-from seaopt.files import read_json, to_json, write_json
+from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -62,8 +62,7 @@ class Session:
     def __init__(
         self, problem: Path, folder: Path, stretch_s: float | None = None, bandwidths_hz: tuple[float, ...] = ()
     ) -> None:
-        if folder.exists() and not folder.is_dir():
-            raise ProblemError(f"{folder}: is a file; give a folder for the results with -o")
+        check_folder(folder)
         self.problem: Problem = read_problem(problem)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -76,7 +75,7 @@ class Session:
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
         self._warned: set[str] = set()
-        self._console = Console(stderr=True)
+        self._console = Terminal(stderr=True)
 
     def plan_stages(self) -> list[str]:
         """Return the stages that the problem has what it takes for."""
@@ -420,7 +419,7 @@ class Session:
             only = next(iter(contents.values())) if len(contents) == 1 else contents
             sys.stdout.write(to_json(only))
             return
-        console = Console(soft_wrap=True)
+        console = Terminal(soft_wrap=True)
         for stage in stages:
             if stage == "simulate":
                 for line in SIMULATED[: 2 if any(table.virtual for table in self.problem.table.experiment) else 1]:

@@ -106,6 +106,8 @@ def responses(
     A rough estimate is made in single precision, in half the time.
     """
     n = u.size
+    if stretch_s is not None and not 0.0 < stretch_s < n * period:
+        raise LogError(f"stretch_s = {stretch_s:g} is not within the log of {n * period:g} s; give a shorter one")
     length = int(n / 16) if stretch_s is None else round(stretch_s / period)
     length = max(length, 16)
     if n < 2 * length:

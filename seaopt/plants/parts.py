@@ -105,7 +105,7 @@ def check_parts(parts: Sequence[str]) -> None:
     if isinstance(parts, str) or not isinstance(parts, Sequence):
         raise PlantError(f"parts = {parts!r} is not a list of names; give a list such as ['load_cell']")
     for part in parts:
-        if part not in PARTS:
+        if not isinstance(part, str) or part not in PARTS:
             raise PlantError(f'part "{part}" is not known; {suggestion(str(part), PARTS)}')
         if list(parts).count(part) > 1:
             raise PlantError(f'part "{part}" is given twice; each part goes on once')

@@ -32,6 +32,24 @@ def check_inside(place: str, table: ExperimentTable) -> None:
                 raise ProblemError(f'{place}.log = "{name}" leaves the problem file\'s folder; put the log beside it')
 
 
+def check_links(folder: Path, names: list[str]) -> None:
+    """Refuse a log that a symbolic link puts outside the problem file's folder.
+
+    Raises
+    ------
+    ProblemError
+        The file that is meant lies elsewhere.
+
+    """
+    for name in names:
+        try:
+            inside = (folder / name).resolve().is_relative_to(folder.resolve())
+        except (OSError, ValueError, RuntimeError):  # no path, or links in a circle: the reader says so
+            continue
+        if not inside:
+            raise ProblemError(f'log = "{name}" is a link out of the problem file\'s folder; put the log beside it')
+
+
 def make_column(table: str | int | ClockTable | ColumnTable, folder: Path) -> Column:
     """Return a column as the reader takes it."""
     if isinstance(table, str | int):

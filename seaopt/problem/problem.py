@@ -25,10 +25,11 @@ from seaopt.estimation import (
     SoftL1,
     Squares,
 )
+from seaopt.files import check_regular
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
-from seaopt.problem.columns import list_log_files, make_column, make_rule
+from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.references import check_references, range_remarks
 from seaopt.problem.schema import (
     ColumnTable,
@@ -179,6 +180,7 @@ class Problem:
         )  # fmt: skip
 
     def _read_log(self, table: ExperimentTable) -> Log:
+        check_links(self.folder, list_log_files(table))
         return read_log(
             [self.folder / name for name in list_log_files(table)],
             time=None if table.time is None else make_column(table.time, self.folder),
@@ -358,10 +360,11 @@ def _read_toml(source: Path) -> dict[str, Any]:
             raise ProblemError(f"{source}: is a folder; give a problem file (TOML)")
         if source.stat().st_size > MAX_BYTES:
             raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
+        check_regular(source)
         return tomllib.loads(source.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise ProblemError(f"{source}: no such file; check the path") from error
     except OSError as error:
-        raise ProblemError(f"{source}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ProblemError(f"{source}: cannot be read ({error.strerror}); check the path") from error
+    except (ValueError, RecursionError) as error:  # also a number of more digits than Python reads
         raise ProblemError(f"{source}: is not valid TOML ({error}); correct that place") from error

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from seaopt.files import write_bytes
+from seaopt.formatting import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,9 +29,26 @@ def render_figure(figure: Figure, kind: str) -> bytes:
     stream = io.BytesIO()
     metadata = {"Date": None} if kind == "svg" else None
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "seaopt", "font.size": 9.0}):
-        _lay_out(figure)
-        figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
+        _take_literally(figure)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Glyph .* missing")  # a character that the font lacks is a box
+            _lay_out(figure)
+            figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata)
     return stream.getvalue()
+
+
+def _take_literally(figure: Figure) -> None:
+    r"""Let titles, labels and legends show a channel named "$\foo$" as it is: only numbers at ticks are mathematics."""
+    texts = list(figure.texts)
+    legends = list(figure.legends)
+    for axis in figure.axes:
+        texts += [axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts]
+        texts += [getattr(axis, side) for side in ("_left_title", "_right_title") if hasattr(axis, side)]
+        legend = axis.get_legend()
+        legends += [legend] if legend is not None else []
+    for text in [*texts, *(entry for legend in legends for entry in legend.get_texts())]:
+        text.set_parse_math(False)
+        text.set_text(printable(text.get_text()))
 
 
 def _lay_out(figure: Figure) -> None:

@@ -25,10 +25,12 @@ SIGNAL_COLOUR = "#5b6570"
 GAP_COLOUR, STUCK_COLOUR, MISSING_COLOUR, OUTLIER_COLOUR = "#e69f00", "#cc79a7", "#0072b2", "#009e73"
 CLIPPED_COLOUR = HUM_COLOUR = "#d55e00"
 MOST_MARKS = 200  # marks of a kind in a panel: more are a blur
+DRAWN = 1e100  # the largest number that a figure's axes are laid out for
 BINS = 600  # of time, each drawn as its least and largest value
 PANEL_HEIGHT = 1.75  # inches
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers near the largest float have no power
 def quality_figure(data: Log | Table, quality: Quality) -> Figure:
     """Draw the steps of time and the excitation on top, then each channel over time and its spectrum.
 
@@ -131,12 +133,19 @@ def _draw_in_time(
     channel: ChannelQuality,
     quality: Quality,
 ) -> None:
+    values = np.clip(values, -DRAWN, DRAWN)
     _draw_range(axis, time, values, quality.clock.gaps)
     _mark_gaps(axis, time, quality.clock)
     _mark_spans(axis, time, channel.missing, MISSING_COLOUR, "missing")
     _mark_spans(axis, time, channel.stuck, STUCK_COLOUR, "stuck")
     for rail in channel.rails:
-        axis.axhline(rail.value, color=CLIPPED_COLOUR, linewidth=1.0, linestyle="--", label="flat top")
+        axis.axhline(
+            float(np.clip(rail.value, -DRAWN, DRAWN)),
+            color=CLIPPED_COLOUR,
+            linewidth=1.0,
+            linestyle="--",
+            label="flat top",
+        )
     rows = channel.outliers[:MOST_MARKS]
     if rows.size:
         axis.plot(time[rows], values[rows], "o", color=OUTLIER_COLOUR, markersize=4, fillstyle="none", label="outlier")
@@ -187,6 +196,9 @@ def _draw_in_frequency(axis: Axes, channel: ChannelQuality, quality: Quality) ->
     f, n = spectra.frequency_hz[1:], 2 * (spectra.frequency_hz.size - 1)
     density = np.sqrt(2.0 * spectra.power(channel.name)[1:] * spectra.period / (0.375 * n))  # Hann's mean square is 3/8
     top = float(np.max(density))
+    if not np.isfinite(top) or top <= 0.0:
+        axis.text(0.5, 0.5, "no spectrum", transform=axis.transAxes, ha="center", va="center")
+        return
     axis.plot(f, np.maximum(density, 1e-12 * top), color=SIGNAL_COLOUR, linewidth=0.9)
     axis.set_ylim(max(float(np.min(density)), 1e-6 * top) / 2.0, 3.0 * top)
     for line in channel.hum.lines_hz if channel.hum is not None else ():

@@ -24,6 +24,7 @@ from seaopt.units import same_dimension
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
+LARGEST = 1e100  # of a sample
 SHORTEST_SHOT = 4  # samples
 Mask = Literal["auto", "declared", "none"]
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
@@ -199,6 +200,17 @@ class Experiment:
                         f'experiment {self.name}: initial_state names "{name}", which is not a state of '
                         f"{self.plant.name}; {suggestion(name, self.plant.states)}"
                     )
+        if self.hold not in ("zero", "first"):
+            raise EstimationError(f'experiment {self.name}: hold = "{self.hold}" is not known; use "zero" or "first"')
+        delay = self.delay_s.value if isinstance(self.delay_s, Parameter) else self.delay_s
+        if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
+            raise EstimationError(f"experiment {self.name}: delay_s = {delay!r} is not a time; give seconds, 0 or more")
+        for name in {*self.outputs, *self.plant.inputs} & set(self.log.signals):
+            if (largest := float(np.fmax.reduce(np.abs(self.log[name])))) > LARGEST:
+                raise EstimationError(
+                    f"experiment {self.name}: channel {name} reaches {largest:.3g}, whose square no number holds; "
+                    "correct its unit, scale or samples"
+                )
         if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
             raise EstimationError(f"experiment {self.name}: shots = {self.shots!r}; give 1 or more")
         if self.gaps not in ("split", "error"):

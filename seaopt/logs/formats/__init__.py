@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -87,9 +88,12 @@ def sniff(path: Path) -> tuple[str, str, str]:
 
 
 def _first_bytes(path: Path) -> bytes:
-    if path.is_dir():
-        raise LogError(f"{path}: is a folder; give a file")
     try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise LogError(f"{path}: is a folder; give a file")
+        if not stat.S_ISREG(mode):
+            raise LogError(f"{path}: is a pipe, a device or a socket; give a regular file")
         with path.open("rb") as stream:
             head = stream.read(4096)
     except FileNotFoundError as error:

@@ -428,6 +428,9 @@ def _mean_period(time: Float[np.ndarray, " n"]) -> float:
 
 
 def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:
+    if np.ma.isMaskedArray(values) or np.iscomplexobj(values):
+        what = "masked; fill it with NaN" if np.ma.isMaskedArray(values) else "complex; give real numbers"
+        raise LogError(f"{source}: channel {name} is {what}")
     try:
         array = np.array(values, dtype=float)
     except (TypeError, ValueError) as error:

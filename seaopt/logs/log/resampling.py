@@ -15,6 +15,7 @@ from seaopt.signals import Recording
 
 AROUND = 20  # samples on either side of a long step that tell a gap from a late stamp
 PARTS = 20  # of a log, whose medians tell whether a stated rate is the timestamps' own
+MOST_RESAMPLED = 100  # samples that interpolation may make of one
 LEAST_RATE = 0.8  # of the log's rate; below it interpolation would fold what is above the new Nyquist frequency
 
 HOW_TO_BRIDGE = "bridge_s = ... interpolates across longer ones (in a problem file resample = { ..., bridge_s = ... })"
@@ -45,6 +46,11 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
             "resample near its own rate, then call decimate"
         )
     time = log.time
+    if (time[-1] - time[0]) * rate_hz > MOST_RESAMPLED * time.size:
+        raise LogError(
+            f"{log.source}: rate_hz = {rate_hz:g} would make more than {MOST_RESAMPLED} samples of each of the log's, "
+            f"which come at {old_rate_hz:.6g} Hz; resample near its own rate"
+        )
     longest_step = bridge_s if bridge_s is not None else GAP * period
     gaps = int(np.count_nonzero(np.diff(time) > longest_step))
     new_time: list[Float[np.ndarray, " _"]] = []

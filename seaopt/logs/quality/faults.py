@@ -117,6 +117,8 @@ def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
         return 0.0
     apart = np.diff(kinds)
     apart = apart[apart > 1e-9 * float(kinds[-1] - kinds[0])]
+    if not (apart.size and np.isfinite(apart).all()):  # numbers near the largest float have no differences
+        return 0.0
     least = float(np.min(apart))
     # The least difference may be several steps where a level next to another never occurs.
     for parts in (1, 2, 3, 4, 5):

@@ -34,6 +34,7 @@ from seaopt.signals import Recording
 QUALITY_SCHEMA = "seaopt/quality/1"
 INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u"})  # names of inputs, in any case
 INPUT_UNITS = frozenset({"A", "V"})
+MOST_PAIRED = 100  # outputs; of more only F1 and F2 are correlated with each other
 ENOUGH_SAMPLES = FEWEST_STRETCHES * SHORTEST_STRETCH  # for spectra, in one stretch
 
 
@@ -230,7 +231,10 @@ def _correlate_pairs(
         return ()
     outputs = [name for name in spectra.channels if name not in inputs]
     wanted = [(first, second) for first in inputs if first in spectra.channels for second in outputs]
-    wanted += [(a, b) for a, b in combinations(outputs, 2) if channels[a].unit and channels[a].unit == channels[b].unit]
+    if len(outputs) <= MOST_PAIRED:
+        wanted += [
+            (a, b) for a, b in combinations(outputs, 2) if channels[a].unit and channels[a].unit == channels[b].unit
+        ]
     forces = {name.casefold(): name for name in outputs}
     if "f1" in forces and "f2" in forces and not any(set(two) == {forces["f1"], forces["f2"]} for two in wanted):
         wanted.append((forces["f1"], forces["f2"]))

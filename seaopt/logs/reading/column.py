@@ -86,11 +86,16 @@ class Column:
         """Return the values in the SI unit of `unit`; the array given is used up."""
         if self.wrap_bits is not None:
             values = _decode_twos_complement(values, self.wrap_bits, f'{place}: column "{self.column}"')
-        for step in (self.scale, factor(unit, si_unit(unit))):
-            if step != 1.0:
-                values *= step
-            if step is self.scale and self.offset:
-                values += self.offset
+        with np.errstate(over="ignore", invalid="ignore"):
+            for step in (self.scale, factor(unit, si_unit(unit))):
+                if step != 1.0:
+                    values *= step
+                if step is self.scale and self.offset:
+                    values += self.offset
+        if np.any(np.isinf(values)):  # none of a file's numbers is
+            raise LogError(
+                f'{place}: column "{self.column}": its scale, offset or unit makes a number infinite; correct it'
+            )
         return values
 
     def describe_conversion(self, unit: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -271,9 +272,9 @@ def _separate_arrays(
     group: Mapping[str, SelectedChannel], columns: dict[str, Float[np.ndarray, " n"]]
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Return an array of its own for each channel: two channels of one column are converted apart."""
-    names = [channel.field.name for channel in group.values()]
+    counts = collections.Counter(channel.field.name for channel in group.values())
     return {
-        name: columns[channel.field.name].copy() if names.count(channel.field.name) > 1 else columns[channel.field.name]
+        name: columns[channel.field.name].copy() if counts[channel.field.name] > 1 else columns[channel.field.name]
         for name, channel in group.items()
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
@@ -403,7 +404,8 @@ def _select_every_channel(
         for source, field in numeric
         if _is_on_clock(clock, reference, source, field) or _can_align(align, field)
     ]
-    if rest := [field.name for pair in numeric if pair not in chosen for field in pair[1:]]:
+    taken = {(str(source.path), field.name) for source, field in chosen}
+    if rest := [field.name for source, field in numeric if (str(source.path), field.name) not in taken]:
         notes.append(f'columns on other clocks than "{clock.name}" were left out: {_list_names(rest)}')
     if not chosen:
         raise LogError(
@@ -412,13 +414,14 @@ def _select_every_channel(
     units, unknown = _find_units(chosen)
     notes += unknown
     bare = [bare_name(field.name) if units[index] else field.name for index, (_, field) in enumerate(chosen)]
+    counts = collections.Counter(bare)
     columns: dict[str, Column] = {}
     places: dict[str, tuple[Source, Field]] = {}
     for name, unit, (source, field) in zip(bare, units, chosen, strict=True):
-        key = name if bare.count(name) == 1 and name != "time" else field.name
+        key = name if counts[name] == 1 and name != "time" else field.name
         key = key if key not in columns else f"{source.path.name}:{field.name}"
         columns[key] = Column(column=field.name, unit=unit, file=source.path)
-        places[key] = find_column([source], key, columns[key])
+        places[key] = source, field
     return columns, places, notes
 
 
