@@ -44,6 +44,7 @@ from seaopt.records import record
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
 MAX_LOOP_SUBSTEPS = 512
+FASTEST_GUESSED = 1e6  # of a mode, radians a sample: beyond, the guess is the largest, and a power may overflow
 RTOL = 1e-6
 RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
 
@@ -283,5 +284,5 @@ def _lags(loop: SampledLoop, params: Sequence[CompletedParameters]) -> dict[str,
 def _first_guess(loop: SampledLoop, params: Sequence[CompletedParameters], rtol: float) -> int:
     """Return half the steps that a mode of the first plant, at rest, needs: n (|s| T/n)^5 / 120 = rtol for the 2n."""
     fastest = float(np.max(np.abs(np.linalg.eigvals(state_space(loop.plant, params[0])[0])), initial=0.0))
-    steps = ((fastest * loop.law.sample_time_s) ** 5 / (120.0 * rtol)) ** 0.25
+    steps = min(fastest * loop.law.sample_time_s, FASTEST_GUESSED) ** 1.25 / (120.0 * rtol) ** 0.25
     return int(np.clip(math.ceil(0.5 * steps), 1, 64))
