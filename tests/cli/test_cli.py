@@ -136,8 +136,9 @@ def test_results_of_another_problem_are_refused(folder, seaopt, done, short, old
 
 def test_a_controller_of_another_fit_is_not_exported(copied, seaopt):
     assert seaopt("export", "all", "--c", "firmware").returncode == 0
-    with (copied / "all" / "fit.json").open("a", encoding="utf-8") as fit:
-        fit.write("\n")
+    fit = json.loads((copied / "all" / "fit.json").read_text(encoding="utf-8"))
+    fit["parameters"]["J"]["value"] *= 1.001
+    (copied / "all" / "fit.json").write_text(json.dumps(fit), encoding="utf-8")
     out = seaopt("export", "all", "--c", "other")
     assert out.returncode == 2
     assert "was tuned with another fit" in out.stderr
