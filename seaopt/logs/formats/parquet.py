@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,15 +19,36 @@ from seaopt.units import header_unit
 if TYPE_CHECKING:
     import polars as pl
 
+STDERR = 2
+
 
 def open_parquet(path: Path) -> Source:
     """List the columns of a Parquet file."""
     import polars as pl
 
-    frame = pl.scan_parquet(path, glob=False)
-    length = int(frame.select(pl.len()).collect().item())
-    fields = tuple(_make_field(name, dtype, length) for name, dtype in frame.collect_schema().items())
+    with _silence_panics():
+        frame = pl.scan_parquet(path, glob=False)
+        length = int(frame.select(pl.len()).collect().item())
+        fields = tuple(_make_field(name, dtype, length) for name, dtype in frame.collect_schema().items())
     return Source(path=path, format="Parquet", fields=fields, load=partial(_load, path))
+
+
+@contextmanager
+def _silence_panics() -> Generator[None]:
+    """Keep what polars' own threads write of a damaged file, a hundred lines of Rust, off stderr; it raises as well."""
+    try:
+        sys.stderr.flush()
+        kept = os.dup(STDERR)
+    except (OSError, ValueError, AttributeError):  # there is none
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+            os.dup2(nowhere.fileno(), STDERR)
+        yield
+    finally:
+        os.dup2(kept, STDERR)
+        os.close(kept)
 
 
 def _make_field(name: str, dtype: pl.DataType, length: int) -> Field:
@@ -38,12 +62,13 @@ def _make_field(name: str, dtype: pl.DataType, length: int) -> Field:
 def _load(path: Path, names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     import polars as pl
 
-    frame = pl.scan_parquet(path, glob=False)
-    schema = frame.collect_schema()
-    if window is not None:
-        clock = _select_number(window.clock, schema[window.clock])
-        frame = frame.filter(clock.is_between(window.start, window.stop))
-    columns = frame.select(_select_number(name, schema[name]).alias(name) for name in names).collect()
+    with _silence_panics():
+        frame = pl.scan_parquet(path, glob=False)
+        schema = frame.collect_schema()
+        if window is not None:
+            clock = _select_number(window.clock, schema[window.clock])
+            frame = frame.filter(clock.is_between(window.start, window.stop))
+        columns = frame.select(_select_number(name, schema[name]).alias(name) for name in names).collect()
     return {name: np.array(columns[name].to_numpy(), dtype=float) for name in names}
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import bz2
 import json
+import struct
+import zlib
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
@@ -25,6 +27,9 @@ from seaopt.logs.formats.source import Field, Source, Window, import_optional, s
 from seaopt.records import record
 
 MAX_CHUNK = 1 << 30  # bytes
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+MCAP_FOOTER = struct.Struct("<BQQQI")  # kind, length, begin of the summary and of its index, checksum
+MCAP_DATA_END = struct.Struct("<BQI")  # kind, length, checksum
 UNIX_STAMP_NS = 1_000_000_000 * 1_000_000_000  # stamps after 2001 count from 1970; earlier ones are a simulation's
 ENCODINGS = ("cdr", "ros1", "json")
 
@@ -263,7 +268,8 @@ def _limit_size(chunk: Any) -> Callable[[bytes], bytes]:
 def _open_mcap_file(path: Path) -> Generator[Bag]:
     reading = import_optional("mcap.reader", "ros", path, "MCAP")
     with path.open("rb") as stream:
-        reader = reading.make_reader(stream)
+        _check_mcap_summary(path)
+        reader = reading.make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
             raise LogError(f"{path}: has no summary, its recorder did not end in order; run mcap recover on it")
@@ -282,11 +288,56 @@ def _open_mcap_file(path: Path) -> Generator[Bag]:
             )  # fmt: skip
 
         def messages(topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, bytes]]:
+            _check_mcap_data(path)
             for _, _, message in reader.iter_messages([topic], starting_at=start, ending_before=stop):
                 yield message.log_time, message.data
 
         start = summary.statistics.message_start_time if summary.statistics.message_count else 0
         yield Bag(start=start, topics=topics, messages=messages)
+
+
+def _check_mcap_summary(path: Path) -> None:
+    """Refuse a summary that is not the one its checksum is of; the library looks at those of the chunks alone."""
+    start, checksum = _read_mcap_footer(path)
+    with path.open("rb") as stream:
+        stream.seek(start)
+        summary = stream.read()[: -len(MCAP_MAGIC) - 4]
+    if checksum and zlib.crc32(summary) != checksum:
+        raise LogError(f"{path}: its summary does not have its checksum, the file is damaged; copy or record it again")
+
+
+def _check_mcap_data(path: Path) -> None:
+    """Refuse messages that are not those that the checksum of all of them is of, where the recorder wrote one."""
+    start, _ = _read_mcap_footer(path)
+    end = start - MCAP_DATA_END.size
+    with path.open("rb") as stream:
+        stream.seek(max(end, 0))
+        code, size, checksum = MCAP_DATA_END.unpack(stream.read(MCAP_DATA_END.size))
+        if (code, size) != (0x0F, 4):
+            raise LogError(f"{path}: its data do not end before its summary, the file is damaged; record it again")
+        stream.seek(0)
+        found, left = 0, end if checksum else 0
+        while left > 0:
+            part = stream.read(min(left, 1 << 22))
+            found, left = zlib.crc32(part, found), left - len(part)
+    if checksum and found != checksum:
+        raise LogError(f"{path}: its messages do not have their checksum, the file is damaged; copy or record it again")
+
+
+def _read_mcap_footer(path: Path) -> tuple[int, int]:
+    """Return where the summary begins, and its checksum (0: none)."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, 2)
+        stream.seek(max(size - MCAP_FOOTER.size - len(MCAP_MAGIC), 0))
+        tail = stream.read()
+    if not tail.endswith(MCAP_MAGIC) or len(tail) < MCAP_FOOTER.size + len(MCAP_MAGIC):
+        raise LogError(f"{path}: cannot be read as MCAP (it does not end as one does); it is cut off, run mcap recover")
+    code, length, start, _, checksum = MCAP_FOOTER.unpack(tail[: MCAP_FOOTER.size])
+    if (code, length) != (0x02, 20) or not 0 <= start <= size:
+        raise LogError(f"{path}: cannot be read as MCAP (its last record is damaged); copy or record it again")
+    if start == 0:
+        raise LogError(f"{path}: has no summary, its recorder did not end in order; run mcap recover on it")
+    return start, checksum
 
 
 def _definition_syntax(encoding: str) -> str:
