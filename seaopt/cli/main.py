@@ -189,6 +189,23 @@ def tune(
     _finish(session, json, [stage])
 
 
+@app.command()
+def validate(
+    problem: ProblemFile,
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log that was not fitted.", show_default=False)],
+    output: Folder = Path("out"),
+    like: Annotated[
+        str | None,
+        typer.Option(metavar="EXPERIMENT", help="Whose columns and sensors it has; the first's, if left out."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Score the fit in DIR on another log, from its own initial state and offsets."""
+    from seaopt.cli.session import Session
+
+    Session(problem, output).validate(log, like, json)
+
+
 def _make_command(name: str, text: str) -> Callable[..., None]:
     def command(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
         from seaopt.cli.session import Session

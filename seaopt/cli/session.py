@@ -22,7 +22,7 @@ from seaopt.cli.terminal import Terminal
 from seaopt.control import Controller, ControllerSpec, sweep, tune
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, fit, warn_unidentified
+from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit, warn_unidentified
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
@@ -276,7 +276,9 @@ class Session:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to fit; add one")
         tell("reading logs")
-        experiments = self.experiments()
+        experiments = self.problem.choose_fitted(self.experiments())
+        if not experiments:
+            raise ProblemError(f'{self.problem.source}: every [[experiment]] has use = "validate"; fit one of them')
         result = fit(
             experiments,
             self.problem.parameters,
@@ -286,7 +288,33 @@ class Session:
         )
         tell(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}")
         self.results["fit"] = result
-        self._write("fit", result.to_dict())
+        scores = self._score(result)
+        self.results["scores"] = scores
+        self._write("fit", result.to_dict() | {"validation": {one.name: one.to_dict() for one in scores}})
+
+    def _score(self, result: Fit) -> list[ModelledOutputs]:
+        """Return the predictions of the experiments that are not fitted."""
+        names = {experiment.name for experiment in self.problem.choose_fitted(self.experiments())}
+        return [result.predict(experiment) for experiment in self.experiments() if experiment.name not in names]
+
+    def validate(self, log: Path, like: str | None, as_json: bool) -> None:
+        """Score the folder's fit on another log, and print that."""
+        fitted = self.parameters()
+        if isinstance(fitted, ParameterSet):
+            raise ProblemError(f"{self.problem.source}: has no [[experiment]] that is fitted; nothing to validate")
+        score = fitted.predict(self.problem.experiment_like(log, like))
+        if as_json:
+            content = {
+                "schema": "seaopt/validation/1",
+                "log": str(log),
+                "fit_met": fitted.met,
+                "outputs": score.to_dict(),
+            }
+            sys.stdout.write(to_json(content))
+            return
+        if not fitted.met:
+            self.say(f"warning: scored {UNMET}: {fitted.verdict}")
+        Terminal(soft_wrap=True).print(repr(score), highlight=False, markup=False)
 
     def _frf(self, tell: Callable[[str], None]) -> None:
         if not self.problem.table.experiment:
@@ -369,7 +397,9 @@ class Session:
         if self.problem.table.experiment:
             fitted = self.parameters()
             if isinstance(fitted, Fit) and not fitted.experiments:
-                self.results["fit"] = fitted = replace(fitted, experiments=self.experiments())
+                self.results["fit"] = fitted = replace(
+                    fitted, experiments=self.problem.choose_fitted(self.experiments())
+                )
             results.append(fitted)
         if self.problem.spec is not None and ("tune" in self.results or (self.folder / FILES["tune"]).exists()):
             results.append(self.controller())
@@ -432,6 +462,8 @@ class Session:
                 if stage == "tune" and "joint" in self.results:
                     console.print(repr(self.results["joint"]), highlight=False, markup=False)
                 console.print(repr(self.results[stage]), highlight=False, markup=False)
+                for score in self.results.get("scores", ()) if stage == "fit" else ():
+                    console.print(repr(score), highlight=False, markup=False)
                 for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
                     console.print(f"  note: {remark}", highlight=False, markup=False)
         for stage in ["fit", "tune", "certify"] if "report" in stages else stages:

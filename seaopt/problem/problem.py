@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -160,6 +161,31 @@ class Problem:
                 named = text if f"experiment {table.name}" in text else f"experiment {table.name}: {text}"
                 raise type(error)(f"{self.source}: {named}") from error
         return tuple(experiments)
+
+    def choose_fitted(self, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+        """Return those of the problem's experiments that are fitted; the others are scored (`use = "validate"`)."""
+        scored = {table.name for table in self.table.experiment if table.use == "validate"}
+        return tuple(experiment for experiment in experiments if experiment.name not in scored)
+
+    def experiment_like(self, log: Path, like: str | None = None) -> Experiment:
+        """Return another log as the experiment of a name would read it; as the first, if no name is given.
+
+        Raises
+        ------
+        SeaoptError
+            There is no such experiment, or the log cannot be read as it would read it.
+
+        """
+        tables = {table.name: table for table in self.table.experiment if table.virtual is None}
+        if not tables or (like is not None and like not in tables):
+            what = f'no experiment "{like}" with a log' if like else "no [[experiment]] with a log"
+            raise ProblemError(f"{self.source}: has {what} that says how to read {log}; add one")
+        first = tables[like] if like is not None else next(iter(tables.values()))
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", log.stem)
+        table = first.model_copy(
+            update={"name": name if name[:1].isalpha() else f"log_{name}", "log": str(log.resolve()), "slice_s": None}
+        )
+        return self._make_experiment(table)
 
     def _make_experiment(self, table: ExperimentTable) -> Experiment:
         plant = self.plants[table.plant]

@@ -185,6 +185,7 @@ class ExperimentTable(_Strict):
 
     name: Name
     plant: Name
+    use: Literal["fit", "validate"] = "fit"
     log: str | list[str] | None = None
     virtual: VirtualTable | None = None
     time: Header | ClockTable | None = None

@@ -12,6 +12,7 @@ from seaopt.cli.export import export_controller
 from seaopt.cli.main import run
 from seaopt.cli.provenance import digest_sources
 from seaopt.cli.session import Session
+from seaopt.logs import write_log
 
 BENCH = """
 schema = 1
@@ -224,3 +225,48 @@ def test_a_fit_made_again_from_the_same_file_keeps_its_controller(write, tmp_pat
     assert after["provenance"] != before["provenance"] and after["provenance"]["python"] == "4.0"
     assert after["made_from"] == before["made_from"] and "wall_s" not in after
     Session(path, tmp_path).controller()  # is not refused
+
+
+def test_logs_that_are_not_fitted_are_scored(write, tmp_path, capsys):
+    """An experiment with use = "validate", and its log by `seaopt validate`: the same score, that of the noise."""
+    stand, thor = so.plants.high_impedance(), so.plants.thor()
+    for name, seed in (("first", 1), ("second", 2)):
+        log = so.virtual_log(
+            stand, thor, so.bench.PAPER_STAND, duration_s=5, rate_hz=400, seed=seed, initial_state={"q": 3e-4},
+            sensors=so.Sensors(noise_std={"F1": 20.0}, offset={"F1": 100.0 * seed}),
+        )  # fmt: skip
+        write_log(log, tmp_path / f"{name}.csv")
+    text = '[[experiment]]\nname = "{0}"\nplant = "stand"\nlog = "{0}.csv"\n{1}'
+    columns = 'time = "time [s]"\ninputs = { I = "I [A]" }\noutputs = { F1 = "F1 [N]" }\n'
+    header = BENCH.split("[[experiment]]")[0]
+    path = write(header + text.format("first", columns) + text.format("second", 'use = "validate"\n' + columns))
+    session = Session(path, tmp_path / "out")
+    session.run("fit")
+    stored = json.loads((tmp_path / "out" / "fit.json").read_text(encoding="utf-8"))
+    assert list(stored["outputs"]) == ["first"] and stored["met"] is True
+    scored = stored["validation"]["second"]["F1"]
+    assert scored["rms_residual"] == pytest.approx(20.0, rel=0.05)
+    capsys.readouterr()
+    Session(path, tmp_path / "out").validate(tmp_path / "second.csv", None, as_json=True)
+    again = json.loads(capsys.readouterr().out)
+    assert again["outputs"]["F1"]["fit_percent"] == pytest.approx(scored["fit_percent"], abs=1e-6)
+
+
+def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):
+    """The stiffness is known to be twice what it is and the sensors tell: fit, tune and export exit with 1."""
+    wrong = BENCH.replace("[plant.stand]", "k = 1310000\nb_r = { value = 1e-4, free = true }\n[plant.stand]")
+    wrong = wrong.replace("duration_s = 2", "duration_s = 10").replace("F1 = 2.0", "F1 = 0.5, F2 = 0.5")
+    wrong = wrong.replace("truth = { J", "truth = { k = 655000, J").replace(
+        "multisine = { amplitudes = [1.0, 1.0], frequencies_hz = [5.0, 15.0] }", "noise = { std = 3.0, band_hz = 150 }"
+    )
+    path = write(wrong + '[controller]\nplant = "stand"\nmeasured = "F1"\nbandwidth_hz = 30\nsample_rate_hz = 1000\n')
+    session = Session(path, tmp_path / "out")
+    for stage in ("fit", "tune"):
+        session.run(stage)
+    assert not session.met(["fit"]) and not session.met(["tune"])
+    session.show(False, ["fit", "tune"])
+    out = capsys.readouterr().out
+    assert out.startswith("Fit: NOT MET") and "on a fit that is not met" in out
+    controller = json.loads((tmp_path / "out" / "controller.json").read_text(encoding="utf-8"))
+    assert controller["fit_met"] is False
+    assert not export_controller(tmp_path / "out", tmp_path / "c", json=False)

@@ -41,7 +41,8 @@ def fit(
     experiments : sequence of Experiment
         Logs with their plants.
     params : ParameterSet
-        Values, bounds and priors; the free ones are estimated, from anywhere within a factor of ten.
+        Values, bounds and priors; the free ones are estimated, from anywhere within a factor of ten. With none free
+        the logs are scored.
     method : OutputError, MultipleShooting or PredictionError, optional
         How the plant is compared with a log; OutputError if left out.
     loss : Squares, Huber or SoftL1, optional
@@ -67,7 +68,7 @@ def fit(
     Raises
     ------
     EstimationError
-        The fit is not well posed: nothing free, no samples, a free parameter that no plant has.
+        The fit is not well posed: no samples, a free parameter that no plant has.
 
     Examples
     --------

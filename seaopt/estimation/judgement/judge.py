@@ -60,7 +60,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
         experiment.name: measure_coherence(experiment, residuals[experiment.name])
         for experiment in minimum.problem.experiments
     }
-    outputs = _state_shares(fit, shares)
+    outputs = _score_held_out_shots(fit, _state_shares(fit, shares))
     fit = replace(fit, outputs=outputs)
     findings = [*_find_unexplained(fit, shares), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
     findings += [*_find_implausible(fit), *_find_few_samples(fit, minimum)]
@@ -95,6 +95,20 @@ def _state_shares(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -
             explainable = None if share is None else max(share.output, explained)
             stated[name][output] = replace(one, explained=explained, explainable=explainable)
     return stated
+
+
+def _score_held_out_shots(fit: Fit, outputs: dict[str, dict[str, OutputFit]]) -> dict[str, dict[str, OutputFit]]:
+    """Return the outputs with a score of what was held out of logs cut into shots, which start from unknown states."""
+    holdout = fit.require_minimum("judge").problem.holdout
+    for experiment in fit.experiments if holdout else ():
+        rows, log = outputs.get(experiment.name, {}), experiment.log
+        if experiment.shots == 1 or all(row.holdout_fit_percent is not None for row in rows.values()):
+            continue
+        tail = log.between((1.0 - holdout) * log.duration_s, log.duration_s)
+        shots = max(1, round(experiment.shots * holdout))
+        score = fit.predict(replace(experiment, log=tail, shots=shots, outputs=experiment.outputs)).fit_percent
+        outputs[experiment.name] = {name: replace(row, holdout_fit_percent=score[name]) for name, row in rows.items()}
+    return outputs
 
 
 def _explained(one: OutputFit) -> float:

@@ -132,7 +132,7 @@ def collect(
     Raises
     ------
     EstimationError
-        Nothing is free, or a free parameter belongs to no plant of the experiments.
+        A free parameter belongs to no plant of the experiments.
 
     """
     used = {name for experiment in experiments for name in experiment.plant.parameters}
@@ -141,8 +141,6 @@ def collect(
             raise EstimationError(
                 f"parameter {name} is free, but no plant of the experiments has it; {suggestion(name, used)}"
             )
-    if not params.free_names:
-        raise EstimationError("no parameter is free; free one: params.free('J'), or free = true in a problem file")
     builder = _Builder()
     for name in params.free_names:
         builder.add(params[name])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.formatting import html_text
 from seaopt.records import record
+from seaopt.units import unit_after
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -118,11 +120,59 @@ class DerivedFigure:
         return (self.value - 1.959964 * self.std, self.value + 1.959964 * self.std)
 
 
-@record(eq=False)
+@record(eq=False, repr=False)
 class ModelledOutputs:
-    """Measured and model outputs of an experiment on its clock; NaN where there is no value."""
+    """Measured and model outputs of an experiment on its clock; NaN where there is no value.
+
+    `own` has the experiment's own unknowns that the model was simulated with, `band_fit_percent` is None of outputs
+    without a band, `units` are the outputs'.
+    """
 
     time: Float[np.ndarray, " n"]
     inputs: dict[str, Float[np.ndarray, " n"]]
     measured: dict[str, Float[np.ndarray, " n"]]
     model: dict[str, Float[np.ndarray, " n"]]
+    name: str
+    own: Nuisance
+    band_fit_percent: dict[str, float | None]
+    units: dict[str, str]
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """100 (1 - |y - yhat| / |y - mean(y)|) of each output, over the samples that are there."""
+        return {name: self._score(name) for name in self.model}
+
+    @property
+    def rms_residual(self) -> dict[str, float]:
+        """Root of the mean square of model minus measured, in the output's unit."""
+        return {
+            name: float(np.sqrt(np.nanmean((model - self.measured[name]) ** 2))) for name, model in self.model.items()
+        }
+
+    def _score(self, name: str) -> float:
+        good = np.isfinite(self.model[name]) & np.isfinite(self.measured[name])
+        y = self.measured[name][good]
+        spread = float(np.linalg.norm(y - np.mean(y)))
+        return 100.0 * (1.0 - float(np.linalg.norm(y - self.model[name][good])) / max(spread, 1e-300))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the scores, of each output, as numbers."""
+        percents, rms = self.fit_percent, self.rms_residual
+        return {
+            name: {
+                "fit_percent": percents[name], "band_fit_percent": self.band_fit_percent.get(name),
+                "rms_residual": rms[name], "unit": self.units[name],
+            }
+            for name in self.model
+        }  # fmt: skip
+
+    def __repr__(self) -> str:
+        lines = [f"Prediction of {self.name}: {self.time.size} samples, with initial states and offsets of its own"]
+        for name, row in self.to_dict().items():
+            band = row["band_fit_percent"]
+            in_band = "" if band is None else f", in the band {band:.2f} %"
+            rms = f"{row['rms_residual']:.4g}{unit_after(row['unit'])}"
+            lines.append(f"  {name}: fit {row['fit_percent']:.2f} %{in_band}, rms residual {rms}")
+        return "\n".join(lines)
+
+    _repr_html_ = html_text

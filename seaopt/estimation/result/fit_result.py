@@ -17,6 +17,7 @@ from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, c
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import DerivedFigure, FitFinding, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
+from seaopt.estimation.result.nuisance import estimate_nuisance, take_sensors
 from seaopt.estimation.solver.methods import Method
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
@@ -164,8 +165,22 @@ class Fit:
         return self.minimum
 
     def predict(self, experiment: Experiment) -> ModelledOutputs:
-        """Return measured and model outputs of one of the fit's experiments."""
-        own = self.nuisance[experiment.name]
+        """Return measured and model outputs of an experiment, with fit percent; prints itself.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            One of the fit's, simulated with what was estimated for it; or of any other log, whose initial state and
+            offsets are estimated from that log, the parameters being those of the fit. A delay and gains that the fit
+            estimated are taken over where the experiment states none.
+
+        Raises
+        ------
+        EstimationError
+            The log is too short.
+
+        """
+        own, in_band = self._find_nuisance(experiment)
         model = make_model(experiment.plant, self.parameters, (), experiment.outputs)
         n = len(experiment.log)
         y = np.full((n, len(experiment.outputs)), np.nan)
@@ -191,7 +206,21 @@ class Fit:
             inputs={name: log[name] for name in experiment.plant.inputs if name in log.signals},
             measured={name: log[name] for name in experiment.outputs},
             model={name: y[:, i] for i, name in enumerate(experiment.outputs)},
+            name=experiment.name,
+            own=own,
+            band_fit_percent=in_band,
+            units={name: experiment.plant.outputs[name] for name in experiment.outputs},
         )
+
+    def _find_nuisance(self, experiment: Experiment) -> tuple[Nuisance, dict[str, float | None]]:
+        """Return an experiment's own unknowns, fitted or else estimated, and outputs' fit percent in the band."""
+        known = any(experiment.log is one.log and experiment.name == one.name for one in self.experiments)
+        if known:
+            rows = self.outputs.get(experiment.name, {})
+            return self.nuisance[experiment.name], {name: row.band_fit_percent for name, row in rows.items()}
+        same = (own for own in self.nuisance.values() if own.plant in ("", experiment.plant.name))
+        band_hz = None if self.minimum is None else self.minimum.problem.band_hz
+        return estimate_nuisance(take_sensors(experiment, next(same, None)), self.parameters, band_hz)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of fit.json (schema seaopt/fit/2)."""

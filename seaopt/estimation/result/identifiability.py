@@ -62,6 +62,8 @@ def assess_identifiability(
     `values` are those of the unknowns, to which changes along an unseen direction are relative.
     """
     p = len(names)
+    if not p:
+        return Identifiability(rank=0, free=0, condition=1.0, unidentifiable=())
     reduced, diagonal = eliminate(hessian, p), np.diag(hessian)[:p]
     size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     eigenvalues, vectors = np.linalg.eigh(reduced / np.outer(size, size))

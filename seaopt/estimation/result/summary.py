@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
@@ -25,7 +24,7 @@ from seaopt.estimation.result.covariance import (
     compute_white_meat,
     mark_unseen,
 )
-from seaopt.estimation.result.findings import DerivedFigure, Nuisance, OutputFit
+from seaopt.estimation.result.findings import DerivedFigure, OutputFit
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.identifiability import (
     Identifiability,
@@ -33,6 +32,7 @@ from seaopt.estimation.result.identifiability import (
     compute_structural_rank,
     describe_direction,
 )
+from seaopt.estimation.result.nuisance import describe_nuisance
 from seaopt.estimation.solver.least_squares import Solution
 from seaopt.estimation.solver.methods import Method
 from seaopt.estimation.solver.settle import Solved, explains_little
@@ -98,7 +98,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         derived=_derive_figures(experiments, fitted, covariance),
         outputs=outputs,
         nuisance={
-            experiment.name: _describe_nuisance(experiment, z, statistics, variance)
+            experiment.name: describe_nuisance(experiment, z, statistics, variance)
             for experiment in problem.experiments
         },
         identifiability=known,
@@ -146,6 +146,8 @@ def _compute_covariances(
     """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
     bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z) + np.diag(prior)
+    if not p:
+        return np.zeros((0, 0)), np.zeros((0, 0))
     inverse, unseen = invert(bread)
     columns = inverse[:, :p]
     known = (columns.T * prior) @ columns
@@ -208,35 +210,6 @@ def _find_status(
     if 0 <= known.structural_rank < known.free:
         return "not_identifiable", f"{words}: fix one, give it a prior, or measure another output"
     return "not_identifiable", f"{words} in this log: excite more, fix one, or give it a prior"
-
-
-def _describe_nuisance(
-    experiment: FitExperiment, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment | None,
-    variance: Float[np.ndarray, " n"],
-) -> Nuisance:  # fmt: skip
-    """Return an experiment's own unknowns; offsets that the fit did not see are what is left over on average."""
-    slots, outputs, states = experiment.slots, experiment.data.outputs, experiment.data.plant.states
-    offset = {name: slot.at(z) for name, slot in zip(outputs, slots.offset, strict=True)}
-    if statistics is not None and experiment.level_unseen:
-        used = statistics[experiment.name].used
-        offset = {name: level - used[name].bias for name, level in offset.items()}
-    free = {"delay_s": slots.delay} | {f"gain.{name}": s for name, s in zip(outputs, slots.gain, strict=True)}
-    return Nuisance(
-        delay_s=slots.delay.at(z),
-        gain={name: slot.at(z) for name, slot in zip(outputs, slots.gain, strict=True)},
-        offset=offset,
-        drift={name: tuple(slot.at(z) for slot in row) for name, row in zip(outputs, slots.drift, strict=True)},
-        initial_state=tuple(
-            {name: slot.at(z) for name, slot in zip(states, segment.initial, strict=True)}
-            for segment in experiment.segments
-        ),
-        noise={name: slot.at(z) for name, slot in zip(states, slots.noise, strict=False)},
-        std={
-            key: float(np.sqrt(max(variance[slot.index], 0.0))) for key, slot in free.items() if slot.index is not None
-        },
-        substeps=experiment.substeps,
-        plant=experiment.data.plant.name,
-    )
 
 
 @lru_cache(maxsize=64)

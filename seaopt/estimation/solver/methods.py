@@ -120,7 +120,7 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Fl
     A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
     a little off is out of phase after some periods. Held to the log, such a guess finds the mode.
     """
-    if not method.search:
+    if not method.search or not problem.unknowns.shared:
         return problem.evaluate(problem.unknowns.start), []
     rng = np.random.default_rng(method.seed)
     guesses, matched = guess_from_responses(problem, rng)

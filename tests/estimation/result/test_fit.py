@@ -317,7 +317,6 @@ def test_fit_json_round_trip(stand, short_log, thor, tmp_path):
     ("make", "words"),
     [
         (lambda s, log, p: so.fit([], p), "no experiment"),
-        (lambda s, log, p: so.fit([experiment(s, log)], p), "no parameter is free"),
         (lambda s, log, p: so.fit([experiment(s, log)], p.free("I_p")), "I_p is free, but no plant"),
         (lambda s, log, p: so.fit([experiment(s, log)], p.free("J"), holdout=1.5), "holdout"),
         (lambda s, log, p: so.fit([experiment(s, log)], p.free("J"), band_hz=(50, 10)), "band_hz"),
