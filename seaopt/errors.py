@@ -7,7 +7,9 @@ remedy, on one line; the command line prints that line and exits with 2.
 from __future__ import annotations
 
 import difflib
+import numbers
 from collections.abc import Iterable
+from typing import Any
 
 
 class SeaoptError(Exception):
@@ -76,7 +78,46 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
     """
     names = list(known)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
     if near:
         return f'did you mean "{near[0]}"?'
     return "known: " + (", ".join(names) if names else "none")
+
+
+def require_type(
+    value: Any,
+    kind: type[Any] | tuple[type[Any], ...],
+    argument: str,
+    remedy: str,
+    error: type[SeaoptError] = SeaoptError,
+) -> None:
+    """Refuse an argument of another type.
+
+    Examples
+    --------
+    >>> require_type("x.csv", dict, "log", "give a Log")
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.SeaoptError: log = 'x.csv' is a str; give a Log
+
+    """
+    if not isinstance(value, kind):
+        raise error(f"{argument} = {repr(value)[:60]} is a {type(value).__name__}; {remedy}")
+
+
+def require_number(value: Any, argument: str, error: type[SeaoptError] = SeaoptError) -> float:
+    """Return a real number as a float; what is none, a flag among them, is refused.
+
+    Examples
+    --------
+    >>> require_number(2, "k")
+    2.0
+    >>> require_number(1j, "k")
+    Traceback (most recent call last):
+    ...
+    seaopt.errors.SeaoptError: k = 1j is a complex; give a real number
+
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise error(f"{argument} = {repr(value)[:60]} is a {type(value).__name__}; give a real number")
+    return float(value)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
-from seaopt.errors import ParameterError, suggestion
+from seaopt.errors import ParameterError, require_number, require_type, suggestion
 from seaopt.formatting import format_table, html_table
 from seaopt.records import record
 from seaopt.units import factor, unit_after
@@ -54,6 +54,12 @@ class Parameter:
     plausible: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        for what, text in (("name", self.name), ("unit", self.unit)):
+            require_type(text, str, f"{what} of a parameter", "give a text", ParameterError)
+        for what in ("value", "min", "max", "prior_std", "std"):
+            number = getattr(self, what)
+            if number is not None:
+                require_number(number, f"{what} of parameter {self.name}", ParameterError)
         if not math.isfinite(self.value):
             unit = unit_after(self.unit)
             what = f"a number in{unit}" if unit else "a number"
@@ -102,6 +108,7 @@ class ParameterSet(Mapping[str, Parameter]):
     def __init__(self, parameters: Iterable[Parameter] = ()) -> None:
         items: dict[str, Parameter] = {}
         for parameter in parameters:
+            require_type(parameter, Parameter, "an item of a ParameterSet", "give Parameters", ParameterError)
             if parameter.name in items:
                 raise ParameterError(f"parameter {parameter.name} is given twice; keep one")
             items[parameter.name] = parameter
@@ -118,7 +125,10 @@ class ParameterSet(Mapping[str, Parameter]):
 
         """
         pairs = {name: given if isinstance(given, tuple) else (given, "-") for name, given in values.items()}
-        return cls(Parameter(name=name, value=float(value), unit=unit) for name, (value, unit) in pairs.items())
+        return cls(
+            Parameter(name=name, value=require_number(value, name, ParameterError), unit=unit)
+            for name, (value, unit) in pairs.items()
+        )
 
     def __getitem__(self, name: str) -> Parameter:
         try:
@@ -168,7 +178,14 @@ class ParameterSet(Mapping[str, Parameter]):
         for name, given in values.items():
             old = self[name]
             value, unit = given if isinstance(given, tuple) else (given, old.unit)
-            changed.append(replace(old, value=float(value) * factor(unit, old.unit), std=None, identified=True))
+            changed.append(
+                replace(
+                    old,
+                    value=require_number(value, name, ParameterError) * factor(unit, old.unit),
+                    std=None,
+                    identified=True,
+                )
+            )
         return self.with_parameters(*changed)
 
     def free(self, *names: str) -> ParameterSet:

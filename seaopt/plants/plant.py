@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import ParameterError, PlantError, UnitError, suggestion
+from seaopt.errors import ParameterError, PlantError, UnitError, require_number, require_type, suggestion
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
@@ -165,6 +165,7 @@ class Plant:
             A value's unit has another dimension than the plant's.
 
         """
+        require_type(params, ParameterSet, f"params of plant {self.name}", "give a ParameterSet", ParameterError)
         if isinstance(params, CompletedParameters):
             if params.plant is self:
                 return params
@@ -382,7 +383,7 @@ def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float]
     for name in known:
         if name not in names:
             raise PlantError(f'"{name}" is not a {kind} of this plant; {suggestion(name, names)}')
-    return np.array([float(known.get(name, 0.0)) for name in names])
+    return np.array([require_number(known.get(name, 0.0), f"{kind} {name}", PlantError) for name in names])
 
 
 def _convert_unit(parameter: Parameter, unit: str, plant: str) -> Parameter:

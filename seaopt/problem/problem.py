@@ -14,7 +14,7 @@ from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_l
 from seaopt.control import ControllerSpec, Notch
 from seaopt.control import draw as draw_values
 from seaopt.documents import check_table
-from seaopt.errors import ProblemError, SeaoptError, suggestion
+from seaopt.errors import ProblemError, SeaoptError, require_type, suggestion
 from seaopt.estimation import (
     Experiment,
     Fit,
@@ -308,6 +308,7 @@ def read_problem(path: Path | str) -> Problem:
     ('THOR linear SEA', ['stand', 'swing'])
 
     """
+    require_type(path, (str, Path), "path", "give the path of a problem file", ProblemError)
     source = Path(path)
     table = _read_table(source)
     try:

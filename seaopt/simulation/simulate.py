@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError, SimulationError, suggestion
+from seaopt.errors import LogError, SimulationError, require_number, require_type, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -107,6 +107,9 @@ def simulate(
     240.3
 
     """
+    require_type(plant, Plant, "plant", "give a Plant", SimulationError)
+    require_type(log, Log, "log", "give a Log", SimulationError)
+    require_number(delay_s, "delay_s", SimulationError)
     model = make_model(plant, params)
     if len(log.segments) > 1:
         raise LogError(f"{log.source}: has {len(log.segments)} stretches with gaps between; simulate them one by one")

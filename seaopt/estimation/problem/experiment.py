@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.errors import EstimationError, suggestion
+from seaopt.errors import EstimationError, require_number, require_type, suggestion
 from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
@@ -103,6 +103,11 @@ class Experiment:
     stretches: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        for value, kind, what, remedy in (
+            (self.plant, Plant, "plant", "give a Plant"), (self.log, Log, "log", "give a Log"),
+            (self.name, str, "name", "give a text"), (self.outputs, (tuple, list), "outputs", "give names in a tuple"),
+        ):  # fmt: skip
+            require_type(value, kind, what, remedy, EstimationError)
         if not EXPERIMENT_NAME.fullmatch(self.name):
             raise EstimationError(
                 f'experiment name "{self.name[:40]}" is not a name; start with a letter, then letters, digits, _ and -'
@@ -136,6 +141,8 @@ class Experiment:
                 f'experiment {self.name}: mask = "{self.mask}" is not known; use "auto", "declared" or "none"'
             )
         for name, ends in self.saturation.items():
+            for end in ends if isinstance(ends, tuple | list) else ():
+                require_number(end, f"experiment {self.name}: saturation of {name}", EstimationError)
             if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
                 raise EstimationError(
                     f"experiment {self.name}: saturation of {name} = {ends} is not a range; give [low, high]"
@@ -164,6 +171,14 @@ class Experiment:
         for what, values in (("sigma", self.sigma), ("gain", self.gain), ("saturation", self.saturation)):
             if not isinstance(values, Mapping):
                 raise EstimationError(f"experiment {self.name}: {what} = {values!r}; give a mapping of output to value")
+        for what, values in (("sigma", self.sigma), ("offset", self.offset), ("gain", self.gain)):
+            for name, value in values.items() if isinstance(values, Mapping) else ():
+                if not isinstance(value, Parameter):
+                    require_number(value, f"experiment {self.name}: {what} of {name}", EstimationError)
+        require_type(self.offset, (bool, Mapping), f"experiment {self.name}: offset", "give a mapping", EstimationError)
+        require_type(self.initial_state, (str, Mapping), f"experiment {self.name}: initial_state",
+                     "give a mapping of state to value", EstimationError)  # fmt: skip
+        require_type(self.drift, int, f"experiment {self.name}: drift", "give an order", EstimationError)
         known = {
             "sigma": self.sigma,
             "gain": self.gain,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError, suggestion
+from seaopt.errors import LogError, require_number, require_type, suggestion
 from seaopt.formatting import format_count, html_text
 from seaopt.logs.log import decimation, frames, resampling
 from seaopt.logs.log.alignment import Rule
@@ -102,7 +102,10 @@ class Log:
             A unit is unknown.
 
         """
+        require_type(units or {}, Mapping, "units", "give a mapping of channel to unit", LogError)
         units = dict(units or {})
+        for name, unit in units.items():
+            require_type(unit, str, f"unit of {name}", "give a text", LogError)
         for name in units:
             if name not in channels and name != "time":
                 raise LogError(f'units names "{name}", which is not a channel; {suggestion(name, channels)}')
@@ -172,6 +175,7 @@ class Log:
             Fewer than two samples lie there.
 
         """
+        start_s, stop_s = require_number(start_s, "start_s", LogError), require_number(stop_s, "stop_s", LogError)
         elapsed = self.time - self.time[0]
         keep = (elapsed >= start_s - 1e-9) & (elapsed <= stop_s + 1e-9)
         if np.count_nonzero(keep) < 2:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError
+from seaopt.errors import LogError, require_number
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule
 from seaopt.logs.quality.clock import GAP, sample_rate_hz, split_at_gaps, timestamp_resolution
 from seaopt.signals import Recording
@@ -38,6 +38,9 @@ def resample(log: Recording, period: float, *, rate_hz: float, rule: Rule | None
             f"{log.source}: rule = {rule!r} is not a valid rule; expected Linear(), Hold() or Nearest(tolerance_s=...)"
         )
     old_rate_hz = sample_rate_hz(period)
+    rate_hz = require_number(rate_hz, "rate_hz", LogError)
+    if bridge_s is not None and not require_number(bridge_s, "bridge_s", LogError) > 0.0:
+        raise LogError(f"{log.source}: bridge_s = {bridge_s:g} is not a time; give seconds")
     if not 0.0 < rate_hz < np.inf:
         raise LogError(f"{log.source}: rate_hz = {rate_hz:g} is not positive; give the rate of the new clock")
     if rate_hz < LEAST_RATE * old_rate_hz:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError
+from seaopt.errors import LogError, require_number, require_type
 from seaopt.logs.log.alignment import Rule
 from seaopt.records import record
 from seaopt.units import factor, si_unit
@@ -72,6 +72,10 @@ class Column:
             raise LogError(f"column = {self.column}: columns are counted from 1")
         if self.from_header and (self.where or self.time or self.wrap_bits):
             raise LogError(f'column "{self.column}": a constant from the header has no where, time or wrap_bits')
+        for what in ("scale", "offset", "clock_offset_s"):
+            require_number(getattr(self, what), f'{what} of column "{self.column}"', LogError)
+        require_type(self.unit or "", str, f'unit of column "{self.column}"', "give a text", LogError)
+        require_type(self.where or {}, Mapping, f'where of column "{self.column}"', "give a mapping", LogError)
         if not np.isfinite(self.scale) or self.scale == 0 or not np.isfinite(self.offset):
             raise LogError(
                 f'column "{self.column}": scale = {self.scale:g}, offset = {self.offset:g}; give finite numbers, no '

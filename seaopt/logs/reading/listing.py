@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from seaopt.errors import LogError, require_type
 from seaopt.formatting import format_table, html_text
 from seaopt.logs.formats import Field, open_source
 from seaopt.records import record
@@ -61,6 +62,7 @@ def contents(path: str | Path) -> Contents:
     Text text None
 
     """
+    require_type(path, (str, Path), "path", "give a path", LogError)
     source = open_source(Path(path))
     return Contents(path=str(path), format=source.format, fields=source.fields, notes=source.notes)
 

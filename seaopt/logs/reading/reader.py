@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import LogError
+from seaopt.errors import LogError, require_number, require_type
 from seaopt.files import write_text
 from seaopt.formatting import format_count
 from seaopt.logs.formats import Window, open_source
-from seaopt.logs.log.alignment import Rule, check_increasing
+from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule, check_increasing
 from seaopt.logs.log.log import Log
 from seaopt.logs.reading.column import Column, spell_column, suspect_wrap
 from seaopt.logs.reading.counter import Counter
@@ -80,7 +80,16 @@ def read_table(
     ('columns that hold no numbers were left out: note',)
 
     """
-    files = [Path(path)] if isinstance(path, str | Path) else [Path(file) for file in path]
+    files = [path] if isinstance(path, str | Path) else path
+    require_type(files, Sequence, "path", "give a path, or a list of them", LogError)
+    for file in files:
+        require_type(file, (str, Path), "path", "give a path, or a list of them", LogError)
+    files = [Path(file) for file in files]
+    require_type(channels or {}, Mapping, "channels", "give a mapping of channel to column", LogError)
+    if counter is not None:
+        require_type(counter, Counter, "counter", "give a Counter", LogError)
+    if align is not None:
+        require_type(align, (Hold, Linear, Nearest), "align", "give Hold(), Linear() or Nearest(...)", LogError)
     if not files:
         raise LogError("path is an empty list; give a file")
     sources = [open_source(file) for file in files]
@@ -186,6 +195,10 @@ def _hash_file(path: Path) -> str:
 
 
 def _check_window(window_s: tuple[float, float] | None) -> None:
+    if window_s is not None:
+        require_type(window_s, (tuple, list), "window_s", "give (start, stop)", LogError)
+        for edge in window_s:
+            require_number(edge, "window_s", LogError)
     if window_s is not None and not (len(window_s) == 2 and window_s[0] < window_s[1]):
         raise LogError(f"window_s = {window_s}: give (start, stop) with start before stop")
 

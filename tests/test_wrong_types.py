@@ -1,0 +1,87 @@
+"""Arguments of a wrong type are refused as any other bad input is: by a SeaoptError of one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import seaopt as so
+from seaopt.errors import SeaoptError
+from seaopt.plants.plant import fill_vector
+
+ROOT = Path(__file__).parents[1]
+T = np.arange(20) / 100
+LOG = so.Log.from_arrays(time=T, I=np.sin(T), F1=np.cos(T))
+PLANT, THOR = so.plants.high_impedance(), so.plants.thor()
+
+
+def experiment(**changes):
+    return so.Experiment(**{"plant": PLANT, "log": LOG, **changes})
+
+
+CASES = {
+    "complex channel": lambda: so.Log.from_arrays(time=[0, 1], I=[1j, 2]),
+    "masked channel": lambda: so.Log.from_arrays(time=[0, 1], I=np.ma.array([1, 2], mask=[0, 1])),
+    "units": lambda: so.Log.from_arrays(time=[0, 1], I=[1, 2], units={"I": 3}),
+    "channel": lambda: LOG[3],
+    "between": lambda: LOG.between("a", "b"),
+    "resample": lambda: LOG.resample(rate_hz="x"),
+    "bridge": lambda: LOG.resample(rate_hz=100, bridge_s=float("nan")),
+    "path": lambda: so.read_log(None),
+    "paths": lambda: so.read_log([3]),
+    "column": lambda: so.Column(column=None),
+    "scale": lambda: so.Column(column="I", scale="x"),
+    "unit": lambda: so.Column(column="I", unit=3),
+    "where": lambda: so.Column(column="I", where="x"),
+    "plant": lambda: experiment(plant=None),
+    "log": lambda: experiment(log="x.csv"),
+    "name": lambda: experiment(name=3),
+    "outputs": lambda: experiment(outputs=3),
+    "sigma": lambda: experiment(sigma={"F1": "x"}),
+    "offset": lambda: experiment(offset={"F1": "x"}),
+    "gain": lambda: experiment(gain={"F1": "x"}),
+    "initial state": lambda: experiment(initial_state=3),
+    "drift": lambda: experiment(drift="x"),
+    "saturation": lambda: experiment(saturation={"F1": ("a", "b")}),
+    "delay of nan": lambda: experiment(delay_s=float("nan")),
+    "delay": lambda: experiment(delay_s="x"),
+    "hold": lambda: experiment(hold="second"),
+    "value": lambda: THOR.update(J="x"),
+    "no value": lambda: THOR.update(J=None),
+    "parameter": lambda: THOR[3],
+    "free": lambda: THOR.free(3),
+    "set": lambda: so.ParameterSet(["x"]),
+    "complex parameter": lambda: so.Parameter(name="a", value=1j, unit="m"),
+    "bound": lambda: so.Parameter(name="a", value=1.0, unit="m", min="x"),
+    "parameters": lambda: PLANT.linearize(None),
+    "state": lambda: fill_vector("state", {"q": "m"}, {"q": "x"}),
+    "simulated plant": lambda: so.simulate(None, THOR, LOG),
+    "simulated log": lambda: so.simulate(PLANT, THOR, None),
+    "simulated delay": lambda: so.simulate(PLANT, THOR, LOG, delay_s="x"),
+    "problem": lambda: so.read_problem(None),
+}
+
+
+def list_bare_errors():
+    """Return the cases that do not end in a SeaoptError of one line."""
+    bare = []
+    for name, case in CASES.items():
+        try:
+            case()
+        except SeaoptError as error:
+            bare += [name] if "\n" in str(error) else []
+        except Exception as error:
+            bare.append(f"{name}: {error!r}")
+        else:
+            bare.append(f"{name}: taken")
+    return bare
+
+
+def test_a_wrong_type_is_a_seaopt_error():
+    """In a process of its own: the tests' checks of types would see it first."""
+    code = "import tests.test_wrong_types as cases; print(cases.list_bare_errors())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
