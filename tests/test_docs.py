@@ -12,6 +12,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control.deploy.export import export
+from seaopt.control.laws.passivity import passivity
 from seaopt.simulation.native import find_compiler
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -133,16 +134,27 @@ def test_every_figure_of_the_docs_is_there():
 
 
 def test_the_verification_of_the_docs_works():
-    page = (DOCS / "verification.md").read_text(encoding="utf-8")
+    page = " ".join((DOCS / "verification.md").read_text(encoding="utf-8").split())
     space: dict = {}
     for code in blocks("verification.md", "python"):
         exec(re.sub(r"(?m)^print\(", "found = (", code), space)
+        found = space.get("found")
         if "verify(" in code:
             assert space["verification"].passed
             for row in space["verification"].rows:
                 assert row.scenario in page
+            low, high = space["verification"].follows_hz["swing"]
+            assert f"tracks references between {low:.1f} and {high:.1f} Hz" in page
+        elif "large_signal(" in code:
+            assert " | ".join(f"{force:.0f} N" for force in found.amplitude_N) in page
+            assert " | ".join(f"{hz:.1f} Hz" for hz in found.bandwidth_hz) in page
         elif "coupled" in code:
-            assert not space["found"].everywhere and space["found"].fixed_stable
+            assert not found.everywhere and found.fixed_stable
+            worst = found.worst
+            assert f"a free link of {worst.m_2:.2f} kg an oscillation at {worst.frequency_hz:.0f} Hz" in page
+            port = passivity(space["controller"], space["stand"], space["thor"])
+            assert f"passive up to {port.violated_hz:.0f} Hz" in page
+            assert f"A damping of {-port.least_damping_N_s_per_m:.1f} N s/m" in page
 
 
 def test_the_tuner_of_the_docs_works():

@@ -1,16 +1,21 @@
-"""Figures in the documentation's text, computed again from the gains that are printed beside them."""
+"""Figures in the documentation's text, computed again from the gains or the specification printed beside them."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from seaopt.control import Gains
+import seaopt as so
+from seaopt.control import Gains, sample
+from seaopt.control.laws.passivity import passivity
 from seaopt.control.laws.realisation import realise
+from seaopt.control.loops.loop import Loop
+from seaopt.control.tuning.tuner import disturbance
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 UNITS = {"s": 1.0, "ms": 1e-3}
@@ -19,6 +24,11 @@ PERIOD = 1e-3
 
 def page(name):
     return (DOCS / name).read_text(encoding="utf-8")
+
+
+def unbroken(name):
+    """Return a page without its line breaks."""
+    return " ".join(page(name).split())
 
 
 def printed_gains(text):
@@ -130,3 +140,49 @@ def test_the_table_of_tracking_times_follows_from_the_gains(stand_matrices, thor
         assert after.min() == pytest.approx(numbers(row[1])[0], abs=6e-3)
         assert settled == numbers(row[2])[0] if row[2].endswith("ms") else settled >= 4500
         assert force.max() == pytest.approx(float(re.findall(r"first swing to ([\d.]+)", text)[0]), abs=6e-3)
+
+
+def test_what_a_passive_band_costs_the_quiet_law(stand, thor):
+    text = unbroken("passivity.md")
+    quiet = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, objective="noise")
+    ends, noise = [], []
+    for band in (None, (1.0, 60.0)):
+        law = so.tune(stand, thor, replace(quiet, passive_band_hz=band))
+        ends.append(passivity(law, stand, thor).violated_hz)
+        noise.append(law.achieved.noise_gain)
+        assert f"{law.gains['k_i'] / (1 + law.gains['k_p']):.2f} (1 + k_p) per second" in text
+    assert f"{noise[0]:.1f} N/N, is passive up to {ends[0]:.1f} Hz only" in text
+    assert f"up to {ends[1]:.1f} Hz, for a noise gain of {noise[1]:.1f} N/N" in text
+
+
+def test_what_late_samples_cost(stand, thor):
+    spec = so.ControllerSpec(bandwidth_hz=50, max_sensitivity=1.6, max_noise_gain=60, delay_samples=1)
+    law = so.tune(stand, thor, spec)
+    ms = [
+        Loop(plant=sample(stand, thor, "F1", law.command.per_effort, 1e-3, late), law=law.law).figures().ms
+        for late in (1, 2, 3)
+    ]
+    assert "has Ms {:.2f} as stated, {:.2f} with 2 samples and {:.2f} with 3.".format(*ms) in unbroken("tuning.md")
+
+
+def test_the_pid_beside_mixed_sensitivity_synthesis(stand, thor):
+    text = unbroken("tuning.md")
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=60)
+    for name, weights in (("pid", "tuned"), ('pid, `"error"`', "error")):
+        law = so.tune(stand, thor, replace(spec, reference_weights=weights))
+        a, integral = law.achieved, disturbance(law.close(stand, thor), 30.0)
+        figures = f"{a.ms:.2f} | {a.noise_gain:.1f} | {a.sensitivity_bandwidth_hz:.1f} Hz | {integral:.2f}"
+        assert f"| {name} | {a.bandwidth_hz:.1f} Hz | {figures} |" in text
+    law = so.tune(stand, thor, replace(spec, bandwidth_hz=27.2, max_noise_gain=44.5))
+    assert f"the pid has an integral of {disturbance(law.close(stand, thor), 27.2):.2f};" in text
+
+
+@pytest.mark.parametrize("bandwidth_hz", [20.0, 30.0])
+def test_feedback_of_the_error_cannot_have_what_the_page_says(bandwidth_hz, monkeypatch):
+    """One more than tests/control/tuning/test_reference_weights.py, which has what the tuned weights can."""
+    monkeypatch.syspath_prepend(str(DOCS.parent / "benchmarks"))
+    from bench_tune_friction import ISSUE, Case
+
+    case = Case(ISSUE, bandwidth_hz)
+    spec = replace(case.spec, reference_weights="error", bandwidth_range_hz=(bandwidth_hz, 1.01 * bandwidth_hz))
+    assert not so.tune(so.plants.high_impedance(), so.plants.thor().update(**ISSUE), spec).feasible

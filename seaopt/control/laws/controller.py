@@ -291,7 +291,8 @@ class Controller:
         loops = [Loop(plant=self.plant(one, params), law=self.law) for one in stuck]
         return [
             "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
-            f"{format_number(figures.bandwidth_hz, missing='none')} Hz, Ms {figures.ms:.4g}, Mt {figures.mt:.4g}"
+            f"{format_number(figures.bandwidth_hz, missing='none')} Hz, Ms {figures.ms:.4g}, Mt {figures.mt:.4g}, "
+            f"reference peak {figures.reference_peak:.4g}, noise gain {figures.noise_gain:.4g}"
             for figures in (loop.figures() for loop in loops)
         ]
 

@@ -498,12 +498,14 @@ class Certificate:
             f"(worst case {worst.ms:.4g}, {worst.mt:.4g}), tracking band {format_band(figures.tracking_band_hz, 'Hz')}"
         ]
         if figures.stable:
-            up, down = (_format_signed(db) for db in (margins.margins.gain_up_db, margins.margins.gain_down_db))
+            up, down = (
+                format_number(db, missing="none") for db in (margins.margins.gain_up_db, margins.margins.gain_down_db)
+            )
             late, phase = margins.sampled_delay_s, format_number(figures.phase_margin_deg, missing="none")
             lines.append(
-                f"    gain {down} / {up} dB, phase {phase} deg, delay "
+                f"    margins: gain {up} dB up, {down} down, phase {phase} deg, delay "
                 + (f"{1e3 * late:.4g} ms" if late is not None else f"beyond {1e3 * margins.searched_delay_s:.3g} ms")
-                + f", disk margin {figures.disk_margin:.3g}"
+                + f", disk {figures.disk_margin:.3g}"
             )
         if worst.parameters:
             lines.append(f"    worst case at {_format_place(worst)}")
@@ -517,10 +519,6 @@ class Certificate:
 
 def _require_runs(runs: Verification | str) -> tuple[Requirement, ...]:
     return tuple(Requirement(**_list_fields(row)) for row in require_runs(runs))
-
-
-def _format_signed(value: float | None) -> str:
-    return "none" if value is None else f"{value:+.4g}"
 
 
 def _format_place(worst: Worst) -> str:

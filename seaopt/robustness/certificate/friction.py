@@ -54,7 +54,7 @@ class FrictionDraws:
             return f"{head}; the first without a proof is {where}"
         if np.isinf(self.least_slope):
             return f"{head}, however steep"
-        return f"{head}, the least up to a slope of {self.least_slope:.4g}, {self.factor:.3g} times its own, {where}"
+        return f"{head}, the least up to {self.factor:.3g} times its own {where}"
 
 
 def prove_frictions(

@@ -101,7 +101,7 @@ class Simulated:
             failed, count = len(self.verification.failures), len(self.verification.rows)
             out.append(f"simulation: {f'{failed} of {count} runs FAILED' if failed else f'{count} runs passed'}")
             out += self.verification.describe_tracking()
-        out += [f"large signals on {sweep.plant}: {_format_large(sweep)}" for sweep in self.large_signal]
+        out += [f"bandwidth on {sweep.plant} against amplitude: {_format_large(sweep)}" for sweep in self.large_signal]
         if self.passivity is not None:
             out.append(f"port at link 2: passive {_format_bands(self.passivity)}")
         if self.environments is not None:
@@ -280,15 +280,16 @@ def _format_bands(port: Passivity) -> str:
     if not port.held_stable:
         return "nowhere: the loop is UNSTABLE with link 2 held"
     bands = ", ".join(format_band(band, "Hz") for band in port.bands_hz) or "nowhere"
-    lost = "" if port.violated_hz is None else f"; {-port.least_damping_N_s_per_m:.3g} N s/m are missing elsewhere"
-    return bands + lost
+    if port.violated_hz is None:
+        return bands
+    return f"{bands}; everywhere with a damper of {-port.least_damping_N_s_per_m:.3g} N s/m"
 
 
 def _format_environments(environments: StabilityMap) -> str:
     if environments.everywhere:
         return f"stable against all of {environments.stable.size} masses on springs and dampers"
     shares = ", ".join(
-        f"{np.count_nonzero(stable)} of {stable.size} at {damping:g} N s/m"
+        f"{np.count_nonzero(stable)} at {damping:g}"
         for damping, stable in zip(environments.damping, environments.stable, strict=True)
     )
-    return f"stable in {shares}"
+    return f"of {environments.stable[0].size} masses on springs, stable by damping (N s/m): {shares}"

@@ -58,7 +58,7 @@ class Varied:
         unit = "" if self.unit == "-" else f" {self.unit}"
         if self.std is None:
             return f"{self.name} {self.low:.4g} to {self.high:.4g}{unit}"
-        return f"{self.name} {self.value:.5g} +- {self.std:.2g}{unit}"
+        return f"{self.name} {self.value:.5g} ± {self.std:.2g}{unit}"
 
 
 @record(eq=False)

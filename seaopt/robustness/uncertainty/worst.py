@@ -45,6 +45,7 @@ GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
 PROBE_STEPS = np.repeat(np.array([0.3, 0.1, 0.03, 0.01]), 3)
 ON_BOUND = 1e-8  # of a physical bound, in standard deviations
 WITNESS_TOLERANCE = 1e-6
+ALIKE = 1.001  # figures within this factor are printed alike
 
 Trials = Float[np.ndarray, "s t k"]
 Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
@@ -109,9 +110,10 @@ class Worst(tuple[Plant, ParameterSet]):
 
     @property
     def elsewhere(self) -> dict[str, Witness]:
-        """The witnesses of the largest Ms and Mt, by name, that are not at the worst case's own parameters."""
-        named = zip(("Ms", "Mt"), self.largest, strict=True)
-        return {name: witness for name, witness in named if witness.parameters != self.witness.parameters}
+        """The witnesses of the largest Ms and Mt, by name, that are larger than at the worst case's own parameters."""
+        ms, mt = self.largest
+        larger = {"Ms": (ms, ms.ms > ALIKE * self.witness.ms), "Mt": (mt, mt.mt > ALIKE * self.witness.mt)}
+        return {name: witness for name, (witness, is_larger) in larger.items() if is_larger}
 
     def figures(self, controller: Controller) -> LoopFigures:
         """Return every figure of the loop there, computed again."""

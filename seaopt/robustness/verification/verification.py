@@ -118,8 +118,8 @@ class Verification:
             slowest = max(row.settling_s or 0.0 for row in rows)
             sizes = [self.scenario(row).phases[-1].force_N for row in rows]
             settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
-            size = f"{min(sizes):.3g} to {max(sizes):.3g} N"
-            lines.append(f"steps on {plant}, {size}: overshoot up to {100 * over:.3g} %, {settled}")
+            ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
+            lines.append(f"steps on {plant}, {ends} N: overshoot up to {100 * over:.3g} %, {settled}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:

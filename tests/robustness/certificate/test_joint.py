@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -14,6 +17,7 @@ SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25,
     min_sensitivity_bandwidth_hz=6,
 )  # fmt: skip
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 RANGES = {"I_p": (0.2, 0.6), "eta": (0.9, 1.0), "delay_s": (0.0, 2e-4)}
 
 
@@ -43,6 +47,16 @@ def test_every_round_has_draws_of_its_own_and_keeps_the_earlier_witnesses(done):
     assert [item.certificate.monte_carlo.seed for item in done.rounds] == [5 + k for k in range(len(done.rounds))]
     assert done.rounds[1].plants == done.rounds[0].plants + len(done.rounds[0].added)
     assert set(done.rounds[0].added) <= set(done.robust_to)
+
+
+def test_the_documentation_shows_these_rounds(done):
+    """But for the number of failures: the page has more draws."""
+    page = " ".join((DOCS / "certificate.md").read_text(encoding="utf-8").split())
+    head, _, *rounds = repr(done).splitlines()
+    assert head in page
+    for line in rounds:
+        number, plants, _, *worst = line.split()
+        assert re.search(rf"{number} {plants} \d+ {re.escape(' '.join(worst))}", page), line
 
 
 def test_the_confidence_is_shared_by_the_rounds(done):
