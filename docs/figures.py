@@ -252,7 +252,7 @@ def state_estimator() -> None:
 
 def predictive_control() -> None:
     plant, truth = so.plants.high_impedance(), so.plants.thor()
-    spec = {"bandwidth_hz": 30, "max_sensitivity": 1.6, "max_reference_peak": 1.1, "current_limit_A": 9.0}
+    spec = {"bandwidth_hz": 30, "max_sensitivity": 1.6, "current_limit_A": 9.0}
     robust = {"swing": so.plants.moving_output()}
     law = runnable(so.tune(plant, truth, so.ControllerSpec(**spec), robust_to=robust))
     mpc = force_mpc(plant, truth, MPCSpec(current_limit_A=9.0))

@@ -11,9 +11,9 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import Gains, sample
+from seaopt.control import Gains, close_loop, sample
 from seaopt.control.laws.passivity import passivity
-from seaopt.control.laws.realisation import realise
+from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.loops.loop import Loop
 from seaopt.control.tuning.tuner import disturbance
 
@@ -186,3 +186,12 @@ def test_feedback_of_the_error_cannot_have_what_the_page_says(bandwidth_hz, monk
     case = Case(ISSUE, bandwidth_hz)
     spec = replace(case.spec, reference_weights="error", bandwidth_range_hz=(bandwidth_hz, 1.01 * bandwidth_hz))
     assert not so.tune(so.plants.high_impedance(), so.plants.thor().update(**ISSUE), spec).feasible
+
+
+def test_the_steps_of_the_pid_beside_predictive_control(stand, swing, thor):
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+    law = runnable(so.tune(stand, thor, spec, robust_to={"swing": swing}))
+    for force in (500.0, 1000.0, 2000.0):
+        run = close_loop(law.step, law.reset(), stand, thor, np.where(np.arange(500) < 10, 0.0, force))
+        times = " | ".join(f"{1e3 * run.settling_time_s(band):.0f} ms" for band in (0.05, 0.02))
+        assert f"| {force:g} N | pid | {100 * run.overshoot:.1f} % | {times} |" in unbroken("mpc.md")
