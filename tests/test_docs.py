@@ -36,6 +36,8 @@ def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log)
     assert fit.status == "converged"
     assert abs(fit.nuisance["chirp"].delay_s - 1.2e-3) < 1e-4
     assert abs(fit.parameters["J"].value / thor["J"].value - 1) < 0.02
+    law = so.tune(problem.design_plant, fit, problem.spec, robust_to=problem.robust_to(fit.parameters))
+    assert law.feasible and law.delay_samples == 2
 
 
 def test_the_plant_of_the_how_to_works():

@@ -273,7 +273,7 @@ def _format_large(sweep: LargeSignal) -> str:
     if sweep.friction_N:  # stuck, widest, saturated; the others are in the report
         widest = max(pairs, key=lambda pair: pair[1] or 0.0)
         pairs = [pair for pair in pairs if pair in (pairs[0], widest, pairs[-1])]
-    return ", ".join(f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.3g} N" for amplitude, hz in pairs)
+    return ", ".join(f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.4g} N" for amplitude, hz in pairs)
 
 
 def _format_bands(port: Passivity) -> str:
