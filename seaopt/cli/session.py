@@ -38,7 +38,7 @@ SCHEMAS = {
     "frf": "seaopt/frf/1",
     "tune": "seaopt/controller/2",
     "sweep": "seaopt/frontier/1",
-    "certify": "seaopt/robustness/1",
+    "certify": "seaopt/robustness/2",
 }
 LABELS = {
     "simulate": "simulating",

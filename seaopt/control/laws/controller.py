@@ -252,7 +252,11 @@ class Controller:
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         controller = cls(**stored, achieved=achieved, design=(plant, params))
-        broken = tuple(list_broken_figures(controller.spec, controller.design_loop) if controller.feasible else ())
+        loops = [
+            MeasuredLoop(name=f"design plant{name}", figures=figures, filter_samples=controller.filter_samples)
+            for name, figures in controller._measure_states().items()
+        ]
+        broken = tuple(list_broken_figures(controller.spec, loops) if controller.feasible else ())
         if not broken:
             return controller
         return replace(controller, feasible=False, active_constraints=broken, blocked_by=broken)
@@ -282,18 +286,24 @@ class Controller:
             ]
         ).rstrip()
 
+    def _measure_states(self) -> dict[str, LoopFigures]:
+        """Return the design plant's figures by its state, " sliding" and " stuck" where it has friction, else ""."""
+        assert self.design is not None
+        plant, params = self.design
+        _, *others = split_friction({"": plant}, params).items()
+        stuck = {name: Loop(plant=self.plant(one, params), law=self.law).figures() for name, one in others}
+        return {" sliding" if stuck else "": self.achieved} | stuck
+
     def _friction_lines(self) -> list[str]:
         """Say of which state the figures are where the design plant has friction, and give the other's."""
         if self.design is None:
             return []
-        plant, params = self.design
-        _, *stuck = split_friction({"": plant}, params).values()
-        loops = [Loop(plant=self.plant(one, params), law=self.law) for one in stuck]
+        _, *stuck = self._measure_states().values()
         return [
             "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
             f"{format_number(figures.bandwidth_hz, missing='none')} Hz, Ms {figures.ms:.4g}, Mt {figures.mt:.4g}, "
             f"reference peak {figures.reference_peak:.4g}, noise gain {figures.noise_gain:.4g}"
-            for figures in (loop.figures() for loop in loops)
+            for figures in stuck
         ]
 
     def _gain_lines(self) -> list[str]:

@@ -32,8 +32,8 @@ def prove_friction(
     Returns
     -------
     FrictionMargin or None
-        With a factor of zero where the sliding loop is not stable itself, or where nothing was proved: that is no
-        proof of an oscillation.
+        With a factor of zero where the sliding loop is not stable itself, where friction acts on the measured output
+        itself (a sampled jump has no bounded gain), or where nothing was proved: that is no proof of an oscillation.
 
     Examples
     --------
@@ -49,9 +49,15 @@ def prove_friction(
         return None
     closed = Loop(plant=loop.plant, law=controller.law)
     if np.max(np.abs(closed.eigenvalues())) >= STABLE:
-        zeros = (0.0,) * loop.slopes.size
-        return FrictionMargin(factor=0.0, slopes=zeros, frequency_hz=0.0, multiplier="none: unstable without friction")
+        return lack_proof(loop.slopes.size, "unstable without friction")
+    if np.any(loop.through * loop.slopes):
+        return lack_proof(loop.slopes.size, "friction acts on the measured output itself")
     return friction_margin(loop, first, least)
+
+
+def lack_proof(frictions: int, reason: str) -> FrictionMargin:
+    """Return the margin of a plant of which nothing can be proved, with the reason."""
+    return FrictionMargin(factor=0.0, slopes=(0.0,) * frictions, frequency_hz=0.0, multiplier=f"none: {reason}")
 
 
 def take_friction_out(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionLoop | None:

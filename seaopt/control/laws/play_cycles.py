@@ -73,6 +73,12 @@ def predict_play_cycles(controller: Controller, plant: Plant, params: ParameterS
     )
 
 
+def has_play(controller: Controller, plant: Plant, params: ParameterSet) -> bool:
+    """Tell whether a plant has play, so that its loop about rest is not the loop in motion."""
+    values = plant.complete(params).drop_conditions()
+    return bool(_find_plays(controller, take_sliding(plant, values), values))
+
+
 def _find_plays(controller: Controller, plant: Plant, params: CompletedParameters) -> list[_Play]:
     row, gain = list(plant.outputs).index(controller.spec.measured), controller.command.per_effort
 
@@ -83,16 +89,16 @@ def _find_plays(controller: Controller, plant: Plant, params: CompletedParameter
     plays: list[_Play] = []
     for state in range(len(plant.states)):
         direction = np.eye(len(plant.states))[state]
-        along = [linearise(deflection * direction) for deflection in DEFLECTIONS]
-        matrices = np.array([a for a, *_ in along])
-        change = matrices[-1] - matrices[0]
+        within, beyond = (linearise(deflection * direction) for deflection in DEFLECTIONS[[0, -1]])
+        change = beyond[0] - within[0]
         size = float(np.sum(change**2))
-        if size <= (LEAST_CHANGE * float(np.max(np.abs(matrices[-1])))) ** 2:
+        if size <= (LEAST_CHANGE * float(np.max(np.abs(beyond[0])))) ** 2:
             continue
+        matrices = np.array([linearise(deflection * direction)[0] for deflection in DEFLECTIONS])
         share = np.sum((matrices - matrices[0]) * change, axis=(1, 2)) / size
         flat = np.abs(share[int(FLAT_FROM * share.size) :] - 1.0) < ROUNDING
         if np.all(flat) and np.all(np.diff(share) > -ROUNDING):
-            plays.append(_Play(state=state, within=along[0], beyond=along[-1], share=share))
+            plays.append(_Play(state=state, within=within, beyond=beyond, share=share))
     return plays
 
 

@@ -92,9 +92,9 @@ def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
     return [verdict.label for verdict in verdicts if not verdict.met]
 
 
-def list_broken_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[str]:
-    """Return the limits that the design plant's loop breaks; a passive band is not among them."""
-    return list_broken(judge_all(replace(spec, passive_band_hz=None), [design]))
+def list_broken_figures(spec: ControllerSpec, states: Sequence[MeasuredLoop]) -> list[str]:
+    """Return the limits that the design plant breaks, sliding and stuck if it has friction; not a passive band."""
+    return list_broken(judge_all(replace(spec, passive_band_hz=None), states, len(states)))
 
 
 def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:

@@ -27,7 +27,7 @@ from seaopt.formatting import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction
+from seaopt.plants.friction import friction_slopes, split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.friction import FrictionDraws, prove_frictions
@@ -46,7 +46,7 @@ from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cy
 from seaopt.robustness.verification.verification import Verification
 
 SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samples, the sampled one is looked for
-ROBUSTNESS_SCHEMA = "seaopt/robustness/1"
+ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
 LIMIT_CYCLE = "limit_cycle_N"
@@ -394,7 +394,7 @@ class Certificate:
             raise FileError(f"robustness.json: {error}; {CERTIFY_AGAIN}") from error
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of robustness.json (schema seaopt/robustness/1)."""
+        """Return the content of robustness.json (schema seaopt/robustness/2)."""
         return {
             "schema": ROBUSTNESS_SCHEMA,
             "passed": self.passed,
@@ -458,24 +458,26 @@ class Certificate:
     def _friction_dict(self, name: str) -> dict[str, Any]:
         """Return what friction and play do to a plant; a plant with play alone has no sector."""
         margin, cycles = self.friction.get(name), self.cycles.get(name, ())
-        stable = True if margin is not None and margin.proved and not cycles else self._find_instability(name)
+        stable = True if margin is not None and margin.proved and not cycles else None
         proof: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
         if margin is not None:
             draws = _list_fields(self.friction_draws[name]) if name in self.friction_draws else None
             proof |= _list_fields(margin) | {"draws": draws}
         return proof
 
-    def _find_instability(self, name: str) -> bool | None:
-        """Return False where an oscillation lasts in a simulation, None where nothing is proved either way."""
-        return False if any(cycle.lasts for cycle in self.cycles.get(name, ())) else None
-
     def _describe_cycles(self, name: str) -> str:
         if name not in self.cycles:
             return ""
-        if self._find_instability(name) is False:
+        if any(cycle.lasts for cycle in self.cycles[name]):
             return "; it oscillates"  # a requirement that is not met says how
-        cycles = "; ".join(map(str, self.cycles[name]))
-        return f"; {cycles or 'no limit cycle is predicted, and no simulated step ends in one'}"
+        if self.cycles[name]:
+            return "; " + "; ".join(map(str, self.cycles[name]))
+        if not isinstance(self.steps, Verification):
+            return "; limit cycles are not looked for, as nothing can be simulated"
+        flattest, steepest = friction_slopes(self.models[name], self.parameters)
+        if np.count_nonzero(steepest - flattest) > 1:
+            return "; no simulated step ends in a limit cycle, and with several frictions none can be predicted"
+        return "; no limit cycle is predicted, and no simulated step ends in one"
 
     def __repr__(self) -> str:
         lines = [f"Certificate: {'passed' if self.passed else 'FAILED'}", *(f"  note: {note}" for note in self.notes)]

@@ -186,7 +186,9 @@ def certify(
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
     friction = prove_frictions(controller, models, nominal)
-    friction_draws = prove_friction_draws(controller, models, unknown, friction, samples, rng)
+    friction_draws = prove_friction_draws(
+        controller, models, unknown, friction, samples, rng, required=min_friction_margin
+    )
     requirements = (
         *_design_requirements(controller, nominal, [row.name for row in varied]),
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),

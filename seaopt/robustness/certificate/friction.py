@@ -11,7 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.laws.friction_proof import lack_proof, prove_friction
+from seaopt.control.laws.play_cycles import has_play
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
@@ -50,7 +51,7 @@ class FrictionDraws:
     def __str__(self) -> str:
         head = f"over draws, it is proved for {self.proved} of {self.samples}"
         where = f"at {format_values(self.parameters)}"
-        if self.proved < self.samples:
+        if not self.least_slope:
             return f"{head}; the first without a proof is {where}"
         if np.isinf(self.least_slope):
             return f"{head}, however steep"
@@ -60,35 +61,43 @@ class FrictionDraws:
 def prove_frictions(
     controller: Controller, models: Mapping[str, Plant], params: ParameterSet
 ) -> dict[str, FrictionMargin]:
-    """Return the friction margin of every plant that has friction."""
-    margins = {name: prove_friction(controller, model, params) for name, model in models.items()}
-    return {name: margin for name, margin in margins.items() if margin is not None}
+    """Return the friction margin of every plant that has friction; with play nothing is proved, as it is not linear."""
+    margins: dict[str, FrictionMargin] = {}
+    for name, model in models.items():
+        margin = prove_friction(controller, model, params)
+        if margin is not None:
+            play = bool(margin.factor) and has_play(controller, model, params)
+            margins[name] = lack_proof(len(margin.slopes), "the spring has play") if play else margin
+    return margins
 
 
 def prove_friction_draws(
     controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, nominal: Mapping[str, FrictionMargin],
-    samples: int, rng: np.random.Generator,
+    samples: int, rng: np.random.Generator, required: float | None = None,
 ) -> dict[str, FrictionDraws]:  # fmt: skip
-    """Prove stability at draws, of the plants with a proof at the nominal parameters."""
+    """Prove stability at draws, of the plants with a proof, or the slope required, at the nominal parameters."""
     count = min(samples, PROVED_DRAWS)
-    if not count or not any(margin.proved for margin in nominal.values()):
+    enough = {
+        name: margin for name, margin in nominal.items()
+        if margin.proved or (required is not None and min(margin.slopes) >= required)
+    }  # fmt: skip
+    if not count or not enough:
         return {}
     values = unknown.values(unknown.draw(count, rng))
     draws = [{name: float(column[k]) for name, column in values.items()} for k in range(count)]
     return {
-        name: _prove_draws(controller, models[name], unknown.nominal, draws, margin.multiplier)
-        for name, margin in nominal.items()
-        if margin.proved
+        name: _prove_draws(controller, models[name], unknown.nominal, draws, margin) for name, margin in enough.items()
     }
 
 
 def _prove_draws(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]], multiplier: str
+    controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]], known: FrictionMargin
 ) -> FrictionDraws:
     """Return how many draws of one plant have a proof, and the least margin."""
     proved, slope, factor, place = 0, np.inf, np.inf, draws[0]
+    least = 1.0 if known.proved else 0.0
     for draw in draws:
-        margin = prove_friction(controller, plant, place_values(plant, nominal, draw), multiplier, least=1.0)
+        margin = prove_friction(controller, plant, place_values(plant, nominal, draw), known.multiplier, least)
         proved += margin is None or margin.proved  # without friction there is nothing to prove
         if margin is not None and min(margin.slopes) < slope:
             slope, factor, place = min(margin.slopes), margin.factor, draw

@@ -24,6 +24,7 @@ FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
 NOMINAL_FORCE_N = 100.0
 STEP_SHARES = (0.02, 0.1, 0.5)  # of the force that the current limit can hold at rest
+LEAST_STEP = 1e-4  # of the force that the current limit can hold at rest: a smaller one is of a run that diverges
 UNSATURATED = 0.9  # of the step that just reaches the current limit
 FRICTION_STEPS = (0.2, 1.0, 5.0, 25.0)  # times the dry friction, where there is no limit
 PEAK_GRACE = 1.1  # of the reference peak allowed, for the overshoot of a step
@@ -271,8 +272,8 @@ def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
 def find_step_limit(controller: Controller) -> float | None:
     """Return the step of F_ref (N) that just reaches the current limit on the design plant; None without a limit.
 
-    It is that of the linear loop, where friction slides; a loop that is unstable reaches the limit with every step, and
-    what the limit holds at rest stands for it.
+    It is that of the loop in which friction slides; one that is unstable, or runs away, reaches the limit with every
+    step, and what the limit holds at rest stands for it.
 
     Raises
     ------
@@ -294,7 +295,9 @@ def find_step_limit(controller: Controller) -> float | None:
         delay_samples=controller.delay_samples,
     )
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), NOMINAL_FORCE_N))
-    return NOMINAL_FORCE_N * limit / float(np.max(np.abs(run.current)))
+    step, held = NOMINAL_FORCE_N * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.01)
+    assert held is not None
+    return step if step > LEAST_STEP * held else held  # with play it may run away where the loop at rest is stable
 
 
 def _require_design(controller: Controller) -> tuple[Plant, ParameterSet]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -126,6 +128,16 @@ def test_a_tuned_controller_is_proved_on_the_stand():
     assert margin.proved
     assert margin.slopes[0] == pytest.approx(margin.factor * 50.0 / 4e-3)
     assert prove_friction(controller, stand, so.plants.thor()) is None
+
+
+def test_nothing_is_proved_where_friction_acts_on_the_measured_output():
+    """A lumped drive's F2 is F_m - friction: sampled, it has no bounded gain, and the sum over aliases diverges."""
+    lumped, rubbing = so.plants.high_impedance(drive="lumped"), so.plants.thor().update(f_c=5.0, v_s=1.0)
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6)
+    controller = so.tune(lumped, rubbing, spec)
+    assert prove_friction(controller, lumped, rubbing).proved
+    margin = prove_friction(replace(controller, spec=replace(spec, measured="F2")), lumped, rubbing)
+    assert not margin.proved and margin.slopes == (0.0,)
 
 
 def test_a_loop_that_needs_friction_is_not_proved():

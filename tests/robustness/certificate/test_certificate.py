@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from dataclasses import replace
 
 import control
@@ -12,6 +13,7 @@ from scipy.stats import beta, binomtest
 
 import seaopt as so
 from seaopt.errors import ControlError
+from seaopt.files import to_json
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.certify import _digest
@@ -48,7 +50,7 @@ def test_every_requirement_carries_its_numbers(certificate):
     assert ("spectral_radius", "stand") in names
     assert all(item.met for item in certificate.requirements)
     content = certificate.to_dict()
-    assert content["schema"] == "seaopt/robustness/1"
+    assert content["schema"] == "seaopt/robustness/2"
     assert set(content["plants"]["swing"]["worst"]["parameters"]) == {"J", "b_r", "eta", "I_p"}
 
 
@@ -353,6 +355,9 @@ def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
     assert any(
         row.name == "max_sensitivity" and "stuck" in row.where for row in certificate.requirements if not row.met
     )
+    tuned = json.loads(to_json(controller.to_dict()))
+    assert tuned["feasible"] and type(controller).from_dict(tuned, stand, rubbing.update(f_c=0.0)).feasible
+    assert not type(controller).from_dict(tuned, stand, rubbing).feasible
     content = certificate.to_dict()
     assert content["friction"]["stand"]["sector_stable"] is True
     again = type(certificate).from_dict(content, controller, {"stand": stand}, certificate.parameters)
@@ -393,3 +398,16 @@ def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
         figures = controller.close(stand, thor.update(b_r=thor["b_r"].value + slope * radius**2)).figures()
         assert figures.stable and figures.ms <= 1.6 * (1 + 1e-6) and figures.reference_peak <= 1.4 * (1 + 1e-6)
     assert controller.achieved.bandwidth_hz == pytest.approx(30, rel=5e-3)
+
+
+def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too(stand, rubbing):
+    """Nearly Coulomb's jump is not proved, a flatter curve is; at draws as at the nominal parameters."""
+    spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, delay_samples=2)
+    controller, sharp = so.tune(stand, rubbing, spec), rubbing.update(v_s=1e-6)
+    asked = {"ranges": {"eta": (0.4, 3.0)}, "samples": 3}
+    certificate = so.certify(controller, {"stand": stand}, sharp, min_friction_margin=1e3, **asked)
+    margin, drawn = certificate.friction["stand"], certificate.friction_draws["stand"]
+    assert not margin.proved and (drawn.samples, drawn.proved) == (3, 0)
+    (row,) = [row for row in certificate.requirements if row.name == "min_friction_margin"]
+    assert row.value == min(*margin.slopes, drawn.least_slope) < margin.slopes[0]
+    assert so.certify(controller, {"stand": stand}, sharp, **asked).friction_draws == {}

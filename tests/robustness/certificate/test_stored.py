@@ -11,7 +11,7 @@ from seaopt.errors import FileError
 from seaopt.robustness.certificate.stored import read_certificate
 
 CONTENT = {
-    "schema": "seaopt/robustness/1", "passed": True,
+    "schema": "seaopt/robustness/2", "passed": True,
     "requirements": [{"name": "max_sensitivity", "limit": 1.6, "value": None, "met": False, "where": "stand"}],
     "plants": {
         "stand": {"ms": 1.5, "worst": {"parameters": {}}},

@@ -112,7 +112,7 @@ def test_a_cycle_that_the_current_holds_fails_the_certificate(blind, stand, rubb
     wild = scaled(blind, 1.5, current_limit_A=10.0)
     certificate = so.certify(wild, {"stand": stand}, rubbing)
     friction = certificate.to_dict()["friction"]["stand"]
-    assert friction["sector_stable"] is False
+    assert friction["sector_stable"] is None
     cycle = friction["limit_cycles"][0]
     assert cycle["simulated"]["frequency_hz"] == pytest.approx(cycle["predicted"]["frequency_hz"], rel=0.1)
     (row,) = [row for row in certificate.requirements if row.name == "limit_cycle_N"]
@@ -128,6 +128,17 @@ def test_near_the_edge_nothing_is_predicted_and_stability_is_proved(blind, stand
     certificate = so.certify(edge, {"stand": stand}, rubbing)
     assert certificate.to_dict()["friction"]["stand"]["sector_stable"] is True
     assert certificate.cycles == {}
+
+
+def test_with_play_nothing_is_proved_and_no_step_is_absurd(stand, thor):
+    """Tuned within the play, where the spring is soft, the loop runs away beyond it."""
+    loose, rubbing = so.plants.high_impedance(parts=["backlash"]), thor.update(f_c=20.0)
+    controller = so.tune(loose, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, current_limit_A=9.0))
+    certificate = so.certify(controller, {"stand": loose}, rubbing)
+    assert not certificate.passed
+    assert certificate.to_dict()["friction"]["stand"]["sector_stable"] is None
+    assert certificate.friction["stand"].multiplier == "none: the spring has play"
+    assert min(step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]) > 1.0
 
 
 def test_play_makes_the_cycle_of_an_independent_simulator(stand, thor):
