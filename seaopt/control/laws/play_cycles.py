@@ -92,7 +92,7 @@ def _find_plays(controller: Controller, plant: Plant, params: CompletedParameter
         within, beyond = (linearise(deflection * direction) for deflection in DEFLECTIONS[[0, -1]])
         change = beyond[0] - within[0]
         size = float(np.sum(change**2))
-        if size <= (LEAST_CHANGE * float(np.max(np.abs(beyond[0])))) ** 2:
+        if np.sqrt(size) <= LEAST_CHANGE * np.max(np.abs(beyond[0])):  # no square of what a draw may make huge
             continue
         matrices = np.array([linearise(deflection * direction)[0] for deflection in DEFLECTIONS])
         share = np.sum((matrices - matrices[0]) * change, axis=(1, 2)) / size
