@@ -245,8 +245,9 @@ def test_the_report_stands_alone(done):
     for fetched in re.findall(r'(?:src|href)="([^"]+)"', page):
         assert fetched.startswith(("#", "data:image/png;base64,")), fetched
     assert "<script" not in page
-    # Each of two experiments: time, response, residuals; the loop; simulations of two plants, amplitudes, environments.
-    assert page.count("<svg") == 11
+    # Each of two experiments: time, response, residuals; the loop; simulations of two plants, gain and bandwidth
+    # against amplitude, environments.
+    assert page.count("<svg") == 12
     for words in (
         "Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band",
         "Simulation of the nonlinear plants", "Large signals", "Contact with an environment", "Re Z falls to",

@@ -10,8 +10,7 @@ the multiple coherence (Bendat and Piersol, Random Data, 4th ed., ch. 7). Of noi
 and a residual's coherence is compared with it. Stretches long and short are looked at: long ones resolve modes, short
 ones average more.
 
-Lightly damped modes ring longer than any stretch. They are seen by a predictor of the output that knows its own past
-(ARX), simulated without it: what it explains is a lower bound of what a model could.
+A lightly damped mode rings longer than any stretch: there the coherence is a lower bound of what a model could explain.
 """
 
 from __future__ import annotations

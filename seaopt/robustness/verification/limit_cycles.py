@@ -14,7 +14,6 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
-from seaopt.control.laws.play_cycles import predict_play_cycles
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import SimulationError
@@ -23,6 +22,7 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL
 from seaopt.robustness.verification.oscillation import find_oscillation
+from seaopt.robustness.verification.play_cycles import predict_play_cycles
 from seaopt.robustness.verification.verification import Verification
 
 PUSH = 1.5  # times the predicted cycle, where a run starts

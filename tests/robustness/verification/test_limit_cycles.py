@@ -10,10 +10,10 @@ import pytest
 
 import seaopt as so
 from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
-from seaopt.control.laws.play_cycles import predict_play_cycles
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
 from seaopt.robustness.verification.limit_cycles import seek_limit_cycles
+from seaopt.robustness.verification.play_cycles import predict_play_cycles
 from tests import laws
 from tests.stick_slip import Mass, simulate
 
