@@ -12,15 +12,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 
 from seaopt.plants.roles import Friction, Port
 from seaopt.records import record
-
-if TYPE_CHECKING:
-    from seaopt.plants.plant import Plant
 
 
 @record(eq=False)
@@ -106,8 +103,8 @@ def _arrange(layout: Any, leaves: list[Any]) -> Any:
     return layout if isinstance(layout, str) else leaves[layout]
 
 
-def store_plant(plant: Plant) -> dict[str, Any]:
-    """Return what a plant is made of, with every function of its own as a `StoredFunction`."""
+def store_plant(plant: Any) -> dict[str, Any]:
+    """Return what a `Plant` is made of, with every function of its own as a `StoredFunction`."""
     x, p = tuple(plant.states), tuple(plant.parameters)
     u = (*plant.inputs, *plant.friction)
     content = {field.name: getattr(plant, field.name) for field in fields(plant) if field.init}
