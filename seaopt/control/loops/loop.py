@@ -161,7 +161,7 @@ class Loop:
             mt=float(mt),
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / extremes.static if extremes.static else np.inf,
-            droop_db=max(0.0, -20.0 * float(np.log10(least / extremes.static))) if least > 0.0 else np.inf,
+            droop_db=_droop_db(least, extremes.static),
             return_hz=float(below[1]) / per_hz if below.size > 1 else None,
             gain_margin_db=_least(extremes.gains_db),
             phase_margin_deg=_least(extremes.lags_deg),
@@ -169,6 +169,13 @@ class Loop:
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
         )
+
+
+def _droop_db(least: float, static: float) -> float:
+    """Return how far a magnitude falls below its static value; what is zero there cannot fall."""
+    if least >= static:
+        return 0.0
+    return -20.0 * float(np.log10(least / static)) if least > 0.0 else np.inf
 
 
 def _least(sizes: Float[np.ndarray, " k"]) -> float | None:

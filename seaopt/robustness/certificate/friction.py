@@ -12,7 +12,6 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.laws.friction_proof import lack_proof, prove_friction
-from seaopt.control.laws.play_cycles import has_play
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
@@ -20,6 +19,7 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.robustness.verification.play_cycles import has_play
 
 PROVED_DRAWS = 100  # at most so many are looked at
 
