@@ -155,7 +155,7 @@ def certify(
     --------
     >>> import seaopt as so
     >>> params, swing = so.plants.thor(), so.plants.moving_output()
-    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, reserve=0.05)  # room for what I_p may be
     >>> controller = so.tune(so.plants.high_impedance(), params, spec, robust_to={"swing": swing})
     >>> certificate = so.certify(controller, {"swing": swing}, params, ranges={"I_p": (0.3, 0.5)}, samples=100)
     >>> certificate.passed, certificate.monte_carlo.failures, list(certificate.plants)

@@ -66,6 +66,9 @@ class LinearView:
 def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> LinearView:
     """Return the linear loop of a scenario's last phase, with the load and the link as they are then.
 
+    It is that of the plant at rest, where the phase ends, with friction as steep as it is there; what the loop does in
+    motion the simulation shows.
+
     Parameters
     ----------
     stage : Stage
@@ -94,7 +97,7 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
         params = apply_load(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
     name = controller.spec.measured
     return LinearView(
-        loop=controller.close(plant, params),
+        loop=Loop(plant=controller.plant(plant, params), law=controller.law),
         noise_N=_combine_std(stage.sensors.noise_std.get(name, 0.0), stage.sensors.quantisation.get(name, 0.0)),
         step_N=_combine_std(0.0, stage.current_step_A / controller.command.per_effort),
     )

@@ -114,7 +114,7 @@ def test_without_limits_it_is_the_linear_loop(stand, thor, delay):
     a, b, c, _, _ = cont2discrete((model.A, model.B * GAIN, model.C[:1], np.zeros((1, 1))), TS, "zoh")
     x, queue, forces = np.zeros(2), [0.0] * delay, []
     e, u = [0.0, 0.0], [0.0, 0.0]
-    num_r, num_y = NUM_R, NUM_Y
+    num_r, num_y = np.array(NUM_R), np.array(NUM_Y)
     y = [0.0, 0.0]
     for _ in range(n):
         forces.append((c @ x)[0])

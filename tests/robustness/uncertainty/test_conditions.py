@@ -202,7 +202,7 @@ def test_every_scenario_of_a_draw_that_rests_at_an_angle(controller, stand, swin
     verification = verify(controller, {"swing": swing}, thor, draws={"swing": drawn}, partners={"swing": stand})
     assert verification.passed, verification
     rows = [row for row in verification.rows if row.draw == "1"]
-    assert len(rows) == 7
+    assert len(rows) == 10
     assert rows[0].parameters == {"I_p": 0.2, "phi": 0.6, "delay_s": 0.2e-3}
     for row in rows:
         first = math.radians(120) if row.scenario.startswith("fall") else 0.6

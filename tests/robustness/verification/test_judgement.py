@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import Gains
+from seaopt.control import Gains, Loop
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import SimulationError
 from seaopt.robustness.verification.linear import linearise_last_phase
@@ -125,18 +125,18 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
 
 
 def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand, thor):
-    """An integrator pushes against 300 N of static friction: 41 N at 4.75 Hz by the spectrum of the last 8 s."""
+    """An integrator pushes against 300 N of static friction: 45 N at 2.7 Hz by the spectrum of the last 8 s."""
     hunter = so.tune(stand, thor, replace(controller.spec, max_noise_gain=None, reference_weights="error"))
     gains = Gains(**{**hunter.gains, "k_i": hunter.gains["k_i"] + 1.0})
     hunter = replace(hunter, law=gains.law("pid", hunter.sample_time_s))
     plant = so.plants.high_impedance(parts=["stribeck"])
     params = plant.complete(thor).update(f_c=100.0, v_s=1e-5, f_s=300.0, v_st=3e-4)
-    assert hunter.close(plant, params).figures().stable
+    assert Loop(plant=hunter.plant(plant, params), law=hunter.law).figures().stable
     hold = Scenario(name="hold", phases=(Phase(duration_s=0.2), Phase(duration_s=9.5, force_N=50.0)))
     force = play(Stage(controller=hunter, plant=plant), hold, [params]).outputs["F1"][0, -8192:]
     spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(8192))) / 2048.0
     top = int(np.argmax(spectrum))
-    assert spectrum[top] > 30.0 and 3.0 < top / 8.192 < 6.0
+    assert spectrum[top] > 30.0 and 2.0 < top / 8.192 < 4.0
     rows = verify(hunter, {"stand": plant}, params, scenarios=[chosen(hunter, plant, "unsaturated step"), hold]).rows
     assert len(rows) == 2
     for row in rows:
