@@ -16,7 +16,7 @@ from seaopt.files import read_json, to_json
 def export_controller(results: Path, target: Path, json: bool, **options: Any) -> bool:
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
 
-    It may where it is feasible, on a fit that is met.
+    It may where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail.
 
     Raises
     ------
@@ -34,14 +34,30 @@ def export_controller(results: Path, target: Path, json: bool, **options: Any) -
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
     written = [str(file) for file in export(content, target, **options)]
-    met = content.get("fit_met", True) is True
+    met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, results / FILES["certify"])
     if json:
-        result = {"schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met, "files": written}
+        result = {
+            "schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met,
+            "certificate_failed": broken, "files": written,
+        }  # fmt: skip
         sys.stdout.write(to_json(result))
     else:
         if not met:
             sys.stdout.write(f"not met: {UNMET}\n")
         if not content["feasible"]:
             sys.stdout.write(f"not met: {', '.join(content['active_constraints'])}\n")
+        if broken:
+            sys.stdout.write(f"not met: the certificate of this controller FAILED: {', '.join(broken)}\n")
         sys.stdout.write(f"wrote {', '.join(written)}\n")
-    return content["feasible"] and met
+    return content["feasible"] and met and not broken
+
+
+def _list_broken_requirements(controller: Path, certificate: Path) -> list[str]:
+    """Return the requirements that the certificate of this very controller says are not met."""
+    if not certificate.is_file():
+        return []
+    content = read_json(certificate, SCHEMAS["certify"])
+    made_from = content.get("made_from")
+    if made_from is not None and made_from.get(controller.name) != digest(controller):
+        return []  # of another controller, and says nothing of this one
+    return list(dict.fromkeys(row["name"] for row in content["requirements"] if not row["met"]))

@@ -250,7 +250,8 @@ def test_the_report_stands_alone(done):
     assert page.count("<svg") == 12
     for words in (
         "Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band",
-        "Simulation of the nonlinear plants", "Large signals", "Contact with an environment", "Re Z falls to",
+        "Simulation of the nonlinear plants", "Bandwidth against amplitude",
+        "Contact with an environment", "Re Z falls to",
     ):  # fmt: skip
         assert words in page
     ids = re.findall(r'\bid="([^"]+)"', page)

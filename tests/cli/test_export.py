@@ -79,3 +79,15 @@ def test_an_infeasible_controller_is_written_only_when_asked_and_exits_1(done, s
     assert out.returncode == 1
     assert "not met: max_noise_gain" in out.stdout
     assert len(list((tmp_path / "out").iterdir())) == 4
+
+
+def test_a_controller_whose_certificate_failed_exits_1(done, seaopt, tmp_path):
+    for name in ("controller.json", "robustness.json"):
+        content = json.loads((done.results / name).read_text(encoding="utf-8"))
+        if name == "robustness.json":
+            content["requirements"][0]["met"] = False
+        (tmp_path / name).write_text(json.dumps(content), encoding="utf-8")
+    out = seaopt("export", tmp_path, "--c", tmp_path / "out")
+    assert out.returncode == 1
+    assert "certificate" in out.stdout and "FAILED" in out.stdout
+    assert len(list((tmp_path / "out").iterdir())) == 4

@@ -130,9 +130,14 @@ class Controller:
         return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}{remedy}"
 
     @property
+    def lifted_notes(self) -> tuple[str, ...]:
+        """A remark on every limit that the specification lifts."""
+        return tuple(f"{name} = false: this limit is not imposed" for name in self.spec.lifted)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        lifted = tuple(f"{name} = false: this limit is not imposed" for name in self.spec.lifted)
+        lifted = self.lifted_notes
         if self.design is None:
             return lifted
         plant, values = self.design

@@ -36,7 +36,7 @@ from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.friction import find_dry_friction, split_friction
+from seaopt.plants.friction import SLIDING, find_dry_friction, split_friction
 
 
 def tune(
@@ -140,7 +140,8 @@ def make_task(
     names = tuple(name for name, _ in pairs)
     for name, sampled in zip(names, plants, strict=True):
         if np.max(np.abs(np.linalg.eigvals(sampled.a))) > GROWING:
-            raise ControlError(f"plant {name} is unstable without control, which the tuner does not treat")
+            remedy = "; where friction falls with speed (Stribeck): tune without that part" if SLIDING in name else ""
+            raise ControlError(f"{name} is unstable without control, which the tuner does not treat{remedy}")
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
     port = None if spec.passive_band_hz is None else port_of(design_plant, values, spec.measured, gain)
     return Task(

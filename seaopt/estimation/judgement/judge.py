@@ -31,6 +31,7 @@ from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
+RUNS_AWAY = -1e3  # fit percent below which a free run is ten times as large as what was measured
 LITTLE = 0.02  # of an output's energy: where no model explains more, explaining less is no fault
 CHANCE = 1e-6  # probability below which a test is not chance
 SYSTEMATIC = 0.5  # of a residual's power: more than its noise
@@ -92,7 +93,7 @@ def _state_shares(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -
         for output, one in row.items():
             explained = _explained(one)
             share = shares[name].get(output)
-            explainable = None if share is None else max(share.output, explained)
+            explainable = None if share is None or explained is None else max(share.output, explained)
             stated[name][output] = replace(one, explained=explained, explainable=explainable)
     return stated
 
@@ -111,8 +112,11 @@ def _score_held_out_shots(fit: Fit, outputs: dict[str, dict[str, OutputFit]]) ->
     return outputs
 
 
-def _explained(one: OutputFit) -> float:
+def _explained(one: OutputFit) -> float | None:
+    """Return the share of an output's energy that its free run explains; None where that runs away, as a plant may."""
     percents = (one.band_fit_percent, one.fit_percent)
+    if one.fit_percent < RUNS_AWAY:
+        return None
     percent = next((value for value in percents if value is not None and math.isfinite(value)), 0.0)
     return max(1.0 - (1.0 - percent / 100.0) ** 2, 0.0)
 

@@ -437,7 +437,8 @@ class Certificate:
             for name in dict.fromkeys((*self.friction, *self.cycles))
         ]
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
-        lifted = () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
+        lifted = self.controller.lifted_notes
+        lifted += () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
         return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
 
     def _worst_dict(self, name: str) -> dict[str, Any]:

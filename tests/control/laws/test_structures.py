@@ -169,6 +169,7 @@ def test_one_sample_late_is_bodes_integral(ms, f):
         assert sensitivity_possible(f, ms, TS, 1) == (least >= 0)
 
 
+@pytest.mark.slow
 def test_the_delays_bound_is_no_stricter_than_what_is_reached(stand, thor):
     """A design that exists is not called impossible, and one sample more never makes more possible."""
     for delay in (0, 3, 8):

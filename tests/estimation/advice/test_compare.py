@@ -38,6 +38,7 @@ def fits_of(kind, log, thor, outputs=("F1", "F2"), free=("J", "b_r", "eta"), **o
     }
 
 
+@pytest.mark.slow
 def test_swing_logs_of_the_unlumped_plant_prefer_it_decisively(thor):
     """The lumped fit is searched for as widely: it ends at a resonance of 17 Hz, and leaves F2 unexplained."""
     log = log_of(so.plants.moving_output, "unlumped", PAPER_SWING, thor)

@@ -400,6 +400,7 @@ def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
     assert controller.achieved.bandwidth_hz == pytest.approx(30, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too(stand, rubbing):
     """Nearly Coulomb's jump is not proved, a flatter curve is; at draws as at the nominal parameters."""
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, delay_samples=2)
