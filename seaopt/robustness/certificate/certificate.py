@@ -299,8 +299,7 @@ class Certificate:
         """Return the limit cycles that last; those that steps end in are required of the steps."""
         return [
             Requirement(
-                name=LIMIT_CYCLE, limit=0.0, value=np.inf if cycle.simulated_N is None else cycle.simulated_N,
-                met=False, where=f"{name}: {cycle}",
+                name=LIMIT_CYCLE, limit=0.0, value=cycle.force_N, met=False, where=f"{name}: {cycle}",
             )
             for name, cycles in self.cycles.items()
             for cycle in cycles

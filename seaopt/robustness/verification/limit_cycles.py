@@ -43,6 +43,8 @@ class FoundCycle:
         Amplitude of the measured output and frequency of what remains; None where it dies out.
     runs_away : bool
         The simulated oscillation grows without end.
+    not_simulated : str
+        Why there is no simulation; empty where there is one.
     found_by : str
         Where the simulation started: there, or with which step.
 
@@ -53,11 +55,21 @@ class FoundCycle:
     simulated_hz: float | None
     runs_away: bool = False
     found_by: str = "there"
+    not_simulated: str = ""
 
     @property
     def lasts(self) -> bool:
-        """Whether the simulation keeps oscillating."""
+        """Whether it keeps oscillating: as simulated or, where that failed, as a stable cycle is predicted to."""
+        if self.not_simulated:
+            return self.predicted is not None and self.predicted.stable
         return self.simulated_N is not None or self.runs_away
+
+    @property
+    def force_N(self) -> float:
+        """Amplitude of what lasts: as simulated, without end, or as predicted where there is no simulation."""
+        if self.not_simulated and self.predicted is not None:
+            return self.predicted.force_N
+        return math.inf if self.simulated_N is None else self.simulated_N
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cycle as it stands in robustness.json."""
@@ -66,6 +78,7 @@ class FoundCycle:
             "simulated": {"force_N": self.simulated_N, "frequency_hz": self.simulated_hz} if self.simulated_N else None,
             "runs_away": self.runs_away,
             "found_by": self.found_by,
+            "not_simulated": self.not_simulated or None,
         }
 
     def __str__(self) -> str:
@@ -74,7 +87,9 @@ class FoundCycle:
             kind = "a stable" if self.predicted.stable else "an unstable"
             size = f"{self.predicted.force_N:.3g} N at {self.predicted.frequency_hz:.3g} Hz"
             parts.append(f"the describing function predicts {kind} oscillation of {size}")
-        if self.runs_away:
+        if self.not_simulated:
+            parts.append(f"its simulation failed: {self.not_simulated}")
+        elif self.runs_away:
             parts.append(f"simulated from {self.found_by} it grows without end")
         elif self.simulated_N is not None:
             parts.append(f"simulated from {self.found_by}: {self.simulated_N:.3g} N at {self.simulated_hz:.3g} Hz")
@@ -88,14 +103,11 @@ def seek_limit_cycles(
 ) -> tuple[FoundCycle, ...]:
     """Return the limit cycles that friction, unless it is proved to make none, and play may make, at rest at zero.
 
-    They are predicted and simulated. A plant that cannot be simulated has none here; its steps say why.
+    They are predicted and simulated; a prediction whose simulation fails stands alone, with the reason.
     """
     predicted = () if proved else predict_limit_cycles(controller, plant, params)
     predicted += predict_play_cycles(controller, plant, params)
-    try:
-        return tuple(_simulate(controller, plant, params, cycle) for cycle in predicted)
-    except SimulationError:
-        return ()
+    return tuple(_simulate(controller, plant, params, cycle) for cycle in predicted)
 
 
 def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
@@ -113,15 +125,18 @@ def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
 
 
 def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle: LimitCycle) -> FoundCycle:
+    """Return what a run that starts beyond a predicted cycle ends in."""
     period = controller.sample_time_s
-    loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
-    )
     lasting = min(max(PERIODS / cycle.frequency_hz, LEAST_S), LONGEST_S)
     values = plant.complete(params).drop_conditions()
-    start = at_rest(loop, 1, PUSH * np.array(cycle.state))
-    run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
-    force = run.outputs[loop.measured][0]
+    measured, delay = controller.spec.measured, controller.delay_samples
+    try:
+        loop = SampledLoop(plant=plant, law=runnable(controller), measured=measured, delay_samples=delay)
+        start = at_rest(loop, 1, PUSH * np.array(cycle.state))
+        run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
+    except SimulationError as error:
+        return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None, not_simulated=str(error))
+    force = run.outputs[measured][0]
     if not np.all(np.isfinite(force)):
         return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None, runs_away=True)
     end = force[-int(JUDGED * force.size) :]

@@ -10,6 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
+from seaopt.errors import SimulationError
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
 from seaopt.robustness.verification.limit_cycles import seek_limit_cycles
@@ -69,6 +70,24 @@ def test_a_relay_with_a_third_order_lag_oscillates_at_the_square_root_of_three(b
     exact = int(np.argmin(np.abs(sum(np.imag(g) / n for n, g in zip(range(1, 40, 2), lag, strict=True)))))
     assert found.simulated_hz == pytest.approx(f[exact], rel=0.005)
     assert found.simulated_N == pytest.approx(4 * RELAY / np.pi * np.abs(lag[0][exact]), rel=0.02)
+
+
+def test_a_cycle_whose_simulation_fails_is_still_predicted(blind, monkeypatch):
+    """A stable one stands as predicted, and is held against the controller; an unstable one does not last."""
+    plant = third_order_lag(1e3)
+    spec = so.ControllerSpec(measured="v", bandwidth_hz=25)
+    open_loop = replace(blind, law=laws.law_of([0.0]), spec=spec, design=(plant, so.ParameterSet()))
+
+    def fail(*args, **kwargs):
+        raise SimulationError("the integration does not end")
+
+    monkeypatch.setattr("seaopt.robustness.verification.limit_cycles.run_loop", fail)
+    (found,) = seek_limit_cycles(open_loop, plant, so.ParameterSet())
+    assert found.predicted.frequency_hz == pytest.approx(np.sqrt(3.0) / (2 * np.pi), rel=1e-2)
+    assert found.lasts and found.force_N == found.predicted.force_N
+    assert found.to_dict()["not_simulated"] == "the integration does not end"
+    assert "the integration does not end" in str(found)
+    assert not replace(found, predicted=replace(found.predicted, stable=False)).lasts
 
 
 def test_the_describing_function_is_the_declared_curves(thor):
