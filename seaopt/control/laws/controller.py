@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes
-from seaopt.control.laws.limits import Limit, MeasuredLoop
+from seaopt.control.laws.limits import Limit, MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import DisturbanceObserver
+from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, list_design_figures
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
@@ -98,12 +98,22 @@ class Controller:
     @property
     def design_loop(self) -> MeasuredLoop:
         """The design plant's loop, as limits are judged on it."""
-        return MeasuredLoop(name="design plant", figures=self.achieved, filter_samples=self.filter_samples)
+        return self.measure("design plant", self.achieved)
 
-    @property
-    def filter_samples(self) -> float:
-        """T_f in samples; infinite where nothing is differentiated."""
-        return self.gains["T_f"] / self.sample_time_s if self.gains["k_d"] else np.inf
+    def measure(self, name: str, figures: LoopFigures, port: PortFigures | None = None) -> MeasuredLoop:
+        """Return a design plant's loop, as limits are judged on it.
+
+        Filter and integral are those of the gains where they make the law; of another law they are read off the law.
+        """
+        gains, law, ts = self.gains, self.law, self.sample_time_s
+        if set(LAW_GAINS) <= set(gains) and Gains.from_names(gains, self.observer).make(law, self.spec.structure):
+            filter_samples = gains["T_f"] / ts if gains["k_d"] else np.inf
+            integral = gains["k_i"] / (1.0 + gains["k_p"]) if self.structure != "pd" and gains["k_i"] else np.inf
+        else:
+            filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
+        return MeasuredLoop(
+            name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral
+        )
 
     @property
     def largest_bandwidth_hz(self) -> float | None:
@@ -258,8 +268,7 @@ class Controller:
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         controller = cls(**stored, achieved=achieved, design=(plant, params))
         loops = [
-            MeasuredLoop(name=f"design plant{name}", figures=figures, filter_samples=controller.filter_samples)
-            for name, figures in controller._measure_states().items()
+            controller.measure(f"design plant{name}", figures) for name, figures in controller._measure_states().items()
         ]
         broken = tuple(list_broken_figures(controller.spec, loops) if controller.feasible else ())
         if not broken:
@@ -374,6 +383,41 @@ def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
     """Return the figures that controller.json states."""
     values = {field.name: getattr(figures, field.name) for field in fields(LoopFigures)}
     return {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
+
+
+def count_filter_samples(law: Law) -> float:
+    """Return the time constant of a law's fastest pole in samples, T/(T + 1) from zero; infinite without a pole.
+
+    Examples
+    --------
+    >>> lag = TransferFunction(num=np.array([2.0, -2.0]), den=np.array([1.0, -0.75]))
+    >>> round(count_filter_samples(Law.from_transfer_functions(lag, lag, sample_time_s=1e-3)), 9)
+    3.0
+
+    """
+    poles = np.abs(law.poles[law.integrators :])
+    return float(np.min(poles / np.maximum(1.0 - poles, 1e-300), initial=np.inf))
+
+
+def find_integral_rate(law: Law) -> float:
+    """Return k_i/(1 + k_p), rad/s, of a law: how fast its slowest integral acts; infinite without one.
+
+    The gains are those of powers of 1/s, s = (2/T_s)(z - 1)/(z + 1): of two integrals it is the ratio of their gains.
+
+    Examples
+    --------
+    >>> pi = Gains(k_p=0.5, k_i=6.0, k_d=0.0, T_f=1e-3, k_r=1.5).law("pid", 1e-3)
+    >>> round(find_integral_rate(pi), 9)
+    4.0
+
+    """
+    m = law.integrators
+    if not m:
+        return np.inf
+    a, b, c = law.rest
+    static = float(law.d[1] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, 1]))
+    last, before = -law.b[m - 1, 1], 1.0 - static if m == 1 else -law.b[m - 2, 1]
+    return float(last / (law.sample_time_s * (before - 0.5 * m * last)))
 
 
 def _milliseconds(time_s: float | None) -> float | None:

@@ -29,6 +29,7 @@ PASSIVE_ROUNDING = 1e-9  # Re Z/abs(Z) that is still called zero
 PLACED_BELOW = 0.97  # of the bandwidth: up to here abs(F/F_ref) must be above -3 dB, which it reaches at the bandwidth
 FALLEN_ABOVE = 1.03  # of the bandwidth: from here it must be below
 SHOULDER = 3.0  # of the bandwidth: up to here it must not come back
+INTEGRAL_RAD_S = 2 * math.pi * 0.05  # k_i/(1 + k_p) at least, so that an integral does something
 
 Sense = Literal["at most", "at least", "equal to"]
 Scope = Literal["every plant", "design plant"]
@@ -66,6 +67,8 @@ class MeasuredLoop:
         The design plant's, where a passive band is asked for.
     filter_samples : float
         Time constant of the derivative's filter in samples; infinite where nothing is differentiated.
+    integral_rad_s : float
+        How fast the integral takes an error away, k_i/(1 + k_p); infinite without one.
 
     """
 
@@ -73,6 +76,7 @@ class MeasuredLoop:
     figures: LoopFigures
     port: PortFigures | None = None
     filter_samples: float = math.inf
+    integral_rad_s: float = math.inf
 
 
 @record(eq=False)
@@ -325,6 +329,12 @@ LIMITS = (
         sense="at least", scope="design plant", unit="samples", default=1.0, reserve="none",
         meaning="T_f in samples: a faster filter lets the derivative amplify what lies between two samples",
         remedy="tune again",
+    ),
+    Limit(
+        name="integral_rad_s", has_field=False, label="rate of the integral", figure=lambda loop: loop.integral_rad_s,
+        sense="at least", scope="design plant", unit="rad/s", allowed=INTEGRAL_RAD_S, reserve="none",
+        meaning="k_i/(1 + k_p) of an integral, 2 pi 0.05 or more: a slower one leaves errors for tens of seconds",
+        remedy="tune again, or leave the integral out",
     ),
     Limit(
         name="passive_band_hz", label="least Re Z/|Z| in the passive band", sense="at least",

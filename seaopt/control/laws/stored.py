@@ -10,7 +10,7 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
+from seaopt.control.laws.structures import AGREES, COMPARED, LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -19,9 +19,7 @@ from seaopt.errors import ControlError, FileError
 from seaopt.files import plain
 
 NOTCH_GAINS = ("notch_frequency_hz", "notch_width", "notch_depth")
-AGREES = 1e-6  # what is for reading gives the law's response to this share, and to the rounding of its coefficients
 FIGURES_AGREE = 1e-4  # a bandwidth where abs(F/F_ref) is flat is known to the root of rounding
-COMPARED = np.geomspace(1e-4, 0.49, 60)  # frequencies at which it is compared, of the sample rate
 ROUNDINGS = 1024 * float(np.finfo(float).eps)
 TUNE_AGAIN = "tune again"
 
@@ -81,6 +79,30 @@ class StoredObserver(ResultTable):
     kept: Coefficients
     inverse: list[StoredTransferFunction]
     T_q: Finite
+    bandwidth_hz: Finite
+    Q: StoredTransferFunction
+    Q_over_P_n: StoredTransferFunction
+
+    def build(self, sample_time_s: float) -> DisturbanceObserver:
+        """Return the observer; refuse what is for reading where it is not that of T_q, kept and inverse."""
+        nominal = Nominal(kept=np.array(self.kept), inverse=tuple(part.build() for part in self.inverse))
+        observer = DisturbanceObserver(nominal=nominal, T_q=self.T_q)
+        if not abs(self.bandwidth_hz - observer.bandwidth_hz) <= AGREES * observer.bandwidth_hz:
+            raise _contradict("observer.bandwidth_hz", f"is {self.bandwidth_hz:g}, and T_q says otherwise")
+        filters = zip(("Q", "Q_over_P_n"), (self.Q, self.Q_over_P_n), observer.filters(sample_time_s), strict=True)
+        for name, stated, made in filters:
+            for end in ("num", "den"):
+                one, other = np.array(getattr(stated, end)), getattr(made, end)
+                if one.shape != other.shape or np.any(np.abs(one - other) > AGREES * np.max(np.abs(other))):
+                    raise _contradict(f"observer.{name}.{end}", "is not what T_q, kept and inverse give")
+        return observer
+
+
+class StoredNumber(ResultTable):
+    """A gain as a drive is set."""
+
+    value: Finite
+    unit: str
 
 
 class StoredCommand(ResultTable):
@@ -127,6 +149,7 @@ class StoredController(ResultTable):
     blocked_by: list[str] = []
     possible: StoredPossible | None = None
     observer: StoredObserver | None = None
+    engineering: dict[str, StoredNumber] = {}
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -147,12 +170,12 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
         raise _contradict("sample_time_s", stated)
     law = table.law.build(spec.sample_time_s)
-    observer = None
-    if table.observer is not None:
-        inverse = tuple(part.build() for part in table.observer.inverse)
-        nominal = Nominal(kept=np.array(table.observer.kept), inverse=inverse)
-        observer = DisturbanceObserver(nominal=nominal, T_q=table.observer.T_q)
+    observer = None if table.observer is None else table.observer.build(spec.sample_time_s)
     _check_gains(table.gains, observer, spec, law)
+    for name, stated in table.engineering.items():
+        expected = table.command.per_effort * table.gains.get(name, np.nan)
+        if not abs(stated.value - expected) <= AGREES * abs(expected):
+            raise _contradict(f"engineering.{name}", f"is {stated.value:g}, and the gain makes {expected:g}")
     _check_reading(table, law)
     return {
         "law": law,
@@ -189,14 +212,7 @@ def _check_gains(
         observer is not None and gains["T_q"] != observer.T_q
     ):
         raise _contradict("observer", "is not that of structure and gains")
-    notch = (
-        Notch(**{name.removeprefix("notch_"): gains[name] for name in NOTCH_GAINS}) if "notch_depth" in gains else None
-    )
-    law_gains = Gains(**{name: gains[name] for name in LAW_GAINS}, observer=observer, notch=notch)
-    made = law_gains.law(spec.structure, spec.sample_time_s)
-    f = COMPARED * spec.sample_rate_hz
-    stated, expected = law.responses(f), made.responses(f)
-    if made.integrators != law.integrators or not np.all(np.abs(stated - expected) <= AGREES * np.abs(expected)):
+    if not Gains.from_names(gains, observer).make(law, spec.structure):
         raise _contradict("law", "is not what gains, observer and spec give")
 
 

@@ -52,7 +52,8 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, fields
 from itertools import zip_longest
 from typing import Any, Literal, NamedTuple
 
@@ -72,6 +73,8 @@ STRUCTURES: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
+AGREES = 1e-6  # numbers for reading give the law's response to this share
+COMPARED = np.geomspace(1e-4, 0.49, 60)  # frequencies at which it is compared, of the sample rate
 HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal lags are 3 dB down
 
 
@@ -245,6 +248,21 @@ class Gains:
         if self.notch is not None:
             out |= {f"notch_{name}": value for name, value in asdict(self.notch).items()}
         return out
+
+    @classmethod
+    def from_names(cls, numbers: Mapping[str, float], observer: DisturbanceObserver | None = None) -> Gains:
+        """Return the gains of `by_name`; those of an observer are its own."""
+        notch = None
+        if "notch_depth" in numbers:
+            notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
+        return cls(**{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch)
+
+    def make(self, law: Law, structure: Structure) -> bool:
+        """Tell whether these gains make a law: its responses, to a millionth, and its integrators."""
+        made, f = self.law(structure, law.sample_time_s), COMPARED / law.sample_time_s
+        expected = made.responses(f)
+        near = np.abs(law.responses(f) - expected) <= AGREES * np.abs(expected)
+        return made.integrators == law.integrators and bool(np.all(near))
 
     def law(self, structure: Structure, sample_time_s: float) -> Law:
         """Return the law as a state space from reference and measurement; `Law.balanced` is what runs."""

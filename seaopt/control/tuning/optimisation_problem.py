@@ -31,7 +31,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.limits import BY_NAME, LIMITS, MeasuredLoop, Scope
+from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
@@ -42,7 +42,6 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here
-INTEGRAL_RAD_S = 2 * np.pi * 0.05  # k_i / (1 + k_p) at least, so that the integral does something
 FREQUENCIES = 300
 SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
@@ -308,10 +307,11 @@ class Task:
         if self.port is not None and band is not None:
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
         filter_samples = float(x[T_F] / spec.sample_time_s) if x[K_D] > 0.0 else np.inf
+        integral_rad_s = float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf
         return [
             MeasuredLoop(
                 name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,
-                filter_samples=filter_samples,
+                filter_samples=filter_samples, integral_rad_s=integral_rad_s,
             )
             for i, name in enumerate(self.names)
         ]  # fmt: skip

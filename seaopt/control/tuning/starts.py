@@ -28,11 +28,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.limits import BY_NAME
+from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S
 from seaopt.control.laws.structures import LawTerms
 from seaopt.control.tuning.optimisation_problem import (
     HIGHEST_NOTCH,
-    INTEGRAL_RAD_S,
     K_D,
     K_I,
     K_P,

@@ -35,8 +35,7 @@ def design_requirements(controller: Controller, states: Mapping[str, Plant], val
     if band is not None and controller.design is not None:
         held = port_of(states[name], values, spec.measured, controller.command.per_effort)
         port = measure_port(held, controller.law, controller.sample_time_s, controller.delay_samples, band)
-    design = MeasuredLoop(name=name, figures=achieved, port=port, filter_samples=controller.filter_samples)
-    verdicts = judge(spec, design, "design plant")
+    verdicts = judge(spec, controller.measure(name, achieved, port), "design plant")
     for other, loop in stuck:
         verdicts += judge(spec, MeasuredLoop(name=other, figures=loop), "design plant", stuck=True)
     return [_make_requirement(verdict, _place_passive(verdict, port, band)) for verdict in verdicts]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import json
 import re
@@ -17,6 +18,8 @@ import seaopt as so
 from seaopt.control import Gains, Loop
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
+from seaopt.control.laws.stored import read_controller
+from seaopt.control.laws.structures import DisturbanceObserver, Nominal, Notch
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.simulation.native import find_compiler
@@ -345,6 +348,7 @@ EDITS = [
     (("measurement", "den"), [], "measurement.den = .."),
     (("active_constraints",), "ms", "active_constraints = 'ms'"),
     (("observer",), {"T_q": 1.0}, "observer.kept is missing"),
+    (("engineering", "k_p", "value"), 1.0, "engineering.k_p is 1"),
 ]
 
 
@@ -361,6 +365,44 @@ def test_an_edited_controller_json_is_refused_by_export_and_by_reading(place, va
         assert str(raised.value).startswith("controller.json: ")
         assert "malformed" not in str(raised.value)
         assert "\n" not in str(raised.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def with_everything(tuned):
+    """Return the controller.json of a pid with an observer and a notch, of numbers that nobody tuned."""
+    notch = Notch(frequency_hz=120.0, width=0.3, depth=0.2)
+    nominal = Nominal.of(tuned.close(*tuned.design).plant)
+    observer = DisturbanceObserver(nominal=nominal, T_q=5e-3)
+    gains = Gains(k_p=0.4, k_i=6.0, k_d=4e-3, T_f=2e-3, k_r=1.3, c=0.7, observer=observer, notch=notch)
+    controller = replace(
+        tuned, structure="pid_dob", gains=gains.by_name(), observer=observer,
+        law=gains.law("pid_dob", tuned.sample_time_s).balanced(),
+        spec=replace(tuned.spec, structure="pid_dob", notch=notch),
+    )  # fmt: skip
+    return json.loads(to_json(controller.to_dict()))
+
+
+NUMBERS = [
+    *[("gains", name) for name in ("k_p", "k_i", "k_d", "T_f", "k_r", "c", "T_q", "notch_frequency_hz", "notch_width",
+                                   "notch_depth")],
+    *[("engineering", name, "value") for name in ("k_p", "k_i", "k_d", "k_r")],
+    ("observer", "T_q"), ("observer", "bandwidth_hz"), ("observer", "kept", -1), ("observer", "inverse", 0, "num", 0),
+    *[("observer", name, end, 0) for name in ("Q_over_P_n",) for end in ("num", "den")], ("observer", "Q", "den", 1),
+    ("observer", "Q", "num", -1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("place", NUMBERS, ids=lambda place: ".".join(map(str, place)))
+def test_a_number_that_is_off_by_a_thousandth_is_not_the_laws(place, with_everything, tmp_path):
+    read_controller(with_everything)
+    content = copy.deepcopy(with_everything)
+    table = content
+    for name in place[:-1]:
+        table = table[name]
+    table[place[-1]] *= 1.001
+    with pytest.raises(FileError, match=r"(law|observer|engineering)\S* is "):
+        export(content, tmp_path)
     assert not list(tmp_path.iterdir())
 
 

@@ -6,20 +6,26 @@ import re
 from dataclasses import fields, replace
 from pathlib import Path
 
+import control
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control.laws.controller import find_integral_rate
 from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
+from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
 from seaopt.control.laws.verdict import judge_all, list_active, list_broken
 from seaopt.errors import ControlError
 from seaopt.problem.schema import ControllerTable
+from tests import laws
 
 TUNING = Path(__file__).resolve().parents[3] / "docs" / "tuning.md"
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, min_disk_margin=0.5, max_reference_peak=1.2,
     max_noise_gain=25, passive_band_hz=(1, 60),
 )  # fmt: skip
+
+PLAIN = replace(SPEC, passive_band_hz=None)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +90,7 @@ def test_the_range_of_a_field_is_the_rows(limit):
 def test_nothing_is_broken_or_active_with_room_to_spare(figures):
     verdicts = judge_all(SPEC, loops(figures))
     assert list_broken(verdicts) == list_active(SPEC, verdicts) == []
-    assert len(verdicts) == 2 * 4 + 8
+    assert len(verdicts) == 2 * 4 + 9
 
 
 # What the figures become; just within the limit, and just beyond it.
@@ -127,19 +133,56 @@ def test_a_passive_band_needs_a_held_loop_that_does_not_grow(figures, cosine, he
 DEFAULTS = {
     "stability": 1.0, "max_sensitivity": 1.7, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_droop_db": 1.0,
     "min_sensitivity_bandwidth_hz": 6.0, "bandwidth_hz": 30.0, "shoulder_hz": 90.0, "min_filter_samples": 1.0,
+    "integral_rad_s": 0.1 * np.pi,
 }  # fmt: skip
 
 
 def test_what_is_left_out_has_its_default_and_false_lifts_it(figures):
     verdicts = judge_all(so.ControllerSpec(bandwidth_hz=30), loops(figures)[:1])
     assert {verdict.limit.name: verdict.allowed for verdict in verdicts} == DEFAULTS
-    optional = [name for name in DEFAULTS if name not in ("stability", "bandwidth_hz", "shoulder_hz")]
+    optional = [name for name in DEFAULTS if name not in ("stability", "bandwidth_hz", "shoulder_hz", "integral_rad_s")]
     spec = so.ControllerSpec(bandwidth_hz=30, **dict.fromkeys(optional, False))
     assert set(spec.lifted) == set(optional)
     kept = judge_all(spec, loops(figures)[:1])
-    assert [verdict.limit.name for verdict in kept] == ["stability", "bandwidth_hz", "shoulder_hz"]
+    assert [verdict.limit.name for verdict in kept] == ["stability", "bandwidth_hz", "shoulder_hz", "integral_rad_s"]
     none = so.ControllerSpec(bandwidth_hz=30, **dict.fromkeys(optional))
     assert judge_all(none, loops(figures)[:1])[1].allowed == 1.7
+
+
+def test_filter_and_integral_are_those_of_the_law(stand, thor):
+    """A law put in the place of the tuned one is judged by its own filter and integral, whatever the gains say."""
+    controller = so.tune(stand, thor, PLAIN)
+    own = controller.design_loop
+    assert own.filter_samples == controller.gains["T_f"] / 1e-3 and own.integral_rad_s > 0.1 * np.pi
+    ahead, back = laws.multiply_out("pid", 1e-3, k_p=0.5, k_i=0.3, k_d=4e-3, T_f=2e-4, k_r=1.5)
+    other = replace(controller, law=laws.law_of(back.num, back.den, (ahead.num, ahead.den)))
+    design = other.measure("stand", other.close(stand, thor).figures())
+    assert design.filter_samples == pytest.approx(0.2, rel=1e-9)
+    assert design.integral_rad_s == pytest.approx(0.2, rel=1e-6)
+    assert {"min_filter_samples", "integral_rad_s"} <= set(list_broken(judge_all(PLAIN, [design])))
+    assert {"min_filter_samples", "integral_rad_s"} <= {
+        row.name for row in so.certify(other, {"stand": stand}, thor).requirements if not row.met
+    }
+
+
+@pytest.mark.parametrize("structure", ["pid", "pid_dob"])
+@pytest.mark.parametrize("rate", [0.05, 0.4])
+def test_the_rate_of_the_integral_is_the_loops_slowest_pole(stand, thor, structure, rate):
+    """Of the loop by python-control on the stand, whose static gain is 1; beside an observer it is the second."""
+    tuned = so.tune(stand, thor, replace(PLAIN, structure="pid"))
+    plant = tuned.close(stand, thor).plant
+    observer = DisturbanceObserver(nominal=Nominal.of(plant), T_q=8e-3) if structure == "pid_dob" else None
+    gains = Gains(k_p=0.4, k_i=1.4 * rate, k_d=2e-3, T_f=2e-3, k_r=1.4, observer=observer)
+    law = gains.law(structure, 1e-3)
+    model = control.ss(plant.a, plant.b[:, None], plant.c[None], plant.d, 1e-3)
+    late = model * control.ss(control.tf([1.0], [1.0, *[0.0] * plant.delay_samples], 1e-3))
+    c_y = control.ss(law.a, -law.b[:, 1:], law.c[None], -law.d[1], 1e-3)
+    poles = np.log(control.feedback(late * c_y, 1).poles()) / 1e-3
+    slowest = float(np.min(np.abs(poles)))
+    assert find_integral_rate(law) == pytest.approx(slowest, rel=2e-3 + 0.05 * rate)
+    made = replace(tuned, law=law, gains=gains.by_name(), observer=observer, spec=replace(PLAIN, structure=structure))
+    broken = list_broken(judge_all(PLAIN, [replace(made, structure=structure).measure("stand", tuned.achieved)]))
+    assert ("integral_rad_s" in broken) == (rate < 0.1 * np.pi)
 
 
 def test_a_filter_that_is_faster_than_the_sampling_is_refused(figures):
