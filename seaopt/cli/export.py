@@ -9,6 +9,7 @@ from typing import Any
 from seaopt.cli.provenance import FILES, check_unedited, digest
 from seaopt.cli.session import SCHEMAS, UNMET
 from seaopt.control.deploy.export import export
+from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
 
@@ -45,7 +46,7 @@ def export_controller(results: Path, target: Path, json: bool, **options: Any) -
         if not met:
             sys.stdout.write(f"not met: {UNMET}\n")
         if not content["feasible"]:
-            sys.stdout.write(f"not met: {', '.join(content['active_constraints'])}\n")
+            sys.stdout.write(f"not met: {join_labels(content['active_constraints'])}\n")
         if broken:
             sys.stdout.write(f"not met: the certificate of this controller FAILED: {', '.join(broken)}\n")
         sys.stdout.write(f"wrote {', '.join(written)}\n")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.control import Controller, Frontier
-from seaopt.control.laws.verdict import list_design_figures
+from seaopt.control.laws.verdict import join_labels, list_design_figures
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import write_text
@@ -252,7 +252,7 @@ def verdict(
     if fit is not None:
         lines.append((fit.met, f"Fit: {fit.verdict}"))
     if controller is not None:
-        what = "every limit met" if controller.feasible else "not met: " + ", ".join(controller.active_constraints)
+        what = "every limit met" if controller.feasible else "not met: " + join_labels(controller.active_constraints)
         lines.append((controller.feasible, f"Controller at {controller.spec.bandwidth_hz:g} Hz: {what}"))
     if certificate is not None:
         mc = certificate.monte_carlo

@@ -21,6 +21,7 @@ import numpy as np
 from seaopt.control.laws.controller import GAIN_UNITS, Controller
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, realise
+from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ControlError, FileError
 from seaopt.files import write_text
 
@@ -108,7 +109,7 @@ def export(
 
         stored, figures = read_controller(controller), _stated(controller)
     if not stored["feasible"] and not allow_infeasible:
-        missed = ", ".join(stored["active_constraints"])
+        missed = join_labels(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
     law = _law(stored, current_limit_A, tracking_time_s, gate)
     context = _describe(stored, law) | {
@@ -187,7 +188,7 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         "delay_samples": stored["delay_samples"],
         "feasible": stored["feasible"],
-        "blocking": _strip_markup(", ".join(stored["active_constraints"])),
+        "blocking": _strip_markup(join_labels(stored["active_constraints"])),
         "limited": math.isfinite(law.current_limit_A),
         "order": law.c.size,
         "storage": max(law.c.size, 1),

@@ -12,7 +12,13 @@ from seaopt.control.laws.command import Command, actuation_notes
 from seaopt.control.laws.limits import Limit, MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
-from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, list_design_figures
+from seaopt.control.laws.verdict import (
+    PossibleBandwidths,
+    join_labels,
+    list_broken_figures,
+    list_design_figures,
+    shorten_blocked,
+)
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -73,7 +79,7 @@ class Controller:
     observer : DisturbanceObserver or None
         The disturbance observer of a pid_dob, which the law includes.
     blocked_by : tuple of str
-        The limits that are broken, each with its figure.
+        The limits that are broken, each once with its worst figure and its plants, the worst first.
     possible : PossibleBandwidths or None
         Where it is not feasible: the bandwidths that keep the limits; None where none were looked for.
 
@@ -135,7 +141,7 @@ class Controller:
         """One line: the limits that block, and the bandwidths that are possible; empty where every limit is met."""
         if self.feasible:
             return ""
-        blocked = " and ".join(self.blocked_by or self.active_constraints)
+        blocked = shorten_blocked(self.blocked_by or self.active_constraints)
         remedy = "" if self.possible is None else f"; {self.possible}"
         return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}{remedy}"
 
@@ -277,7 +283,7 @@ class Controller:
 
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec
-        verdict = "every limit met" if self.feasible else "NOT FEASIBLE: " + ", ".join(self.active_constraints)
+        verdict = "every limit met" if self.feasible else "NOT FEASIBLE"
         gain_margin, phase_margin, delay_margin, bandwidth = (
             format_number(value, missing="none")
             for value in (a.gain_margin_db, a.phase_margin_deg, _milliseconds(a.delay_margin_s), a.bandwidth_hz)
@@ -293,7 +299,7 @@ class Controller:
                 f"  gain margin {gain_margin} dB, phase margin {phase_margin} deg, delay margin {delay_margin} ms",
                 *self._friction_lines(),
                 *self._force_lines(),
-                f"  limits met with nothing to spare: {', '.join(self.active_constraints) or 'none'}"
+                f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
                 if self.feasible
                 else f"  {self.explanation}",
                 *(f"  note: {note}" for note in self.notes),

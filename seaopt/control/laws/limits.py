@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Literal
 
-from seaopt.control.loops.loop import DROOP_BAND, STABLE, LoopFigures
+from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, SHOULDER, SHOULDER_FALL, STABLE, LoopFigures
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.records import record
 
@@ -27,8 +27,6 @@ LIMIT_ROUNDING = 1e-6  # by which a figure that lies on its limit may be beyond 
 BANDWIDTH_TOLERANCE = 0.005
 PASSIVE_ROUNDING = 1e-9  # Re Z/abs(Z) that is still called zero
 PLACED_BELOW = 0.97  # of the bandwidth: up to here abs(F/F_ref) must be above -3 dB, which it reaches at the bandwidth
-FALLEN_ABOVE = 1.03  # of the bandwidth: from here it must be below
-SHOULDER = 3.0  # of the bandwidth: up to here it must not come back
 INTEGRAL_RAD_S = 2 * math.pi * 0.05  # k_i/(1 + k_p) at least, so that an integral does something
 
 Sense = Literal["at most", "at least", "equal to"]
@@ -94,8 +92,7 @@ class LimitCurve:
     floor : bool
         abs(X) is to be above, not below.
     fall : float
-        The level falls with the frequency to this power, from the bandwidth asked, so that the tuner leaves no curve
-        lying along it.
+        The level falls with the frequency to this power, from the bandwidth asked.
     symbol : str
         Of abs(X)/abs(1 + L), where a message states this rather than the figure.
 
@@ -319,9 +316,10 @@ LIMITS = (
         tolerance=BANDWIDTH_TOLERANCE, reserve="curve",
         curve=LimitCurve(
             of="P C_r", level=lambda _: HALF_POWER, from_hz=lambda _, bandwidth_hz: FALLEN_ABOVE * bandwidth_hz,
-            until_hz=lambda allowed, _: allowed, fall=0.25,
+            until_hz=lambda allowed, _: allowed, fall=SHOULDER_FALL,
         ),
-        meaning="where |F/F_ref| comes back above -3 dB, three bandwidths or more: neither dip nor shoulder makes one",
+        meaning="where |F/F_ref| (f/bandwidth)^0.25 is again above -3 dB, three bandwidths or more: neither a dip nor "
+        "a shoulder makes a bandwidth",
         remedy="ask for the bandwidths that the result names",
     ),
     Limit(

@@ -10,8 +10,10 @@ import numpy as np
 from seaopt.control.laws.limits import FIELDS, LIMITS, Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
+from seaopt.formatting import format_count, join_words
 from seaopt.records import record
 
+BLOCKED_CHARACTERS = 145  # of the limits that a message names, so that it stays below three lines of 80
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
 
 
@@ -27,10 +29,22 @@ class Verdict:
     stuck: bool = False
 
     @property
+    def names_plant(self) -> bool:
+        """Whether the limit holds for several plants, so that it takes a plant's name to say which."""
+        return self.limit.scope == "every plant" or self.stuck
+
+    @property
     def label(self) -> str:
         """The limit's name, with the plant where it holds for several."""
-        named = self.limit.scope == "every plant" or self.stuck
-        return f"{self.limit.name} ({self.plant})" if named else self.limit.name
+        return f"{self.limit.name} ({self.plant})" if self.names_plant else self.limit.name
+
+    @property
+    def severity(self) -> float:
+        """How much of the limit is used; without bound where the loop is unstable or there is no figure."""
+        if self.limit.name == "stability" or not np.isfinite(self.value):
+            return np.inf
+        used = self.limit.usage(self.value, self.allowed)
+        return max(used, 1.0 / used) if self.limit.sense == "equal to" else used
 
 
 @record
@@ -108,8 +122,51 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def explain_broken(spec: ControllerSpec, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
-    """Return each limit that is broken with the figure that was reached; `loop` is the design plant's."""
-    return [_explain(spec, verdict, design, loop) for verdict in verdicts if not verdict.met]
+    """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
+
+    `loop` is the design plant's. What is broken most comes first.
+    """
+    broken: dict[str, list[Verdict]] = {}
+    for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda one: -one.severity):
+        broken.setdefault(verdict.limit.name, []).append(verdict)
+    return [
+        _explain(spec, worst, design, loop) + _format_plants([one.plant for one in (worst, *others) if one.names_plant])
+        for worst, *others in broken.values()
+    ]
+
+
+def join_labels(labels: Sequence[str]) -> str:
+    """Return limits, as `Verdict.label` names them, each once with its plants.
+
+    Examples
+    --------
+    >>> join_labels(["max_sensitivity (sliding)", "max_sensitivity (stuck)", "max_noise_gain"])
+    'max_sensitivity (sliding and stuck), max_noise_gain'
+
+    """
+    plants: dict[str, list[str]] = {}
+    for label in labels:
+        name, _, plant = label.removesuffix(")").partition(" (")
+        plants.setdefault(name, []).extend([plant] if plant else [])
+    return ", ".join(name + _format_plants(named) for name, named in plants.items())
+
+
+def shorten_blocked(blocked: Sequence[str]) -> str:
+    """Return the first of some broken limits, as many as a message has room for, and how many more there are."""
+    shown = 1
+    while shown < len(blocked) and sum(map(len, blocked[: shown + 1])) <= BLOCKED_CHARACTERS:
+        shown += 1
+    rest = len(blocked) - shown
+    return join_words([*blocked[:shown], *([format_count(rest, "more limit")] if rest else [])])
+
+
+def _format_plants(plants: Sequence[str]) -> str:
+    """Return up to two plants by name, in brackets, and how many more there are."""
+    if not plants:
+        return ""
+    if len(plants) > 2:
+        return f" ({plants[0]} and {len(plants) - 1} more)"
+    return f" ({' and '.join(plants)})"
 
 
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[tuple[Limit, float | None, float | None]]:
@@ -126,9 +183,9 @@ def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[tupl
 def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:
     limit, port = verdict.limit, design.port
     if limit.name == "stability":
-        return verdict.label
+        return limit.name
     if limit.curve is not None and limit.curve.symbol:
-        return f"{limit.name}, {_reached(spec, verdict, loop)}"
+        return f"{limit.name} ({_reached(spec, verdict, loop)})"
     if limit.name == "passive_band_hz" and port is not None and spec.passive_band_hz is not None:
         low, high = spec.passive_band_hz
         growth = "" if port.held_stable else "; the loop grows with its link held"
@@ -136,8 +193,8 @@ def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop:
             f"{limit.name} = [{low:g}, {high:g}], Re Z/|Z| {port.least_cosine:.3g} of 0 at {port.at_hz:.4g} Hz{growth}"
         )
     if limit.sense == "equal to" and not np.isfinite(verdict.value):
-        return f"{verdict.label}, of which there is none"
-    return f"{verdict.label} {verdict.value:.4g} of {verdict.allowed:g}"
+        return f"{limit.name}, of which there is none"
+    return f"{limit.name} {verdict.value:.4g} of {verdict.allowed:g}"
 
 
 def _reached(spec: ControllerSpec, verdict: Verdict, loop: Loop) -> str:
@@ -150,4 +207,4 @@ def _reached(spec: ControllerSpec, verdict: Verdict, loop: Loop) -> str:
     c_y = -response
     values = np.abs(curve.numerator(p, c_y, c_r, p * c_y)) / np.abs(1.0 + p * c_y)
     extreme = f"falls to {np.min(values):.4f}" if curve.floor else f"reaches {np.max(values):.4f}"
-    return f"{curve.symbol} {extreme} below {until:g} Hz, {curve.level(verdict.allowed):.4f} allowed"
+    return f"{curve.symbol} {extreme} below {until:.4g} Hz, {curve.level(verdict.allowed):.4f} allowed"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes, find_least
 from seaopt.control.loops.response import ClosedLoop, close
@@ -19,6 +20,9 @@ from seaopt.records import record
 
 GRID_LOWEST_HZ = 1e-3
 DROOP_BAND = 1.0 / 3.0  # of the bandwidth
+FALLEN_ABOVE = 1.03  # of the bandwidth: from here abs(F/F_ref) must be below -3 dB,
+SHOULDER = 3.0  # up to here it must not come back,
+SHOULDER_FALL = 0.25  # and be below by more and more, by this power of frequency, so that it does not linger there
 # A spectral radius from STABLE to GROWING is 1 to rounding. A loop there is not stable: it has no margins. What has
 # nothing to damp it (an actuator or an environment without friction) is there too, and does not grow: growth by e
 # takes longer than 11 days at 1 kHz.
@@ -52,7 +56,8 @@ class LoopFigures:
     droop_db : float
         How far abs(F/F_ref) falls below its static value up to a third of the bandwidth.
     return_hz : float or None
-        Lowest frequency above the bandwidth at which abs(F/F_ref) comes back above -3 dB.
+        Lowest frequency from 1.03 to 3 times the bandwidth at which abs(F/F_ref), times (f/bandwidth)^0.25, is above
+        -3 dB: it comes back, or lingers there.
     gain_margin_db : float or None
         Smallest change of gain, up or down, that makes the loop unstable; None: no change does.
     phase_margin_deg, delay_margin_s : float or None
@@ -162,13 +167,27 @@ class Loop:
             ms_hz=float(ms_at) / per_hz,
             reference_peak=float(reference) / extremes.static if extremes.static else np.inf,
             droop_db=_droop_db(least, extremes.static),
-            return_hz=float(below[1]) / per_hz if below.size > 1 else None,
+            return_hz=self._find_return(float(below[0]) / per_hz, extremes.static) if below.size else None,
             gain_margin_db=_least(extremes.gains_db),
             phase_margin_deg=_least(extremes.lags_deg),
             delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
         )
+
+    def _find_return(self, bandwidth_hz: float, static: float) -> float | None:
+        """Return where abs(F/F_ref) comes back, or lingers, above its bandwidth."""
+        low, high = FALLEN_ABOVE * bandwidth_hz, min(SHOULDER * bandwidth_hz, self.plant.nyquist_hz)
+        if low >= high:
+            return None
+
+        def room(f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+            return HALF_POWER * static * (bandwidth_hz / f) ** SHOULDER_FALL - np.abs(self.tracking(f))
+
+        grid = self.grid()
+        f = add_minima(room, np.concatenate([[low], grid[(grid > low) & (grid < high)], [high]]))
+        crossings = [low] if room(f[:1])[0] < 0.0 else find_crossings(room, f)
+        return float(crossings[0]) if len(crossings) else None
 
 
 def _droop_db(least: float, static: float) -> float:

@@ -10,7 +10,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.verdict import judge_all, list_broken
+from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task
@@ -97,7 +97,11 @@ class Frontier:
         head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin", "force limit")
         sticks = any(row.without_sticking for row in self.rows)
         cells = [
-            [*_cells(row), *([_friction_cost(row)] if sticks else []), " and ".join(row.blocked_by)]
+            [
+                *_cells(row),
+                *([_friction_cost(row)] if sticks else []),
+                shorten_blocked(row.blocked_by) if row.blocked_by else "",
+            ]
             for row in self.rows
         ]
         friction = ("cost of friction",) if sticks else ()

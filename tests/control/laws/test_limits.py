@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.control.laws.controller import find_integral_rate
 from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
-from seaopt.control.laws.verdict import judge_all, list_active, list_broken
+from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken, shorten_blocked
 from seaopt.errors import ControlError
 from seaopt.problem.schema import ControllerTable
 from tests import laws
@@ -29,9 +29,13 @@ PLAIN = replace(SPEC, passive_band_hz=None)
 
 
 @pytest.fixture(scope="module")
-def figures(stand, thor):
+def loop(stand, thor):
+    return so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).close(stand, thor)
+
+
+@pytest.fixture(scope="module")
+def figures(loop):
     """Return figures that keep every limit of SPEC with room to spare."""
-    loop = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30)).close(stand, thor)
     return replace(
         loop.figures(), stable=True, spectral_radius=0.999, ms=1.4, mt=1.1, disk_margin=0.8, reference_peak=1.0,
         noise_gain=10.0, sensitivity_bandwidth_hz=8.0, bandwidth_hz=30.1, droop_db=0.5, return_hz=None,
@@ -188,3 +192,21 @@ def test_the_rate_of_the_integral_is_the_loops_slowest_pole(stand, thor, structu
 def test_a_filter_that_is_faster_than_the_sampling_is_refused(figures):
     loop = replace(loops(figures)[0], filter_samples=0.99)
     assert list_broken(judge_all(SPEC, [loop])) == ["min_filter_samples"]
+
+
+def test_each_broken_limit_is_named_once_with_its_worst_figure_and_its_plants(figures, loop):
+    states = [replace(figures, ms=1.7), replace(figures, ms=2.0, noise_gain=26.0), replace(figures, ms=1.9)]
+    names = ("design plant sliding", "design plant stuck", "swing")
+    measured = [MeasuredLoop(name=name, figures=one) for name, one in zip(names, states, strict=True)]
+    texts = explain_broken(PLAIN, judge_all(PLAIN, measured, 2), measured[0], loop)
+    assert [text.split()[0] for text in texts] == ["max_sensitivity", "max_noise_gain"]
+    assert "2 of 1.6" in texts[0] and "design plant stuck and 2 more" in texts[0]
+    assert "26 of 25" in texts[1] and "(design plant stuck)" in texts[1]
+
+
+def test_a_message_has_room_for_the_worst_limits_and_counts_the_rest():
+    blocked = [f"max_something_{number} {number}.123 of 1.6 (design plant sliding)" for number in range(8)]
+    text = shorten_blocked(blocked)
+    assert text.startswith(blocked[0]) and blocked[3] not in text and "more limits" in text
+    assert len(text) < 180
+    assert shorten_blocked(blocked[:1]) == blocked[0]

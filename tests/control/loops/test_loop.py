@@ -183,3 +183,21 @@ def test_zeros_in_brackets_are_found_to_rounding():
     low, high, every = roots - 0.7, roots + 1.9, np.arange(4)
     found = find_zeros(curve, low, high, curve(low, every), curve(high, every), 1e-15)
     np.testing.assert_allclose(found, roots, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(("gains", "returns"), [
+    ({"k_p": 0.9, "k_i": 14.0, "k_d": 0.013, "k_r": 1.75, "c": 0.8}, False),
+    ({"k_p": 1.95, "k_i": 4.45, "k_d": 0.032, "k_r": 2.07, "c": 0.4}, True),  # lingers from the start
+    ({"k_p": 0.86, "k_i": 20.0, "k_d": 0.079, "k_r": 1.66, "c": 0.65}, True),  # comes back
+])  # fmt: skip
+def test_a_shoulder_is_where_a_dense_grid_has_it(gains, returns):
+    """From 1.03 to 3 times the bandwidth abs(F/F_ref) is to fall below -3 dB by the quarter power of frequency."""
+    loop = loop_of(**gains)
+    found = loop.figures()
+    f = np.linspace(1.03 * found.bandwidth_hz, 3.0 * found.bandwidth_hz, 200_001)
+    _, tracking, *_ = independent(loop, f)
+    static = abs(independent(loop, np.array([1e-7]))[1][0])
+    above = np.abs(tracking) * (f / found.bandwidth_hz) ** 0.25 > np.sqrt(0.5) * static
+    assert bool(np.any(above)) == (found.return_hz is not None) == returns
+    if returns:
+        assert found.return_hz == pytest.approx(f[np.argmax(above)], rel=1e-4)
