@@ -146,6 +146,11 @@ def _load(
             times.append(time - bag.start)
             if take is not None:
                 rows.append(take(data))
+    if span == (None, None) and len(times) != topic.count:
+        raise LogError(
+            f"{path}: {topic.name} counts {topic.count} messages and holds {len(times)}, the file is damaged; "
+            "copy or record it again"
+        )
     out = {name: np.array([row.get(name, np.nan) for row in rows], dtype=float) for name in paths.values()}
     for name in paths.values():
         if _find_unit(name) == "s":
@@ -199,9 +204,13 @@ def _open_db3_file(path: Path) -> Generator[Bag]:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     _check_pages(path)
-    reader = Sqlite3Reader(path.absolute())
+    reader: Any = Sqlite3Reader(path.absolute())
     reader.open()
     try:
+        # A page that is damaged leaves rows out, or in another order than their index has.
+        ((verdict,),) = reader.dbconn.cursor().execute("PRAGMA integrity_check(1)")
+        if verdict != "ok":
+            raise LogError(f"{path}: its pages contradict each other, the file is damaged; copy or record it again")
         meta = reader.metadata
         yield _wrap_rosbags(reader, reader.connections, meta.start_time if meta.message_count else 0, "cdr")
     finally:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import struct
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from seaopt.errors import LogError
 from seaopt.logs.formats.source import Field, Source, check_size, import_optional, make_row_loader
 
 UNIT_PROPERTIES = ("unit_string", "NI_UnitDescription")
+LEAD_IN = 28  # bytes before each segment: tag, contents, version, where the next segment and this one's data begin
+BIG_ENDIAN, DAQMX = 1 << 6, 1 << 7  # of the contents
+CUT_OFF = "cannot be read as TDMS (it is cut off within its last segment, or damaged); copy it again, or save it anew"
 
 
 def open_tdms(path: Path) -> Source:
@@ -20,9 +24,11 @@ def open_tdms(path: Path) -> Source:
     nptdms = import_optional("nptdms", "tdms", path, "TDMS")
     fields: list[Field] = []
     places: dict[str, tuple[str, str]] = {}
+    size = _measure_segments(path)
     with path.open("rb") as stream, nptdms.TdmsFile.open(stream) as file:
         if file.file_status.incomplete_final_segment:
-            raise LogError(f"{path}: is cut off within its last segment; copy it again, or save what is left anew")
+            raise LogError(f"{path}: {CUT_OFF}")
+        _check_lengths(path, [channel for group in file.groups() for channel in group.channels()], size)
         for group in file.groups():
             clocks = _name_clocks(group)
             for channel in group.channels():
@@ -40,6 +46,36 @@ def open_tdms(path: Path) -> Source:
     return Source(
         path=path, format="TDMS", fields=tuple(fields), load=make_row_loader(partial(_load, path, places, clock_names))
     )
+
+
+def _measure_segments(path: Path) -> int | None:
+    """Return the bytes of data in all segments, None with DAQmx data; npTDMS drops a last segment that was cut off."""
+    data, place, size, plain = 0, 0, path.stat().st_size, True
+    with path.open("rb") as stream:
+        while place < size:
+            stream.seek(place)
+            lead = stream.read(LEAD_IN)
+            contents = int.from_bytes(lead[4:8], "little")
+            if len(lead) < LEAD_IN or lead[:4] != b"TDSm":
+                raise LogError(f"{path}: {CUT_OFF}")
+            following, begin = struct.unpack(">QQ" if contents & BIG_ENDIAN else "<QQ", lead[12:])
+            data, place = data + following - begin, place + LEAD_IN + following
+            plain = plain and not contents & DAQMX
+    if place != size:
+        raise LogError(f"{path}: {CUT_OFF}")
+    return data if plain else None
+
+
+def _check_lengths(path: Path, channels: Sequence[Any], size: int | None) -> None:
+    """Refuse channels that do not fill the segments: a damaged count would shift the samples of all that follow."""
+    widths = [channel.data_type.size if channel.data_type else 0 for channel in channels]
+    if size is None or None in widths:  # text has no fixed width
+        return
+    stated = sum(width * len(channel) for width, channel in zip(widths, channels, strict=True))
+    if stated != size:
+        raise LogError(
+            f"{path}: its channels take {stated} bytes but its segments hold {size}, the file is damaged; copy it again"
+        )
 
 
 def _name_clocks(group: Any) -> dict[str, str]:
