@@ -86,6 +86,7 @@ jaxtyping.install_import_hook("seaopt", "seaopt_type_checker.check")
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402
+from seaopt.simulation.native import find_compiler  # noqa: E402
 from tests import simulated_logs  # noqa: E402
 
 settings.register_profile("seaopt", deadline=None, max_examples=25, derandomize=True)
@@ -93,6 +94,15 @@ settings.load_profile("seaopt")
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 NO_DATA = f"measured logs are not at {DATA}"
+
+
+@pytest.fixture(scope="session")
+def compiler() -> list[str]:
+    """Return the command of a C compiler, or skip."""
+    found = find_compiler()
+    if found is None:
+        pytest.skip("no C compiler on this machine")
+    return found
 
 
 @pytest.fixture(scope="session")

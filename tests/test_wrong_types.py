@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import seaopt as so
+from seaopt.control import PlausibilityGate
 from seaopt.errors import SeaoptError
 from seaopt.plants.plant import fill_vector
 
@@ -16,6 +17,8 @@ ROOT = Path(__file__).parents[1]
 T = np.arange(20) / 100
 LOG = so.Log.from_arrays(time=T, I=np.sin(T), F1=np.cos(T))
 PLANT, THOR = so.plants.high_impedance(), so.plants.thor()
+
+GATE = {"range_N": (-1.0, 1.0), "max_step_N": 1.0, "max_held": 1, "ramp_A_per_s": 1.0}
 
 
 def experiment(**changes):
@@ -56,6 +59,17 @@ CASES = {
     "set": lambda: so.ParameterSet(["x"]),
     "complex parameter": lambda: so.Parameter(name="a", value=1j, unit="m"),
     "bound": lambda: so.Parameter(name="a", value=1.0, unit="m", min="x"),
+    **{
+        f"gate {name} = {value!r}": lambda name=name, value=value: PlausibilityGate(**{**GATE, name: value})
+        for name, values in {
+            "range_N": (5.0, None, "ab", (1.0,), ("a", "b"), (0.0, True)),
+            "max_step_N": ("1", None, True),
+            "ramp_A_per_s": ("1", None, 1j),
+            "max_held": (2.5, 2.0, float("nan"), float("inf"), "2", None, True),
+        }.items()
+        for value in values
+    },
+    "gate of no controller": lambda: PlausibilityGate.of_controller(None, range_N=(-1.0, 1.0)),
     "parameters": lambda: PLANT.linearize(None),
     "state": lambda: fill_vector("state", {"q": "m"}, {"q": "x"}),
     "simulated plant": lambda: so.simulate(None, THOR, LOG),

@@ -2,9 +2,11 @@ r"""A gate in front of a running law: readings that cannot be true are bridged, 
 
 A reading is plausible if it is a number within its range and no further from the last plausible one than the plant
 moves in the time since: with h readings refused in between, `max_step_N` (h + 1), so that a force that really has
-moved is believed again as soon as it can have got there. Up to `max_held` readings in a row that are not plausible are
-replaced by the last that was. One more is a fault: from then on the law stands still, the command goes to zero at
-`ramp_A_per_s`, and stays there until the law is reset, for a sensor that comes back is not one to trust.
+moved is believed again as soon as it can have got there. The first reading is judged by its jump from the measurement
+that the law was reset with; where none was given, as in predictive control, it is judged by its range alone. Up to
+`max_held` readings in a row that are not plausible are replaced by the last that was. One more is a fault: from then on
+the law stands still, the command goes to zero at `ramp_A_per_s`, and stays there until the law is reset, for a sensor
+that comes back is not one to trust.
 
 The most that a sampled plant can move between two samples while the effort stays within :math:`\pm F` is
 
@@ -17,21 +19,26 @@ takes a factor for that.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_number, require_type
 from seaopt.records import record
 
 SETTLED = 1e-12  # of the largest term: a response below it is over
 MOST_TERMS = 200_000
+LARGEST, MOST_HELD = 1e30, 1_000_000  # what float and unsigned long of every target hold
 
 
 @record
 class GateState:
-    """The last plausible reading (NaN: none yet), how many in a row were not, and whether that became a fault."""
+    """The last plausible reading (NaN: none yet), how many in a row were not, and whether that became a fault.
+
+    A measurement that is known before the first reading is one that the first must be near.
+    """
 
     measurement: float = math.nan
     held: int = 0
@@ -83,22 +90,35 @@ class PlausibilityGate:
     ramp_A_per_s: float
 
     def __post_init__(self) -> None:
-        low, high = self.range_N
-        if not -math.inf < low < high < math.inf:
-            raise ControlError(f"range_N = ({low:g}, {high:g}) is not a range; give finite low < high")
+        _check_range(self.range_N)
         for name in ("max_step_N", "ramp_A_per_s"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ControlError(f"{name} = {value:g} is not positive and finite; give a positive number")
-        if isinstance(self.max_held, bool) or self.max_held != int(self.max_held) or self.max_held < 0:
-            raise ControlError(f"max_held = {self.max_held!r} is not a number of samples; give 0, 1, ...")
+            _check_positive(getattr(self, name), name)
+        held: Any = self.max_held
+        if isinstance(held, bool) or not isinstance(held, int | np.integer) or not 0 <= held <= MOST_HELD:
+            raise ControlError(f"max_held = {held!r} is not a number of samples; give 0, 1, ... up to {MOST_HELD}")
+
+    def start(self, measurement: float) -> GateState:
+        """Return the state in which the first reading must be near a measurement at rest.
+
+        Raises
+        ------
+        ControlError
+            It is not within the range itself.
+
+        """
+        low, high = self.range_N
+        if not low <= measurement <= high:
+            raise ControlError(
+                f"measurement = {measurement:g} is not within range_N = ({low:g}, {high:g}); give the force at rest"
+            )
+        return GateState(measurement=measurement)
 
     def screen(self, state: GateState, measurement: float) -> tuple[float, GateState]:
         """Return the reading to use, and the next state; NaN where there was none yet."""
         if state.fault:
             return state.measurement, state
         low, high = self.range_N
-        known = not math.isnan(state.measurement)
+        known = math.isfinite(state.measurement)
         moved = abs(measurement - state.measurement) if known else 0.0
         if low <= measurement <= high and moved <= self.max_step_N * (state.held + 1):
             return measurement, GateState(measurement=measurement)
@@ -146,12 +166,30 @@ class PlausibilityGate:
 
 
         """
+        require_type(controller, Controller, "controller", "give a Controller", ControlError)
+        for name, value in (("ramp_s", ramp_s), ("margin", margin)):
+            _check_positive(value, name)
         limit = controller.spec.current_limit_A
         if limit is None or controller.design is None:
             raise ControlError("the controller has no current limit or no design plant; give max_step_N yourself")
         plant = controller.close(*controller.design).plant
         step = largest_step(plant, limit / controller.command.per_effort)
         return cls(range_N=range_N, max_step_N=margin * step, max_held=max_held, ramp_A_per_s=limit / ramp_s)
+
+
+def _check_range(range_N: Any) -> None:
+    """Refuse what is not two finite numbers, the lower one first."""
+    if not isinstance(range_N, tuple | list) or len(range_N) != 2:
+        raise ControlError(f"range_N = {range_N!r} is not a range; give (low, high)")
+    low, high = (require_number(end, "range_N", ControlError) for end in range_N)
+    if not -LARGEST < low < high < LARGEST:
+        raise ControlError(f"range_N = ({low:g}, {high:g}) is not a range; give finite low < high")
+
+
+def _check_positive(value: Any, name: str) -> None:
+    """Refuse what is not a positive number that a target's `float` holds too."""
+    if not 1.0 / LARGEST < require_number(value, name, ControlError) < LARGEST:
+        raise ControlError(f"{name} = {value:g} is not positive and finite; give a positive number")
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:

@@ -131,17 +131,22 @@ class RunnableLaw:
         out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
         return out[0], out[1]
 
-    def reset(self, reference: float = 0.0, measurement: float = 0.0, current_A: float = 0.0) -> LawState:
+    def reset(self, reference: float = 0.0, measurement: float | None = None, current_A: float = 0.0) -> LawState:
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
 
-        A law without an integrator cannot be set: its next command follows from the inputs alone.
+        A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that
+        is left out is zero, and a gate judges the first reading by its range; one that is given, by its jump from it.
 
         Raises
         ------
         ControlError
-            An input is not finite, or the current is above the limit.
+            An input is not finite, the measurement is outside the gate's range, or the current is above the limit.
 
         """
+        seen = GateState()
+        if self.gate is not None and measurement is not None:
+            seen = self.gate.start(measurement)
+        measurement = 0.0 if measurement is None else measurement
         if not (math.isfinite(reference) and math.isfinite(measurement)):
             raise ControlError(f"reference = {reference:g}, measurement = {measurement:g}: give finite numbers")
         if not abs(current_A) <= self.current_limit_A:
@@ -151,7 +156,7 @@ class RunnableLaw:
         if self.integrators:
             force = float(self.c @ x) + self.d_reference * reference - self.d_measurement * measurement
             x[0] = current_A / self.per_effort - force
-        return LawState(x=x, current_A=current_A)
+        return LawState(x=x, current_A=current_A, gate=seen)
 
     def step(self, state: LawState, reference: float, measurement: float) -> tuple[float, LawState]:
         """Return the current (A) to command at this sample, and the next state.

@@ -129,7 +129,8 @@ class ForceMPC:
     shift : array, shape (n, n)
         Shifts the plan at the knots by one sample.
     gate : PlausibilityGate, optional
-        Which measurements are believed; the others are predicted, and at a fault the current goes to zero.
+        Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
+        current goes to zero.
 
     """
 

@@ -22,11 +22,10 @@ from seaopt.control.laws.stored import read_controller
 from seaopt.control.laws.structures import DisturbanceObserver, Nominal, Notch
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
-from seaopt.simulation.native import find_compiler
+from tests.c_code import STRICT, CompiledLaw
 from tests.control.loops.test_law import RATES, gains_at
 from tests.laws import law_of, scaled
 
-STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
 TS = 1e-3
 
 
@@ -34,14 +33,6 @@ TS = 1e-3
 def tuned():
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
     return so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
-
-
-@pytest.fixture(scope="module")
-def compiler():
-    found = find_compiler()
-    if found is None:
-        pytest.skip("no C compiler on this machine")
-    return found
 
 
 def with_law(controller, law):
@@ -63,45 +54,6 @@ def gain_only(controller):
     return with_law(controller, law_of([40.0]))
 
 
-class Compiled:
-    """An exported law through ctypes."""
-
-    def __init__(self, compiler, folder, controller, precision, **options):
-        export(controller, folder, precision=precision, name="law", **options)
-        library = folder / "law.so"
-        command = [*compiler, *STRICT, "-O2", "-shared", "-fPIC", str(folder / "law.c"), "-o", str(library)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        real = ctypes.c_double if precision == "double" else ctypes.c_float
-        order = int(re.search(r"_ORDER (\d+)", (folder / "law.h").read_text())[1])
-
-        class Law(ctypes.Structure):
-            _fields_ = (
-                ("x", real * max(order, 1)),
-                ("current_A", real),
-                ("held", ctypes.c_ulong),
-                ("status", ctypes.c_int),
-                ("refused", ctypes.c_ulong),
-                ("measurement_N", real),
-                ("known", ctypes.c_int),
-            )  # fmt: skip; the last three are there with a gate
-
-        self.law, self.library = Law(), ctypes.CDLL(str(library))
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, real]
-        self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, real, real]
-        self.library.law_init(ctypes.byref(self.law))
-
-    def step(self, reference, measurement):
-        return self.library.law_step(ctypes.byref(self.law), float(reference), float(measurement))
-
-    def reset(self, *values):
-        self.library.law_reset(ctypes.byref(self.law), *values)
-
-    def run(self, references, measurements):
-        return np.array([self.step(*pair) for pair in zip(references, measurements, strict=True)])
-
-
 @pytest.fixture(scope="module")
 def signals():
     """Slow and fast parts, so large that the current is at its limit about half of the time."""
@@ -120,7 +72,7 @@ def test_compiled_c_is_the_python_law(which, precision, compiler, tuned, signals
     controller = LAWS[which](tuned)
     expected, _ = runnable(controller).run(*signals)
     assert 0.05 < np.mean(np.abs(expected) == 9.0) < 0.95
-    found = Compiled(compiler, tmp_path, controller, precision).run(*signals)
+    found = CompiledLaw(compiler, tmp_path, controller, precision).run(*signals)
     tolerance = 9.0 * (1e-12 if precision == "double" else 1e-5)
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
     assert np.abs(found).max() <= 9.0
@@ -132,7 +84,7 @@ def test_the_loop_of_compiled_c_rests_at_its_reference(rate_hz, compiler, tuned,
     gains, plant = gains_at(rate_hz, thor, stand)
     law = gains.law("pid_dob", 1 / rate_hz).balanced()
     controller = with_law(replace(tuned, sample_time_s=1 / rate_hz), law)
-    compiled = Compiled(compiler, tmp_path, controller, "double")
+    compiled = CompiledLaw(compiler, tmp_path, controller, "double")
     model = stand.linearize(thor)
     a, b, c, _, _ = cont2discrete((model.A, model.B[:, :1], model.C[:1], np.zeros((1, 1))), 1 / rate_hz, "zoh")
     x, waiting = np.zeros(2), 0.0
@@ -198,13 +150,13 @@ def test_the_compiled_loop_is_the_simulated_one(precision, compiler, tuned, tmp_
         return current
 
     expected = closed(python)
-    found = closed(Compiled(compiler, tmp_path, tuned, precision).step)
+    found = closed(CompiledLaw(compiler, tmp_path, tuned, precision).step)
     np.testing.assert_allclose(found, expected, atol=target * (1e-11 if precision == "double" else 1e-5))
     assert found[-1] == pytest.approx(target, rel=1e-5)
 
 
 def test_reset_continues_from_a_current_in_c(compiler, tuned, tmp_path):
-    compiled = Compiled(compiler, tmp_path, tuned, "double")
+    compiled = CompiledLaw(compiler, tmp_path, tuned, "double")
     compiled.reset(700.0, 700.0, 2.5)
     assert compiled.step(700.0, 700.0) == pytest.approx(2.5, rel=1e-12)
     compiled.reset(np.nan, np.inf, 100.0)
@@ -219,7 +171,7 @@ def test_readings_that_are_not_finite_hold_the_command_in_c(compiler, tuned, sig
     bad[400:404] = [np.nan, np.inf, -np.inf, 1e308]
     law = runnable(tuned)
     expected, state = law.run(r[:404], bad[:404])
-    compiled = Compiled(compiler, tmp_path, tuned, "double")
+    compiled = CompiledLaw(compiler, tmp_path, tuned, "double")
     found = compiled.run(r[:404], bad[:404])
     np.testing.assert_allclose(found, expected, atol=1e-11)
     assert (found[400:] == found[399]).all()
@@ -446,7 +398,7 @@ def test_a_pid_whose_integral_is_slow_is_coarse_in_float(compiler, tuned, tmp_pa
     for precision in ("double", "float"):
         folder = tmp_path / precision
         folder.mkdir()
-        compiled = Compiled(compiler, folder, with_law(tuned, slow), precision, current_limit_A=90.0)
+        compiled = CompiledLaw(compiler, folder, with_law(tuned, slow), precision, current_limit_A=90.0)
         compiled.reset(1000.0, 1000.0, 2000.0 * tuned.command.per_effort)
         before = compiled.law.x[0]
         for _ in range(1000):

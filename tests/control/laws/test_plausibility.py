@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +9,17 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import GateState, MPCSpec, PlausibilityGate, export_mpc, force_mpc, runnable
+from seaopt.control import GateState, MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.plausibility import largest_step
 from seaopt.control.running.sampled_loop import SampledLoop
 from seaopt.errors import ControlError, SimulationError
-from seaopt.simulation.native import find_compiler
-from tests.control.deploy.test_export import Compiled
+from tests.c_code import CompiledLaw, CompiledMPC
 
 TS, BEGIN = 1e-3, 300
 GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=50, ramp_A_per_s=90.0)
 STATUS = ("ok", "held", "fault")
 REFERENCE = np.repeat([500.0, 600.0], [450, 300])
+FIRST = [np.nan, 1e4, -np.inf, 3000.0, 10.0, 20.0]  # no number, out of range twice, in range and wrong, true
 
 FAULTS = {  # readings from sample 300 on; None: as it is
     "nan": {BEGIN: np.nan},
@@ -71,14 +70,6 @@ def tuned(stand, thor):
 
 
 @pytest.fixture(scope="module")
-def compiler():
-    found = find_compiler()
-    if found is None:
-        pytest.skip("no C compiler on this machine")
-    return found
-
-
-@pytest.fixture(scope="module")
 def mpc(stand, thor):
     return force_mpc(stand, thor, MPCSpec(current_limit_A=9.0), gate=GATE)
 
@@ -122,7 +113,7 @@ def test_without_a_gate_a_spike_is_taken_for_true(tuned, thor, stand):
 
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_the_c_code_of_a_pid_does_what_python_does(precision, compiler, tuned, thor, stand, tmp_path):
-    compiled = Compiled(compiler, tmp_path, tuned, precision, gate=GATE)
+    compiled = CompiledLaw(compiler, tmp_path, tuned, precision, gate=GATE)
     for name, faults in FAULTS.items():
         found = run(*of_law(runnable(tuned, gate=GATE)), thor, stand, faults)
         compiled.reset(0.0, 0.0, 0.0)
@@ -137,17 +128,10 @@ def test_the_c_code_of_a_pid_does_what_python_does(precision, compiler, tuned, t
 
 
 def test_the_c_code_of_predictive_control_does_what_python_does(mpc, compiler, thor, stand, tmp_path):
-    folder = export_mpc(mpc, tmp_path)
-    sources = sorted(str(path.relative_to(folder)) for path in [*folder.glob("*.c"), *folder.glob("src/*.c")])
-    flags = ["-std=c99", "-Iinc/public", "-Iinc/private", "-I.", "-O1"]
-    strict = [*flags, "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", "force_mpc.c", "example.c"]
-    subprocess.run([*compiler, *strict], cwd=folder, check=True)
-    subprocess.run([*compiler, *flags, *sources, "-lm", "-o", "example"], cwd=folder, check=True)
-    for name, faults in FAULTS.items():
+    compiled = CompiledMPC(compiler, tmp_path, mpc)
+    for name, faults in {**FAULTS, "first readings": dict(enumerate(FIRST))}.items():
         _, currents, statuses, readings = run(*of_mpc(mpc), thor, stand, faults)
-        lines = "\n".join(f"{r!r} {y!r}" for r, y in zip(REFERENCE.tolist(), map(float, readings), strict=True))
-        said = subprocess.run([str(folder / "example")], input=lines, capture_output=True, text=True, check=True).stdout
-        rows = np.array([line.split() for line in said.splitlines()], dtype=float)
+        rows = compiled.run(REFERENCE, readings)
         assert rows[:, 0] == pytest.approx(currents, abs=1e-7), name
         assert [STATUS[int(value)] for value in rows[:, 4]] == statuses, name
 
@@ -188,13 +172,73 @@ def test_the_largest_step_is_reached_by_its_own_input_and_by_no_other(tuned, tho
     assert abs(last[1] - last[0]) == pytest.approx(claimed, rel=1e-4)
 
 
+def test_a_first_reading_that_cannot_be_true_is_refused():
+    state, used, statuses = GateState(), [], []
+    for reading in FIRST:
+        value, state = GATE.screen(state, reading)
+        used.append(value)
+        statuses.append(state.status)
+    assert np.all(np.isnan(used[:3])) and used[3:5] == [3000.0, 3000.0]  # by its range alone
+    assert statuses == ["held", "held", "held", "ok", "held", "held"]
+    strict, state = replace(GATE, max_held=2), GateState()
+    for reading in FIRST[:3]:
+        state = strict.screen(state, reading)[1]
+    assert state.fault and strict.screen(state, 10.0)[1].fault
+
+
+def test_a_reset_with_a_measurement_judges_the_first_reading_by_it(tuned):
+    law = runnable(tuned, gate=GATE)
+    state, statuses, currents = law.reset(reference=10.0, measurement=10.0), [], []
+    for reading in FIRST:
+        current, state = law.step(state, 10.0, reading)
+        currents.append(current)
+        statuses.append(state.status)
+    assert statuses == ["held", "held", "held", "held", "ok", "ok"]
+    assert np.max(np.abs(currents[:5])) < 0.01  # 10 N bridged: not held either, for there was a reading to use
+    with pytest.raises(ControlError, match=r"measurement = 5000 .*range_N"):
+        law.reset(measurement=5000.0)
+    with pytest.raises(ControlError, match="measurement = nan"):
+        law.reset(measurement=np.nan)
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+@pytest.mark.parametrize("given", [False, True])
+def test_the_c_code_starts_as_python_does(precision, given, compiler, tuned, tmp_path):
+    compiled, law = CompiledLaw(compiler, tmp_path, tuned, precision, gate=GATE), runnable(tuned, gate=GATE)
+    state = law.reset(reference=10.0, measurement=10.0) if given else law.reset()
+    if given:
+        compiled.reset(10.0, 10.0, 0.0)
+    found, expected = [], []
+    for reading in [*FIRST, 15.0, 12.0]:
+        current, state = law.step(state, 10.0, reading)
+        expected.append((state.status, pytest.approx(current, abs=1e-4 if precision == "float" else 1e-11)))
+        made = compiled.step(10.0, reading)
+        found.append((STATUS[compiled.law.status], made))
+    assert found == expected
+    compiled.reset(0.0, 1e4, 0.0)  # out of range, which C cannot refuse: as if nothing were known
+    assert compiled.law.known == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("range_N", [(1.0, -1.0), (1.0, 1.0), (np.nan, 1.0), (-np.inf, 1.0), (0.0, np.inf), (0.0, 1e300)]),
+        ("max_step_N", [0.0, -1.0, np.inf, np.nan, 1e300, 1e-300]),
+        ("ramp_A_per_s", [0.0, -1.0, np.inf, np.nan]),
+        ("max_held", [-1, 10**9]),
+    ],
+)  # fmt: skip
+def test_what_no_gate_can_have_is_refused(name, values):
+    for value in values:
+        with pytest.raises(ControlError, match=f"{name} = .*; give ") as caught:
+            replace(GATE, **{name: value})
+        assert "\n" not in str(caught.value)
+
+
 def test_what_cannot_be_is_refused(tuned, thor, stand):
-    for change in (
-        {"range_N": (1.0, -1.0)}, {"max_step_N": 0.0}, {"max_step_N": np.inf}, {"max_held": -1}, {"max_held": 2.5},
-        {"ramp_A_per_s": np.nan},
-    ):  # fmt: skip
-        with pytest.raises(ControlError, match=next(iter(change))):
-            replace(GATE, **change)
+    for change in ({"ramp_s": 0.0}, {"ramp_s": np.nan}, {"margin": -1.0}, {"max_held": -1}):
+        with pytest.raises(ControlError, match=f"{next(iter(change))} = "):
+            PlausibilityGate.of_controller(tuned, **{"range_N": (-1e3, 1e3), **change})
     bare = replace(tuned, spec=replace(tuned.spec, current_limit_A=None))
     with pytest.raises(ControlError, match="no current limit"):
         PlausibilityGate.of_controller(bare, range_N=(-1e3, 1e3))

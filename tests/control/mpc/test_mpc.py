@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,9 +12,9 @@ from scipy.signal import lfilter
 
 import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, sample
-from seaopt.control.mpc.export import export_mpc
 from seaopt.control.mpc.prediction import interpolate_knots, spread_knots
 from seaopt.errors import ControlError
+from tests.c_code import CompiledMPC
 
 TS = 1e-3
 
@@ -220,31 +218,17 @@ def test_a_reference_that_is_no_number_is_refused(mpc):
         mpc.step(mpc.start, np.nan, 0.0)
 
 
-COMPILER = shutil.which("gcc") or shutil.which("cc")
-
-
-@pytest.mark.skipif(COMPILER is None, reason="no C compiler")
-def test_the_c_code_does_the_same(stand, thor, mpc, tmp_path):
-    """Over 600 samples that saturate, one of them without a measurement; its own file without a warning."""
-    pairs = []
+def test_the_c_code_does_the_same(compiler, stand, thor, mpc, tmp_path):
+    """Over 600 samples that saturate, one of them without a measurement."""
+    measurements = []
 
     def watched(state, reference, measurement):
-        measured = np.nan if len(pairs) == 300 else measurement
-        pairs.append(f"{reference!r} {measured!r}")
-        return mpc.command(state, reference, measured)
+        measurements.append(np.nan if len(measurements) == 300 else measurement)
+        return mpc.command(state, reference, measurements[-1])
 
     reference = np.repeat([0.0, 2000.0, -2000.0, 500.0], 150)
     run = close_loop(watched, mpc.start, stand, thor, reference, sensor_std=2.0)
-    folder = export_mpc(mpc, tmp_path / "code")
-    paths = ["-std=c99", "-Iinc/public", "-Iinc/private", "-I."]
-    strict = [COMPILER, *paths, "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", "force_mpc.c", "example.c"]
-    subprocess.run(strict, cwd=folder, check=True)
-    sources = sorted(str(path.relative_to(folder)) for path in [*folder.glob("*.c"), *folder.glob("src/*.c")])
-    subprocess.run([COMPILER, *paths, "-O1", *sources, "-lm", "-o", "example"], cwd=folder, check=True)
-    said = subprocess.run(
-        [str(folder / "example")], input="\n".join(pairs), capture_output=True, text=True, check=True
-    ).stdout
-    rows = np.array([line.split() for line in said.splitlines()], dtype=float)
+    rows = CompiledMPC(compiler, tmp_path / "code", mpc).run(reference, measurements)
     assert np.max(np.abs(run.current)) == 9.0
     assert rows[:, 0] == pytest.approx(run.current, abs=1e-8)
     assert np.all(rows[:, 1] == 1)

@@ -27,7 +27,7 @@ typedef struct {
  * reported with a plausibility gate alone (FORCE_MPC_GATE). */
 enum { FORCE_MPC_OK, FORCE_MPC_HELD, FORCE_MPC_FAULT };
 
-/* At rest at zero. */
+/* At rest at zero; with a plausibility gate the first measurement is believed if it is in range. */
 void force_mpc_reset(force_mpc *s);
 
 /* The current (A) to command for a reference and a measured force (N); it is within limits whatever the input.
