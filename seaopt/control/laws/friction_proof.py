@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.loops.absolute_stability import FrictionLoop, FrictionMargin, friction_margin
+from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.loop import STABLE, Loop
-from seaopt.control.loops.sampled_plant import DELAY, find_rest, linearise, read_conditions, sample
+from seaopt.control.loops.sampled_plant import DELAY, find_rest, linearise, read_conditions, sample_linear
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states, has_friction
+from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states
 
 
 def prove_friction(
@@ -44,10 +47,20 @@ def prove_friction(
     True
 
     """
-    loop = take_friction_out(controller, plant, params)
-    if loop is None:
-        return None
-    closed = Loop(plant=loop.plant, law=controller.law)
+    return prove_friction_sets(controller, plant, [params], first, least)[0]
+
+
+def prove_friction_sets(
+    controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
+) -> list[FrictionMargin | None]:
+    """Return `prove_friction` of a plant at several sets of parameters, all with the same conditions among them."""
+    return [
+        None if loop is None else _prove_loop(loop, first, least) for loop in take_friction_out(controller, plant, sets)
+    ]
+
+
+def _prove_loop(loop: FrictionLoop, first: str, least: float) -> FrictionMargin:
+    closed = Loop(plant=loop.plant, law=loop.law)
     if np.max(np.abs(closed.eigenvalues())) >= STABLE:
         return lack_proof(loop.slopes.size, "unstable without friction")
     if np.any(loop.through * loop.slopes):
@@ -60,22 +73,33 @@ def lack_proof(frictions: int, reason: str) -> FrictionMargin:
     return FrictionMargin(factor=0.0, slopes=(0.0,) * frictions, frequency_hz=0.0, multiplier=f"none: {reason}")
 
 
-def take_friction_out(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionLoop | None:
-    """Return the sliding loop with what friction has above its flattest slope taken out; None without friction."""
-    values = plant.complete(params)
-    if not has_friction(plant, values):
-        return None
+def take_friction_out(
+    controller: Controller, plant: Plant, sets: Sequence[ParameterSet]
+) -> list[FrictionLoop | None]:  # fmt: skip
+    """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
+
+    It is None where there is no friction. All sets have the same conditions among them.
+    """
+    values = [plant.complete(params) for params in sets]
+    spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
+    if not np.any(spans):
+        return [None] * len(sets)
     sliding = friction_states(plant)[SLIDING]
-    flattest, steepest = friction_slopes(plant, values)
-    measured, gain = controller.spec.measured, controller.command.per_effort
-    conditions = read_conditions(plant, values)
-    at = {name: np.array([value]) for name, value in conditions.items()}
-    a, motor, output, _ = (block[0] for block in linearise(sliding, values.vector[:, None], at, measured, gain))
-    x, u = find_rest(plant, values)
-    on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, values.vector))
-    return FrictionLoop(
-        a=a, motor=motor, friction=on_states, velocity=velocity, measured=output,
-        through=on_outputs[list(plant.outputs).index(measured)], slopes=steepest - flattest,
-        plant=sample(sliding, values, measured, gain, controller.sample_time_s, controller.delay_samples),
-        law=controller.law, delay_s=conditions.get(DELAY, 0.0),
-    )  # fmt: skip
+    measured, period = controller.spec.measured, controller.sample_time_s
+    places = [read_conditions(plant, each) for each in values]
+    at = {name: np.array([place[name] for place in places]) for name in places[0]}
+    vectors = np.column_stack([each.vector for each in values])
+    linear = linearise(sliding, vectors, at, measured, controller.command.per_effort)
+    delays = at.get(DELAY, np.zeros(len(sets)))
+    sampled = sample_linear(linear, delays, period, controller.delay_samples)
+    loops: list[FrictionLoop | None] = []
+    for k, (each, span) in enumerate(zip(values, spans, strict=True)):
+        on_states, on_outputs, velocity = (
+            np.array(block) for block in friction_matrices(plant)(*find_rest(plant, each), each.vector)
+        )
+        loops.append(None if not np.any(span) else FrictionLoop(
+            a=linear[0][k], motor=linear[1][k], measured=linear[2][k], friction=on_states, velocity=velocity,
+            through=on_outputs[list(plant.outputs).index(measured)], slopes=span, plant=sampled[k],
+            law=controller.law, delay_s=float(delays[k]),
+        ))  # fmt: skip
+    return loops

@@ -25,7 +25,7 @@ from scipy.optimize import brentq
 
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_proof import take_friction_out
-from seaopt.control.loops.absolute_stability import FrictionLoop
+from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes
@@ -98,10 +98,10 @@ def predict_limit_cycles(controller: Controller, plant: Plant, params: Parameter
         The plant with its friction. Where several of its frictions change with velocity nothing is predicted.
 
     """
-    loop = take_friction_out(controller, plant, params)
-    if loop is None or np.count_nonzero(loop.slopes) != 1:
+    (loop,) = take_friction_out(controller, plant, [params])
+    if loop is None or loop.only_port is None:
         return ()
-    port = int(np.flatnonzero(loop.slopes)[0])
+    port = loop.only_port
     name = list(plant.friction)[port]
     gains = describe_friction(plant, params, name, AMPLITUDES)
     cycles: list[LimitCycle] = []
@@ -156,14 +156,10 @@ def _respond(
     loop: FrictionLoop, port: int, f: Float[np.ndarray, " m"]
 ) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"], Complex[np.ndarray, "m n"]]:
     """Return velocity, measured output and states of a friction effort of 1 N at frequencies (Hz), the fundamentals."""
-    period, s = loop.plant.sample_time_s, 2j * np.pi * f
-    causes = np.column_stack([loop.friction[:, port], loop.motor]).astype(complex)
-    inner = s[:, None, None] * np.eye(loop.motor.size) - loop.a
-    by_friction, by_motor = np.moveaxis(np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape))), 2, 0)
-    law = loop.law.measurement_response(f)
-    closed = law / (1.0 + loop.plant.response(f) * law) * np.exp(-s * period * loop.plant.delay_samples)
-    hold = -np.expm1(-s * period) / s * np.exp(-s * loop.delay_s)
+    theta = 2 * np.pi * f * loop.plant.sample_time_s
+    opened = loop.respond(theta, FUNDAMENTAL, np.eye(loop.motor.size))
+    by_friction, by_motor = opened.by_friction[:, 0, :, port], opened.by_motor[:, 0]
     sensed = by_friction @ loop.measured + loop.through[port]
-    effort = -hold * closed * sensed / period
+    effort = -loop.feedback(theta) * sensed
     x = by_friction + by_motor * effort[:, None]
     return x @ loop.velocity[port], sensed + (by_motor @ loop.measured) * effort, x

@@ -37,11 +37,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from scipy.special import polygamma
 
-from seaopt.control.loops.law import Law
-from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.records import record
 
 ALIASES = 30  # on either side; what is beyond is bounded
@@ -58,44 +57,9 @@ WORTHWHILE = 0.9  # of the inverse: a multiplier that gains less is not looked a
 
 Angles = Float[np.ndarray, " m"]
 Multiplier = Callable[[Complex[np.ndarray, "*n"]], Complex[np.ndarray, "*n"]]
-Test = Callable[[float], Angles]
-
-
-@record(eq=False)
-class FrictionLoop:
-    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = c x.
-
-    Parameters
-    ----------
-    a, motor : arrays, shapes (n, n) and (n,)
-        The continuous plant without friction, and the effect of the motor effort u.
-    friction : array, shape (n, p)
-        The effect of each friction effort in the direction of its velocity.
-    velocity, measured : arrays, shapes (p, n) and (n,)
-        The velocities that friction acts on, and the fed-back output.
-    through : array, shape (p,)
-        The effect of each friction effort on the output itself.
-    slopes : array, shape (p,)
-        The steepest slope of each friction curve, N s/m (N m s/rad).
-    plant : DigitalPlant
-        The same plant, sampled, from u to y, with its delay.
-    law : Law
-        Its C_y closes the loop.
-    delay_s : float
-        Of the motor effort, besides the whole samples of `plant`.
-
-    """
-
-    a: Float[np.ndarray, "n n"]
-    motor: Float[np.ndarray, " n"]
-    friction: Float[np.ndarray, "n p"]
-    velocity: Float[np.ndarray, "p n"]
-    measured: Float[np.ndarray, " n"]
-    through: Float[np.ndarray, " p"]
-    slopes: Float[np.ndarray, " p"]
-    plant: DigitalPlant
-    law: Law
-    delay_s: float = 0.0
+Places = slice | Int[np.ndarray, " a"]
+Test = Callable[[float, Places], Angles]  # of 1/kappa and which angles: positive where M (H + 1/kappa) is definite
+EVERY = slice(None)
 
 
 @record
@@ -154,17 +118,18 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
     bar = 1.0 / least if least else np.inf
     best = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
     for name, multiplier in sorted(_multipliers(loop), key=lambda named: named[0] != first):
-        inverse = _least_inverse(responses, multiplier, WORTHWHILE / best.factor if best.factor else bar)
+        test = _weigh(responses, multiplier)
+        inverse = _least_inverse(test, WORTHWHILE / best.factor if best.factor else bar)
         if inverse is None:
             continue
-        fine, inverse = _settle(loop, responses, multiplier, inverse)
+        theta, test, inverse = _settle(loop, responses.theta, test, multiplier, inverse)
         if np.isinf(inverse) or (best.factor and inverse >= 1.0 / best.factor):
             continue
-        worst = int(np.argmin(_definiteness(fine, multiplier, inverse * (1.0 - 0.01))))
+        worst = int(np.argmin(test(inverse * (1.0 - 0.01), EVERY)))
         factor = np.inf if inverse == 0.0 else 1.0 / inverse
         best = FrictionMargin(
             factor=float(factor), slopes=tuple(float(slope) for slope in factor * loop.slopes),
-            frequency_hz=float(fine.theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
+            frequency_hz=float(theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
         )  # fmt: skip
         if name == first and best.proved:
             break
@@ -172,18 +137,19 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
 
 
 def _settle(
-    loop: FrictionLoop, responses: _Responses, multiplier: Multiplier, inverse: float
-) -> tuple[_Responses, float]:
+    loop: FrictionLoop, theta: Angles, test: Test, multiplier: Multiplier, inverse: float
+) -> tuple[Float[np.ndarray, " new"], Test, float]:
     """Look between the angles, where the test may fail, and give way until it holds; infinite where it never does."""
     for _ in range(REFINEMENTS):
-        responses = _refine(loop, responses, multiplier, inverse)
-        again = _least_inverse(responses, multiplier, LARGEST_INVERSE)
+        theta = _refine(theta, test(inverse, EVERY))
+        test = _weigh(_respond(loop, theta), multiplier)
+        again = _least_inverse(test, LARGEST_INVERSE)
         if again is None:
-            return responses, np.inf
+            return theta, test, np.inf
         if again <= inverse * (1.0 + MARGIN_PRECISION):
-            return responses, max(again, inverse)
+            return theta, test, max(again, inverse)
         inverse = again
-    return responses, inverse
+    return theta, test, inverse
 
 
 @record(eq=False)
@@ -201,66 +167,36 @@ class _Responses:
 
 def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
     """Return G_v, a (without M) and b at angles."""
-    period = loop.plant.sample_time_s
-    z = np.exp(1j * theta)
-    f = theta / (2 * np.pi * period)
-    law = loop.law.measurement_response(f)
-    through = loop.plant.response(f)
-    gain = law / (1.0 + through * law) * z**-loop.plant.delay_samples
-    s = 1j * (theta[:, None] + 2 * np.pi * np.arange(-ALIASES, ALIASES + 1)) / period
-    root = np.sqrt(loop.slopes)  # phi = slope v: with v' = root v and phi' = phi / root the slope is 1
-    causes = np.column_stack([loop.friction * root, loop.motor])
-    seen = np.vstack([root[:, None] * loop.velocity, loop.measured])
-    response = _transfer(loop.a, causes, seen, s)
-    velocity, measured = response[..., :-1, :], response[..., -1, :-1]
-    hold = -np.expm1(-s * period) / s * np.exp(-s * loop.delay_s)
+    period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
+    orders = np.arange(-ALIASES, ALIASES + 1)
+    seen = np.vstack([root[:, None] * loop.velocity, loop.measured])  # phi = slope v: the slope of phi / root is 1
+    response = loop.respond(theta, orders, seen)
+    by_friction = root * response.by_friction
+    gain = loop.feedback(theta)[:, None, None]
     return _Responses(
-        theta=theta, s=s, mobility=velocity[..., :-1], command=-velocity[..., -1] * (hold * gain[:, None])[..., None],
-        sensed=np.conj(measured + loop.through * root) / period,
+        theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :-1, :],
+        command=-gain * response.by_motor[..., :-1],
+        sensed=np.conj(by_friction[..., -1, :] + loop.through * root),
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
         order=ALIASES + theta / (2 * np.pi),
     )  # fmt: skip
 
 
-def _transfer(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n u"], c: Float[np.ndarray, "y n"], s: Complex[np.ndarray, "m k"]
-) -> Complex[np.ndarray, "m k y u"]:
-    """Return c (sI - a)^-1 b, by back substitution in a Schur basis of the balanced matrix, for all s at once."""
-    from scipy.linalg import matrix_balance, schur
-
-    balanced, transform = matrix_balance(a, permute=False)
-    scale = np.diag(transform)
-    triangle, basis = np.array(schur(balanced, output="complex")[:2])
-    right, left = basis.conj().T @ (b / scale[:, None]), (c * scale) @ basis
-    n, flat = len(triangle), s.ravel()
-    x = np.empty((n, right.shape[1], flat.size), dtype=complex)
-    for i in range(n - 1, -1, -1):
-        known = np.tensordot(triangle[i, i + 1 :], x[i + 1 :], axes=1) if i + 1 < n else 0.0
-        x[i] = (right[i][:, None] + known) / (flat - triangle[i, i])
-    out = np.tensordot(left, x, axes=1)
-    return np.moveaxis(out, -1, 0).reshape(*s.shape, *out.shape[:2])
-
-
-def _definiteness(at: _Responses, multiplier: Multiplier, inverse: float) -> Angles:
-    """Return, per angle, what is positive where M (H + inverse) is positive definite."""
-    return _weigh(at, multiplier)(inverse)
-
-
 def _weigh(at: _Responses, multiplier: Multiplier) -> Test:
-    """Return the test of one multiplier: of 1/kappa, the values of `_definiteness`."""
+    """Return the test of one multiplier."""
     weight = multiplier(at.s)
     if at.mobility.shape[-1] == 1:
         return _weigh_one(at, weight)
     right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
 
-    def test(inverse: float) -> Angles:
-        block = weight[..., None, None] * (at.mobility + inverse * np.eye(at.mobility.shape[-1]))
+    def test(inverse: float, angles: Places) -> Angles:
+        block = weight[angles, :, None, None] * (at.mobility[angles] + inverse * np.eye(at.mobility.shape[-1]))
         block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
         negative = np.any(np.linalg.eigvalsh(block) <= 0.0, axis=(-2, -1))
         block = np.where(negative[:, None, None, None], np.eye(block.shape[-1]), block)
-        sums = np.conj(np.swapaxes(right, -1, -2)) @ np.linalg.solve(block, right)
+        sums = np.conj(np.swapaxes(right[angles], -1, -2)) @ np.linalg.solve(block, right[angles])
         alpha, beta, gamma = (sums[..., i, j] for i, j in ((0, 0), (1, 1), (1, 0)))
-        return np.where(negative, -1.0, _compare(at, np.real(alpha), np.real(beta), gamma))
+        return np.where(negative, -1.0, _compare(at, angles, np.real(alpha), np.real(beta), gamma))
 
     return test
 
@@ -269,27 +205,33 @@ def _weigh_one(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> Test:
     """Return the test where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
     mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
     command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
-    own, other, both = np.abs(command) ** 2, np.abs(sensed) ** 2, np.conj(sensed) * command
+    own, other, both = _square(command), _square(sensed), np.conj(sensed) * command
 
-    def test(inverse: float) -> Angles:
-        real = mobility + inverse * slope
-        negative = np.any(real <= 0.0, axis=-1)
-        real = np.where(real > 0.0, real, 1.0)
-        return np.where(negative, -1.0, _compare(at, own / real, other / real, both / real))
+    def test(inverse: float, angles: Places) -> Angles:
+        real = mobility[angles] + inverse * slope[angles]
+        negative = np.min(real, axis=-1) <= 0.0
+        share = 1.0 / np.where(real > 0.0, real, 1.0)
+        terms = (product[angles] * share for product in (own, other, both))
+        return np.where(negative, -1.0, _compare(at, angles, *terms))
 
     return test
 
 
+def _square(values: Complex[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
+    return np.real(values) ** 2 + np.imag(values) ** 2
+
+
 def _compare(
-    at: _Responses, alpha: Float[np.ndarray, "m k"], beta: Float[np.ndarray, "m k"], gamma: Complex[np.ndarray, "m k"]
-) -> Angles:
+    at: _Responses, angles: Places, alpha: Float[np.ndarray, "a n"], beta: Float[np.ndarray, "a n"],
+    gamma: Complex[np.ndarray, "a n"],
+) -> Angles:  # fmt: skip
     """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it.
 
     The terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
     """
-    reach = TAIL_GROWTH * at.order**2 * at.tail
+    reach = (TAIL_GROWTH * at.order**2 * at.tail)[angles]
 
-    def rest(terms: Complex[np.ndarray, "m k"] | Float[np.ndarray, "m k"]) -> Angles:
+    def rest(terms: Complex[np.ndarray, "a n"] | Float[np.ndarray, "a n"]) -> Angles:
         return reach * np.maximum(np.abs(terms[:, 0]), np.abs(terms[:, -1]))
 
     product = (np.sum(alpha, axis=1) + rest(alpha)) * (np.sum(beta, axis=1) + rest(beta))
@@ -297,28 +239,35 @@ def _compare(
     return (np.sign(least) * least**2 - product) / (4.0 + np.abs(product))
 
 
-def _least_inverse(at: _Responses, multiplier: Multiplier, bar: float) -> float | None:
+def _least_inverse(test: Test, bar: float) -> float | None:
     """Return the least 1/kappa, in units of the curves' own 1/slope, that holds at all angles; None if none below bar.
 
-    More of it adds the Hermitian part of M, which is not negative: what holds at one value holds above it.
+    More of it adds the Hermitian part of M, which is not negative: what holds at one value holds above it, so that only
+    angles that fail at the lower end are looked at in between. What is returned is tested at all of them.
     """
-    test = _weigh(at, multiplier)
 
-    def holds(inverse: float) -> bool:
-        return bool(np.min(test(inverse)) > 0.0)
+    def fail(inverse: float, angles: Int[np.ndarray, " n"]) -> Int[np.ndarray, " lost"]:
+        return angles[test(inverse, angles) <= 0.0]
 
-    high = min(bar, LARGEST_INVERSE)
-    if not holds(high):
+    high = top = min(bar, LARGEST_INVERSE)
+    if np.any(test(high, EVERY) <= 0.0):
         return None
-    if holds(0.0):
+    failing = np.flatnonzero(test(0.0, EVERY) <= 0.0)
+    if not failing.size:
         return 0.0
     low = SMALLEST_INVERSE
-    if holds(low):
-        return low
-    while high / low > 1.0 + MARGIN_PRECISION:
-        middle = float(np.sqrt(low * high))
-        low, high = (low, middle) if holds(middle) else (middle, high)
-    return high
+    failing = fail(low, failing)
+    if not failing.size:
+        high = low
+    while True:
+        while high / low > 1.0 + MARGIN_PRECISION:
+            middle = float(np.sqrt(low * high))
+            still = fail(middle, failing)
+            low, high, failing = (middle, high, still) if still.size else (low, middle, failing)
+        failing = np.flatnonzero(test(high, EVERY) <= 0.0)
+        if not failing.size:
+            return high
+        low, high = high, top  # the bound on what is beyond the aliases need not fall as the rest does
 
 
 def _angles(loop: FrictionLoop) -> Angles:
@@ -332,17 +281,13 @@ def _angles(loop: FrictionLoop) -> Angles:
     return np.unique(np.concatenate([even, folded[folded >= LOWEST_ANGLE]]))
 
 
-def _refine(loop: FrictionLoop, at: _Responses, multiplier: Multiplier, inverse: float) -> _Responses:
-    """Return the responses at new angles, about the least values of the test."""
-    values = _definiteness(at, multiplier, inverse)
-    dips = [
-        i for i in range(values.size) if values[i] <= min(values[max(i - 1, 0)], values[min(i + 1, values.size - 1)])
-    ]
-    dips = sorted(dips, key=lambda i: values[i])[:REFINED_DIPS]
-    new = [
-        np.linspace(at.theta[max(i - 1, 0)], at.theta[min(i + 1, values.size - 1)], POINTS_PER_DIP) for i in dips
-    ]  # fmt: skip
-    return _respond(loop, np.unique(np.concatenate(new)))
+def _refine(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
+    """Return new angles, about the least values of a test."""
+    beside = np.concatenate([values[:1], values, values[-1:]])
+    dips = np.flatnonzero(values <= np.minimum(beside[:-2], beside[2:]))
+    dips = dips[np.argsort(values[dips], kind="stable")][:REFINED_DIPS]
+    low, high = np.maximum(dips - 1, 0), np.minimum(dips + 1, values.size - 1)
+    return np.unique(np.linspace(theta[low], theta[high], POINTS_PER_DIP))
 
 
 def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:

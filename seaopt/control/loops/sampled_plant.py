@@ -123,12 +123,21 @@ def sample(
     """
     values = plant.complete(params)
     at = {name: np.array([value]) for name, value in read_conditions(plant, values).items()}
-    a, b, c, d = linearise(plant, values.vector[:, None], at, measured, gain)
-    sampled = hold(a, b, c, d, sample_time_s, at.get(DELAY, np.zeros(1)))
-    return DigitalPlant(
-        a=sampled[0][0], b=sampled[1][0], c=sampled[2][0], d=float(sampled[3][0]), sample_time_s=sample_time_s,
-        delay_samples=delay_samples, static_gain=_compute_static_gain(a[0], b[0], c[0], float(d[0])),
-    )  # fmt: skip
+    linear = linearise(plant, values.vector[:, None], at, measured, gain)
+    return sample_linear(linear, at.get(DELAY, np.zeros(1)), sample_time_s, delay_samples)[0]
+
+
+def sample_linear(
+    plants: LinearPlants, delay_s: Float[np.ndarray, " k"], sample_time_s: float, delay_samples: int
+) -> list[DigitalPlant]:
+    """Return the digital plants of k linear ones and their delays, seconds besides the whole samples."""
+    static = [_compute_static_gain(a, b, c, float(d)) for a, b, c, d in zip(*plants, strict=True)]
+    return [
+        DigitalPlant(
+            a=a, b=b, c=c, d=float(d), sample_time_s=sample_time_s, delay_samples=delay_samples, static_gain=gain
+        )
+        for a, b, c, d, gain in zip(*hold(*plants, sample_time_s, delay_s), static, strict=True)
+    ]
 
 
 def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:

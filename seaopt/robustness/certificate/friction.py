@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.control.laws.friction_proof import lack_proof, prove_friction
+from seaopt.control.laws.friction_proof import lack_proof, prove_friction, prove_friction_sets
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
@@ -94,12 +94,17 @@ def _prove_draws(
     controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]], known: FrictionMargin
 ) -> FrictionDraws:
     """Return how many draws of one plant have a proof, and the least margin."""
-    proved, slope, factor, place = 0, np.inf, np.inf, draws[0]
+    placed = [place_values(plant, nominal, draw) for draw in draws]
+    keys = [tuple((name, each[name].value) for name in each) for each in placed]
+    distinct = dict(zip(keys, placed, strict=True))  # draws that vary what this plant does not have are one loop
     least = 1.0 if known.proved else 0.0
-    for draw in draws:
-        margin = prove_friction(controller, plant, place_values(plant, nominal, draw), known.multiplier, least)
+    found = prove_friction_sets(controller, plant, list(distinct.values()), known.multiplier, least)
+    margins = dict(zip(distinct, found, strict=True))
+    proved, slope, factor, place = 0, np.inf, np.inf, 0
+    for k, key in enumerate(keys):
+        margin = margins[key]
         proved += margin is None or margin.proved  # without friction there is nothing to prove
         if margin is not None and min(margin.slopes) < slope:
-            slope, factor, place = min(margin.slopes), margin.factor, draw
-    used = {name: value for name, value in place.items() if name in place_values(plant, nominal, place)}
+            slope, factor, place = min(margin.slopes), margin.factor, k
+    used = {name: value for name, value in draws[place].items() if name in placed[place]}
     return FrictionDraws(samples=len(draws), proved=proved, least_slope=slope, factor=factor, parameters=used)

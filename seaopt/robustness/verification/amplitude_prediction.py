@@ -21,6 +21,7 @@ from jaxtyping import Complex, Float
 from seaopt.control import Controller
 from seaopt.control.laws.friction_proof import take_friction_out
 from seaopt.control.laws.limit_cycles import AMPLITUDES, describe_friction
+from seaopt.control.loops.friction_loop import FUNDAMENTAL
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -77,22 +78,16 @@ class _Friction:
 
     @classmethod
     def of(cls, controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"]) -> _Friction:
-        loop = take_friction_out(controller, plant, params)
+        (loop,) = take_friction_out(controller, plant, [params])
         nothing = np.zeros(f.size, dtype=complex)
-        if loop is None or np.count_nonzero(loop.slopes) != 1:
+        if loop is None or loop.only_port is None:
             return cls(nothing, nothing, nothing, np.zeros(AMPLITUDES.size))
-        port = int(np.flatnonzero(loop.slopes)[0])
-        s, period = 2j * np.pi * f, loop.plant.sample_time_s
-        causes = np.column_stack([loop.friction[:, port], loop.motor]).astype(complex)
-        inner = s[:, None, None] * np.eye(loop.motor.size) - loop.a
-        by_friction, by_motor = np.moveaxis(
-            np.linalg.solve(inner, np.broadcast_to(causes, (f.size, *causes.shape))), 2, 0
-        )
-        late = s * (period * loop.plant.delay_samples + loop.delay_s)
-        hold = -np.expm1(-s * period) / (s * period) * np.exp(-late)
+        port = loop.only_port
+        rows = np.vstack([loop.velocity[port], loop.measured])
+        opened = loop.respond(2 * np.pi * f * loop.plant.sample_time_s, FUNDAMENTAL, rows)
+        mobility, on_output = opened.by_friction[:, 0, :, port].T
         return cls(
-            on_output=by_friction @ loop.measured + loop.through[port], mobility=by_friction @ loop.velocity[port],
-            by_motor=by_motor @ loop.velocity[port] * hold,
+            on_output=on_output + loop.through[port], mobility=mobility, by_motor=opened.by_motor[:, 0, 0],
             gains=describe_friction(plant, params, list(plant.friction)[port], AMPLITUDES),
         )  # fmt: skip
 

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.control.loops import absolute_stability as proof
+from seaopt.control.loops.friction_loop import FrictionLoop, transfer
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from tests.laws import law_of, measurement_matrices
 
@@ -36,7 +37,7 @@ def pid(k_p, k_d, k_i=0.6, T_f=1.3e-3):
 def loop_of(law, slope=1.0):
     a, b = discretise(PERIOD)
     plant = DigitalPlant(a=a, b=b, c=C, d=0.0, sample_time_s=PERIOD, delay_samples=DELAY, static_gain=1.0)
-    return proof.FrictionLoop(
+    return FrictionLoop(
         a=A, motor=B, friction=B[:, None], velocity=np.array([[0.0, 1.0]]), measured=C, through=np.zeros(1),
         slopes=np.array([slope]), plant=plant, law=law,
     )  # fmt: skip
@@ -92,7 +93,7 @@ def test_the_test_agrees_with_a_fine_lifted_discretisation(gains):
         lifted = direct + state @ np.linalg.solve(z * np.eye(len(transition)) - transition, effort)
         for inverse in (1e-3, 1.6e-4, 5e-5, 2e-5, 1e-5, 3e-6):
             least = np.linalg.eigvalsh(0.5 * (lifted + lifted.conj().T) + inverse * np.eye(120))[0]
-            value = proof._definiteness(responses, np.ones_like, inverse)[i]
+            value = proof._weigh(responses, np.ones_like)(inverse, proof.EVERY)[i]
             assert value <= 0.0 or least > 0.0, (angle, inverse, least, value)  # what is proved is true
             if least > 0.1 * inverse and inverse > 1e-5:  # and, where substeps and aliases resolve it, proved
                 assert value > 0.0, (angle, inverse, least, value)
@@ -157,7 +158,7 @@ def test_the_responses_are_those_of_a_solve_at_each_point():
     a = np.array([[0, 1, 0, 0], [-3e5, -20, 4e3, 0], [0, 0, -1e3, 5e4], [2e-3, 0, 0, -300.0]])
     b, c = np.array([[0.0, 1.0], [3.0, 0.1], [0.0, 0.0], [1e-3, 0.0]]), np.array([[0.0, 1.0, 0.0, 2e2]])
     s = 1j * np.array([[0.1, 3.0], [500.0, -2e5]])
-    found = proof._transfer(a, b, c, s)
+    found = transfer(a, b, c, s)
     for place in np.ndindex(s.shape):
         np.testing.assert_allclose(found[place], c @ np.linalg.solve(s[place] * np.eye(4) - a, b), rtol=1e-9)
 
@@ -177,7 +178,7 @@ def test_one_friction_is_tested_as_many_are():
         sensed=np.concatenate([one.sensed, still], axis=-1), tail=one.tail, order=one.order,
     )  # fmt: skip
     for inverse in (1e-3, 0.1, 1.0):
-        found, expected = (proof._definiteness(at, lambda s: 1.0 + 1e-3 * s, inverse) for at in (one, two))
+        found, expected = (proof._weigh(at, lambda s: 1.0 + 1e-3 * s)(inverse, proof.EVERY) for at in (one, two))
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 

@@ -1,0 +1,130 @@
+"""A sampled loop with its friction taken out, as a port from friction efforts to what they move.
+
+The proof of stability looks at it at all aliases of an angle (`seaopt.control.loops.absolute_stability`), describing
+functions at the fundamental alone (`seaopt.control.laws.limit_cycles`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.records import record
+
+FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
+
+
+@record(eq=False)
+class FrictionLoop:
+    r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = c x.
+
+    Parameters
+    ----------
+    a, motor : arrays, shapes (n, n) and (n,)
+        The continuous plant without friction, and the effect of the motor effort u.
+    friction : array, shape (n, p)
+        The effect of each friction effort in the direction of its velocity.
+    velocity, measured : arrays, shapes (p, n) and (n,)
+        The velocities that friction acts on, and the fed-back output.
+    through : array, shape (p,)
+        The effect of each friction effort on the output itself.
+    slopes : array, shape (p,)
+        The steepest slope of each friction curve, N s/m (N m s/rad).
+    plant : DigitalPlant
+        The same plant, sampled, from u to y, with its delay.
+    law : Law
+        Its C_y closes the loop.
+    delay_s : float
+        Of the motor effort, besides the whole samples of `plant`.
+
+    """
+
+    a: Float[np.ndarray, "n n"]
+    motor: Float[np.ndarray, " n"]
+    friction: Float[np.ndarray, "n p"]
+    velocity: Float[np.ndarray, "p n"]
+    measured: Float[np.ndarray, " n"]
+    through: Float[np.ndarray, " p"]
+    slopes: Float[np.ndarray, " p"]
+    plant: DigitalPlant
+    law: Law
+    delay_s: float = 0.0
+
+    @property
+    def only_port(self) -> int | None:
+        """The one friction that changes with its velocity; None where none or several do."""
+        ports = np.flatnonzero(self.slopes)
+        return int(ports[0]) if ports.size == 1 else None
+
+    def respond(
+        self, theta: Float[np.ndarray, " m"], orders: Int[np.ndarray, " k"], seen: Float[np.ndarray, "y n"]
+    ) -> FrictionResponse:
+        """Return what friction efforts and motor commands do to some rows of the states, the loop open.
+
+        Parameters
+        ----------
+        theta : array, shape (m,)
+            Angles, 2 pi times frequency over sample rate.
+        orders : array, shape (k,)
+            Which aliases: that of order k is theta + 2 pi k.
+        seen : array, shape (y, n)
+            The rows.
+
+        """
+        period = self.plant.sample_time_s
+        s = 1j * (theta[:, None] + 2 * np.pi * orders) / period
+        response = transfer(self.a, np.column_stack([self.friction, self.motor]), seen, s)
+        # The hold over a period, (1 - exp(-sT))/(sT): the numerator is the same at all aliases.
+        drive = (-np.expm1(-1j * theta) * np.exp(-1j * theta * self.plant.delay_samples))[:, None] / (s * period)
+        if self.delay_s:
+            drive = drive * np.exp(-s * self.delay_s)
+        return FrictionResponse(by_friction=response[..., :-1], by_motor=response[..., -1] * drive[..., None])
+
+    def feedback(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return K, the motor command per measured output that comes from elsewhere, with the loop closed."""
+        f = theta / (2 * np.pi * self.plant.sample_time_s)
+        law = self.law.measurement_response(f)
+        return law / (1.0 + self.plant.response(f) * law)
+
+
+@record(eq=False)
+class FrictionResponse:
+    """Rows of the states at m angles and k aliases.
+
+    Parameters
+    ----------
+    by_friction : array, shape (m, k, y, p)
+        Per unit of each friction effort, as it pushes.
+    by_motor : array, shape (m, k, y)
+        Per unit of the sampled motor command at the fundamental, delayed and held.
+
+    """
+
+    by_friction: Complex[np.ndarray, "m k y p"]
+    by_motor: Complex[np.ndarray, "m k y"]
+
+
+def transfer(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n u"], c: Float[np.ndarray, "y n"], s: Complex[np.ndarray, "m k"]
+) -> Complex[np.ndarray, "m k y u"]:
+    """Return c (sI - a)^-1 b, by back substitution in a Schur basis of the balanced matrix, for all s at once."""
+    from scipy.linalg import matrix_balance, schur
+
+    balanced, transform = matrix_balance(a, permute=False)
+    scale = np.diag(transform)
+    triangle, basis = np.array(schur(balanced, output="complex")[:2])
+    right, left = basis.conj().T @ (b / scale[:, None]), (c * scale) @ basis
+    n, flat = len(triangle), s.ravel()
+    x = np.empty((n, right.shape[1], flat.size), dtype=complex)
+    for i in range(n - 1, -1, -1):
+        x[i] = right[i][:, None]
+        for j in range(i + 1, n):  # no matrix product: BLAS starts threads for it, which cost more than they save
+            x[i] += triangle[i, j] * x[j]
+        x[i] *= 1.0 / (flat - triangle[i, i])
+    out = np.zeros((len(left), right.shape[1], flat.size), dtype=complex)
+    for row, weights in zip(out, left, strict=True):
+        for weight, state in zip(weights, x, strict=True):
+            row += weight * state
+    return np.moveaxis(out, -1, 0).reshape(*s.shape, *out.shape[:2])
