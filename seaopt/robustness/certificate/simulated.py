@@ -239,7 +239,7 @@ def _list_kept(runs: Verification, plant: str, rows: Sequence[Outcome]) -> list[
     peaks = [
         (1.0 + (row.overshoot or 0.0), scenario.max_overshoot, row)
         for row, scenario in steps
-        if scenario.max_overshoot is not None and not row.saturated
+        if scenario.max_overshoot is not None and not row.overshoot_by_limit
     ]
     times = [(row.settling_s or 0.0, scenario.settling_s or 0.0, row) for row, scenario in steps]
     for name, figures in ((STEP_OVERSHOOT, peaks), (STEP_SETTLING, times)):

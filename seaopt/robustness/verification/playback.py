@@ -72,6 +72,12 @@ class Stage:
         return replace(self, sensors=Sensors(saturation=self.sensors.saturation), current_step_A=0.0)
 
     @property
+    def unlimited(self) -> Stage:
+        """The stage with no current limit."""
+        spec = replace(self.controller.spec, current_limit_A=None)
+        return replace(self, controller=replace(self.controller, spec=spec))
+
+    @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
         sensors, name = self.sensors, self.controller.spec.measured

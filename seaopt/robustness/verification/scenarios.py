@@ -95,7 +95,7 @@ class Scenario:
     final_error : float or None
         Largest mean error over the last fifth of the last phase, N.
     max_overshoot : float or None
-        Largest force over the last phase's reference, a step from rest, where the current does not saturate.
+        Largest force over the last phase's reference, a step from rest, unless the current limit alone makes it larger.
     settling_s : float or None
         Time of the last phase, a step from rest, until the force stays within a tenth of its reference.
     max_force_N, max_angle_rad : float or None

@@ -16,7 +16,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
 from seaopt.records import record
-from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out
 
@@ -114,12 +114,14 @@ class Verification:
             rows = [row for row in self.rows if row.plant == plant and row.settling_s is not None]
             if not rows:
                 continue
-            over = max((row.overshoot or 0.0 for row in rows if not row.saturated), default=0.0)
+            over = max((row.overshoot or 0.0 for row in rows if not row.overshoot_by_limit), default=0.0)
+            more = max((row.overshoot or 0.0 for row in rows if row.overshoot_by_limit), default=0.0)
+            limited = f" ({100 * more:.3g} % where the current limit makes it)" if more else ""
             slowest = max(row.settling_s or 0.0 for row in rows)
             sizes = [self.scenario(row).phases[-1].force_N for row in rows]
             settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
             ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
-            lines.append(f"steps on {plant}, {ends} N: overshoot up to {100 * over:.3g} %, {settled}")
+            lines.append(f"steps on {plant}, {ends} N: overshoot up to {100 * over:.3g} %{limited}, {settled}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
@@ -237,7 +239,12 @@ def verify(
         for scenario in played[name]:
             trace = play(stage, scenario, sets[name], seed=seed)
             ideal = trace if stage.is_ideal else play(stage.ideal, scenario, sets[name], seed=seed)
-            rows += [judge_run(stage, name, scenario, trace, k, sets[name], ideal) for k in range(len(sets[name]))]
+            unlimited = None
+            if overshoots_at_limit(stage, scenario, ideal):
+                unlimited = play(stage.ideal.unlimited, scenario, sets[name], seed=seed)
+            rows += [
+                judge_run(stage, name, scenario, trace, k, sets[name], ideal, unlimited) for k in range(len(sets[name]))
+            ]
             for one in (trace,) if ideal is trace else (trace, ideal):
                 simulated += len(sets[name]) * one.time.size * controller.sample_time_s
                 wall, error = wall + one.wall_s, max(error, one.error)

@@ -45,6 +45,7 @@ def play_independently(controller, params, steps, jump=False):
 
 def test_steps_overshoot_as_the_independent_simulator_says(blind, stand, rubbing):
     certificate = so.certify(blind, {"stand": stand}, rubbing)
+    assert not any(row.overshoot_by_limit for row in certificate.steps.rows)  # nor is the limit to blame for the others
     rows = {row.scenario: row for row in certificate.steps.rows if not row.saturated}
     assert set(rows) == {"2 % step", "unsaturated step"}
     steps = np.array([certificate.steps.scenario(row).phases[-1].force_N for row in rows.values()])
@@ -54,7 +55,31 @@ def test_steps_overshoot_as_the_independent_simulator_says(blind, stand, rubbing
     (over,) = [row for row in certificate.requirements if row.name == "step_overshoot"]
     assert not over.met and not certificate.passed
     assert (over.value, over.limit) == pytest.approx((1.0 + np.max(expected), 1.1 * 1.3), rel=2e-3)
-    assert over.where.startswith("stand, unsaturated step") and over.where.endswith("the worst of 2 such runs")
+    assert over.where.startswith("stand, unsaturated step") and over.where.endswith("the worst of 3 such runs")
+
+
+def test_a_sample_at_the_limit_excuses_no_overshoot(blind, stand, rubbing):
+    """One sample of the step saturates, by a hundredth of its current: it overshoots as it does without the limit."""
+    rows = so.certify(blind, {"stand": stand}, rubbing).steps
+    row = next(row for row in rows.rows if row.scenario == "unsaturated step")
+    tight = replace(blind, spec=replace(SPEC, current_limit_A=0.99 * row.peak_current_A))
+    found = verify(tight, {"stand": stand}, rubbing, scenarios=(rows.scenario(row),)).rows[0]
+    assert 0.0 < found.saturated < 0.002
+    assert [fault.kind for fault in found.faults] == ["overshoot"] and not found.overshoot_by_limit
+
+
+@pytest.mark.parametrize("cell", [None, so.Sensors(noise_std={"F1": 1.0})])
+def test_an_overshoot_that_the_limit_alone_makes_stands(cell, stand, thor):
+    """Near the limit nothing is left to brake a fast law's step with; without the limit it keeps 1.05."""
+    thor = thor.update(b_r=2e-5)
+    tuned = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=60, max_reference_peak=1.05, current_limit_A=9.0))
+    step = 0.95 * tuned.force_limit(0.01)
+    last = step_scenarios(tuned, stand)[0]
+    large = replace(last, phases=(last.phases[0], replace(last.phases[1], force_N=step)), final_error=0.02 * step)
+    row = verify(tuned, {"stand": stand}, thor, scenarios=(large,), sensors=cell).rows[0]
+    alone = play_independently(tuned, thor, [step]).overshoot(np.array([step]))[0]
+    assert alone < 1.1 * 1.05 - 1.0 < row.overshoot
+    assert row.overshoot_by_limit and "overshoot" not in [fault.kind for fault in row.faults]
 
 
 def test_where_no_peak_is_asked_for_the_certificate_says_that_none_is_judged(blind, stand, rubbing):
