@@ -10,7 +10,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.loop import STABLE, Loop
-from seaopt.control.loops.sampled_plant import DELAY, find_rest, linearise, read_conditions, sample_linear
+from seaopt.control.loops.sampled_plant import find_rest, linearise_sets, sample_linear
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states
@@ -85,13 +85,9 @@ def take_friction_out(
     if not np.any(spans):
         return [None] * len(sets)
     sliding = friction_states(plant)[SLIDING]
-    measured, period = controller.spec.measured, controller.sample_time_s
-    places = [read_conditions(plant, each) for each in values]
-    at = {name: np.array([place[name] for place in places]) for name in places[0]}
-    vectors = np.column_stack([each.vector for each in values])
-    linear = linearise(sliding, vectors, at, measured, controller.command.per_effort)
-    delays = at.get(DELAY, np.zeros(len(sets)))
-    sampled = sample_linear(linear, delays, period, controller.delay_samples)
+    measured = controller.spec.measured
+    linear, delays = linearise_sets(sliding, values, measured, controller.command.per_effort)
+    sampled = sample_linear(linear, delays, controller.sample_time_s, controller.delay_samples)
     loops: list[FrictionLoop | None] = []
     for k, (each, span) in enumerate(zip(values, spans, strict=True)):
         on_states, on_outputs, velocity = (

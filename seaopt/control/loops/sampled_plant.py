@@ -121,10 +121,25 @@ def sample(
         The plant has no such output, or cannot rest where it is to be linearised.
 
     """
-    values = plant.complete(params)
-    at = {name: np.array([value]) for name, value in read_conditions(plant, values).items()}
-    linear = linearise(plant, values.vector[:, None], at, measured, gain)
-    return sample_linear(linear, at.get(DELAY, np.zeros(1)), sample_time_s, delay_samples)[0]
+    linear, delay_s = linearise_sets(plant, [plant.complete(params)], measured, gain)
+    return sample_linear(linear, delay_s, sample_time_s, delay_samples)[0]
+
+
+def linearise_sets(
+    plant: Plant, sets: Sequence[CompletedParameters], measured: str, gain: float
+) -> tuple[LinearPlants, Float[np.ndarray, " k"]]:
+    """Return what `linearise` does at k sets of parameters with the same conditions among them, and their delays (s).
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output, or cannot rest where it is to be linearised.
+
+    """
+    places = [read_conditions(plant, values) for values in sets]
+    at = {name: np.array([place[name] for place in places]) for name in places[0]}
+    linear = linearise(plant, np.column_stack([values.vector for values in sets]), at, measured, gain)
+    return linear, at.get(DELAY, np.zeros(len(sets)))
 
 
 def sample_linear(

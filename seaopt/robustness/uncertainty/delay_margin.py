@@ -27,13 +27,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.control import Controller
-from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.control.loops.peaks import find_crossovers
-from seaopt.control.loops.sampled_plant import DELAY
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.control.loops.sampled_plant import linearise_sets, sample_linear
+from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
-from seaopt.units import factor
 
 CELLS = 16  # of a sample
 NARROWEST_CELL = 1e-4  # of a sample: a crossover that comes and goes within less is not looked for
@@ -114,9 +114,12 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
 
     """
     period = controller.sample_time_s
+    sliding, effort = take_sliding(plant, params), controller.command.per_effort
+    linear, before = linearise_sets(sliding, [sliding.complete(params)], controller.spec.measured, effort)
 
     def delay_loop(part: float) -> _DelayedLoop:
-        return _delay_loop(controller, plant, params, part)
+        (sampled,) = sample_linear(linear, before + part * period, period, controller.delay_samples)
+        return _measure_delayed(Loop(plant=sampled, law=controller.law), part)
 
     grid = _build_grid(delay_loop)
     samples = np.arange(int(np.ceil(reach_s / period)) + 1)
@@ -133,10 +136,8 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     return None
 
 
-def _delay_loop(controller: Controller, plant: Plant, params: ParameterSet, part: float) -> _DelayedLoop:
-    before = params[DELAY].value * factor(params[DELAY].unit, "s") if DELAY in params else 0.0
-    delay = Parameter(name=DELAY, value=before + part * controller.sample_time_s, unit="s")
-    system = controller.close(plant, params.with_parameters(delay)).system()
+def _measure_delayed(loop: Loop, part: float) -> _DelayedLoop:
+    system = loop.system()
     angles, phases = find_crossovers(system)
     nyquist = system.curves(np.array([np.pi]))[0, 0]
     return _DelayedLoop(

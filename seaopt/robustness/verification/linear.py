@@ -56,6 +56,8 @@ class LinearView:
 
     def force_std(self, lowest_hz: float = 0.0) -> float:
         """Return the standard deviation (N) of the force that noise makes above a frequency; the loop is stable."""
+        if not (self.noise_N or self.step_N):
+            return 0.0
         f = self.loop.grid()
         f = np.concatenate([[lowest_hz], f[f > lowest_hz]]) if lowest_hz else f
         s = self.loop.sensitivity(f)
