@@ -18,6 +18,7 @@ once, so that they keep their digits down to 0 Hz.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,21 +99,19 @@ class Law:
 
     def evaluate(self, from_one: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
         """Return u per reference and per measured signal at z = 1 + from_one."""
-        m = self.integrators
-        a, b, c = self.rest
+        m, triangle, left, right = _factorise(self)
         distance = np.where(np.abs(from_one) < NEAREST_TO_ONE, NEAREST_TO_ONE, from_one)
         out = np.repeat(self.d[:, None], from_one.size, axis=1).astype(complex)
         power = np.ones_like(distance)
         for row in self.b[:m]:
             power = power / distance
             out += np.multiply.outer(row, power)
-        if not c.size:
+        if not left.size:
             return out
-        triangle, basis = _triangulate(a)
-        x, left = np.zeros((c.size, from_one.size), dtype=complex), c @ basis
-        for i in range(c.size):  # x (zI - triangle) = left
+        x = np.zeros((left.size, from_one.size), dtype=complex)
+        for i in range(left.size):  # x (zI - triangle) = left
             x[i] = (left[i] + triangle[:i, i] @ x[:i]) / (from_one + (1.0 - triangle[i, i]))
-        return out + (basis.conj().T @ b).T @ x
+        return out + right.T @ x
 
     def balanced(self) -> Law:
         """Return the same law with what does not integrate balanced and of least order; as it is if that is unstable.
@@ -194,6 +193,18 @@ class Law:
         ):  # fmt: skip
             check_same_response(name, tf, response, sample_time_s)
         return law
+
+
+@lru_cache(maxsize=32)
+def _factorise(
+    law: Law,
+) -> tuple[int, Complex[np.ndarray, "n n"], Complex[np.ndarray, " n"], Complex[np.ndarray, "n k"]]:
+    """Return how many states integrate, and of the rest the Schur form with its output and inputs, once for a law."""
+    a, b, c = law.rest
+    if not c.size:
+        return law.integrators, a + 0j, c + 0j, b + 0j
+    triangle, basis = _triangulate(a)
+    return law.integrators, triangle, c @ basis, basis.conj().T @ b
 
 
 def _triangulate(a: Float[np.ndarray, "n n"]) -> tuple[Complex[np.ndarray, "n n"], Complex[np.ndarray, "n n"]]:

@@ -319,6 +319,7 @@ class Certificate:
         return run_simulations(
             self.controller, self.models, self.parameters, draws=self._draws(), sensors=sensors,
             current_step_A=current_step_A, seed=seed,
+            steps=self.steps if isinstance(self.steps, Verification) else None,
         )  # fmt: skip
 
     @classmethod

@@ -125,6 +125,7 @@ def run_simulations(
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
     seed: int = 1,
+    steps: Verification | None = None,
 ) -> Simulated:
     """Run scenarios, large signals, passivity and environments, as far as plants and controller allow.
 
@@ -132,6 +133,8 @@ def run_simulations(
     ----------
     controller, plants, parameters, draws, sensors, current_step_A, seed
         As in `verify`; the controller knows its design plant.
+    steps : Verification, optional
+        What `simulate_steps` played: on the same devices it is not played again.
 
     Returns
     -------
@@ -168,7 +171,8 @@ def run_simulations(
     ]
     return Simulated(
         verification=attempt("simulation", lambda: verify(
-            controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed
+            controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed,
+            known=steps,
         )),
         large_signal=tuple(sweep for sweep in sweeps if sweep is not None),
         passivity=attempt("passivity", lambda: passivity(controller, plant, values)),
