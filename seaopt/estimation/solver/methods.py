@@ -14,6 +14,7 @@ from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
 from seaopt.estimation.solver.settle import Solved, explains_little, settle
+from seaopt.estimation.solver.stretches import find_start_on_stretches
 from seaopt.records import record
 
 FURTHER = 5  # guesses of the frequency responses that are tried at most
@@ -64,7 +65,7 @@ class OutputError(Method):
             return solved
         for start in _further_starts(problem, best, guesses, self) if self.search else ():
             other = settle(problem, problem.evaluate(start), self.max_iterations, callback)
-            solved = other if solved is None else _better(solved, other)
+            solved = other if solved is None or other.misfit < solved.misfit else solved
             if not _is_doubtful(solved, guesses):
                 break
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
@@ -99,26 +100,39 @@ class PredictionError(Method):
         """Settle with a filter that hardly trusts the plant, then with one whose noise is estimated."""
         best, _ = find_start(problem, self)
         solved: Solved | None = None
+        follows = problem.all_linear and not explains_little(problem, best.power)
         for start in (*([best.z] if np.isfinite(best.cost) else []), problem.unknowns.start):
-            z = find_predicting_start(problem, start, self.max_iterations)
-            predicting = None if z is None else add_predictors(problem, z, follows=True)
-            if z is None or predicting is None:
-                continue
-            one = settle(predicting, predicting.evaluate(z), self.max_iterations, callback)
-            again = add_predictors(one.problem, one.solution.z, follows=True)
-            if again is not None and not problem.all_linear:
-                one = settle(again, again.evaluate(one.solution.z), self.max_iterations, callback)
-            solved = one if solved is None else _better(solved, one)
-            if solved.solution.status == "converged":
+            # A plant that already simulates well would be led away: held to the log, it may do without its input.
+            z = best.z if follows and start is best.z else find_predicting_start(problem, start, self.max_iterations)
+            solved = _better(solved, None if z is None else self._settle_predicting(problem, z, callback))
+            if solved is not None and solved.solution.status == "converged":
                 break
+        if self.search and (solved is None or _simulates_badly(solved)):
+            simulated = OutputError(max_iterations=self.max_iterations, seed=self.seed).solve(problem, callback)
+            if not _simulates_badly(simulated):
+                solved = self._settle_predicting(problem, simulated.solution.z, callback) or solved
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
+
+    def _settle_predicting(
+        self, problem: FitProblem, start: Float[np.ndarray, " n"], callback: Callback | None
+    ) -> Solved | None:
+        """Return the minimum of the errors of prediction near a start; None where no filter is found."""
+        predicting = add_predictors(problem, start, follows=True)
+        if predicting is None:
+            return None
+        one = settle(predicting, predicting.evaluate(start), self.max_iterations, callback)
+        again = add_predictors(one.problem, one.solution.z, follows=True)
+        if again is not None and not problem.all_linear:
+            one = settle(again, again.evaluate(one.solution.z), self.max_iterations, callback)
+        return one
 
 
 def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Float[np.ndarray, " n"]]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses.
 
     A guess that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode
-    a little off is out of phase after some periods. Held to the log, such a guess finds the mode.
+    a little off is out of phase after some periods. On short stretches, or held to the log, such a guess finds the
+    mode.
     """
     if not method.search or not problem.unknowns.shared:
         return problem.evaluate(problem.unknowns.start), []
@@ -129,15 +143,29 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Fl
         return guessed, guesses
     first = problem.evaluate(problem.unknowns.start)
     best = first if guessed is None or guessed.cost > first.cost else guessed
-    if matched and explains_little(problem, best.power):
-        predicting = find_predicting_start(problem, guesses[0], method.max_iterations)
-        other = None if predicting is None else problem.evaluate(predicting)
+    if guesses and (matched or problem.all_linear) and explains_little(problem, best.power):
+        # Of a linear plant the best initial states of stretches follow from one evaluation.
+        z = (
+            find_start_on_stretches(problem, guesses[0])
+            if problem.all_linear
+            else find_predicting_start(problem, guesses[0], method.max_iterations)
+        )
+        other = None if z is None else problem.evaluate(z)
         best = other if other is not None and other.cost < best.cost else best
     return best, guesses
 
 
-def _better(one: Solved, other: Solved) -> Solved:
+def _better(one: Solved | None, other: Solved | None) -> Solved | None:
+    if one is None or other is None:
+        return one or other
     return other if other.misfit < one.misfit else one
+
+
+def _simulates_badly(solved: Solved) -> bool:
+    """Tell whether a minimum explains little in free run, whatever it predicts one sample ahead."""
+    simulating = solved.problem.with_each(predictor=None)
+    power = simulating.evaluate(solved.solution.z).power
+    return explains_little(simulating, power)
 
 
 def _is_doubtful(solved: Solved, guesses: list[Float[np.ndarray, " n"]]) -> bool:

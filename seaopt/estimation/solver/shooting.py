@@ -32,7 +32,7 @@ from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.normal_equations import QuadraticModel, TrustRegionStep, add_gram
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.solver.least_squares import Callback, minimise
-from seaopt.estimation.solver.methods import Method, find_start
+from seaopt.estimation.solver.methods import Method, OutputError, find_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
 from seaopt.estimation.solver.settle import Solved, estimate_sigma, explains_little, settle
 from seaopt.records import record
@@ -87,10 +87,16 @@ class MultipleShooting(Method):
             z = z if predicting is None else predicting
         joined, z, shots = _join(problem.with_each(band_hz=None, loss=Squares()), z, self, callback)
         single = problem.evaluate(_with_first_nodes(problem, z, shots))
-        if np.isfinite(single.cost):
-            solved = settle(problem, single, self.max_iterations, callback)
-            if solved.solution.status == "converged" and _explains_as_much(solved, joined):
-                return solved
+        solved = settle(problem, single, self.max_iterations, callback) if np.isfinite(single.cost) else None
+        if solved is not None and not (_has_converged(solved) and _explains_as_much(solved, joined)):
+            solved = None
+        if self.search and (solved is None or _explains_little(solved)):
+            # Shots may follow a log that no input drives; a plant that is simulated in one go cannot.
+            other = OutputError(max_iterations=self.max_iterations, seed=self.seed).solve(problem, callback)
+            if _has_converged(other) and not _explains_little(other):
+                return other
+        if solved is not None:
+            return solved
         return _settle_apart(problem, self, z, shots, callback)
 
 
@@ -344,6 +350,14 @@ def _measure_gaps(model: CondensedModel) -> float:
             size = np.maximum(np.max(np.abs(part.shots.nodes), axis=0), 1e-300)
             worst = max(worst, float(np.max(np.abs(part.gaps) / size, initial=0.0)))
     return worst
+
+
+def _has_converged(solved: Solved) -> bool:
+    return solved.solution.status == "converged"
+
+
+def _explains_little(solved: Solved) -> bool:
+    return explains_little(solved.problem, solved.solution.evaluation.power)
 
 
 def _explains_as_much(solved: Solved, joined: FitProblem) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.bench import PAPER_SWING, Noise
@@ -178,6 +179,33 @@ def test_a_light_mode_of_free_bodies_is_found(method, thor):
     assert fit.status == "converged"
     so.testing.assert_recovered(fit, truth, sigmas=4)
     assert fit.iterations < 60
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("factor", [1.0, 7.0])
+def test_a_mode_that_rings_through_the_log_is_found(method, factor):
+    """A link with a damping ratio of 1e-3 on a servo that steps (its response by scipy), and a gain of 1.0 for 1.2."""
+    k, c, gamma, rate = 340.0, 2e-3 * np.sqrt(340.0), 1.2, 250.0
+    rng = np.random.default_rng(5)
+    reference = np.repeat(rng.uniform(-0.8, 0.8, 12), 750)
+    servo = cont2discrete(([625.0], [1.0, 35.0, 625.0]), 1.0 / rate, "zoh")
+    hub = lfilter(servo[0].ravel(), servo[1], reference)
+    link = cont2discrete(([-gamma, 0.0, 0.0], [1.0, c, k]), 1.0 / rate, "foh")
+    alpha = lfilter(link[0].ravel(), link[1], hub)
+    alpha += 0.02 * np.std(alpha) * rng.normal(size=alpha.size)
+    log = so.Log.from_arrays(time=np.arange(alpha.size) / rate, theta=hub, alpha=alpha)
+    plant = so.Plant(
+        name="link", states={"tip": "rad", "v": "rad/s"}, inputs={"theta": "rad"}, outputs={"alpha": "rad"},
+        parameters={"k": "1/s^2", "c": "1/s", "gamma": "-"},
+        f=lambda t, x, u, p: {"tip": x.v - p.c * (x.tip - u.theta), "v": -p.k * (x.tip - u.theta)},
+        h=lambda t, x, u, p: {"alpha": p.gamma * (x.tip - u.theta)},
+    )  # fmt: skip
+    truth = so.ParameterSet.of(k=(k, "1/s^2"), c=(c, "1/s"), gamma=(gamma, "-"))
+    start = truth.update(k=factor * k, c=0.05, gamma=1.0).bound(k=(0.0, 1e5)).free("k", "c", "gamma")
+    experiment = so.Experiment(plant=plant, log=log, hold="first")
+    fit = so.fit([experiment], start, method=METHODS[method])
+    assert fit.status == "converged"
+    so.testing.assert_recovered(fit, truth, sigmas=4)
 
 
 def test_noise_that_is_not_there_does_not_slow_the_search(stand, thor):
