@@ -257,6 +257,7 @@ class ControllerTable(_Strict):
     max_droop_db: Level = _limit("max_droop_db")
     max_noise_gain: Level = _limit("max_noise_gain")
     min_filter_samples: Level = _limit("min_filter_samples")
+    min_friction_margin: Level = _limit("min_friction_margin")
     min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")
     passive_band_hz: tuple[Number, Number] | None = _limit("passive_band_hz")
     objective: Literal["disturbance", "noise"] = "disturbance"

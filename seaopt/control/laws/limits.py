@@ -67,6 +67,8 @@ class MeasuredLoop:
         Time constant of the derivative's filter in samples; infinite where nothing is differentiated.
     integral_rad_s : float
         How fast the integral takes an error away, k_i/(1 + k_p); infinite without one.
+    friction_slope : float
+        The steepest friction for which stability is proved, N s/m (N m s/rad); infinite where none is to be proved.
 
     """
 
@@ -75,6 +77,7 @@ class MeasuredLoop:
     port: PortFigures | None = None
     filter_samples: float = math.inf
     integral_rad_s: float = math.inf
+    friction_slope: float = math.inf
 
 
 @record(eq=False)
@@ -333,6 +336,12 @@ LIMITS = (
         sense="at least", scope="design plant", unit="rad/s", allowed=INTEGRAL_RAD_S, reserve="none",
         meaning="k_i/(1 + k_p) of an integral, 2 pi 0.05 or more: a slower one leaves errors for tens of seconds",
         remedy="tune again, or leave the integral out",
+    ),
+    Limit(
+        name="min_friction_margin", label="friction margin", figure=lambda loop: loop.friction_slope, sense="at least",
+        scope="every plant", unit="N s/m",
+        meaning="steepest friction, counted from its flattest slope, for which stability is proved",
+        remedy="ask for the largest that the result names, lower the bandwidth, or allow more noise gain",
     ),
     Limit(
         name="passive_band_hz", label="least Re Z/|Z| in the passive band", sense="at least",

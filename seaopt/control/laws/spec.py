@@ -55,6 +55,9 @@ class ControllerSpec:
         Peak of abs(F_m / noise on F), N/N, design plant.
     min_filter_samples : float, optional
         T_f in samples.
+    min_friction_margin : float, optional
+        Steepest friction, N s/m (N m s/rad), for which stability is to be proved on every plant that has friction
+        (`seaopt.control.loops.absolute_stability`).
     min_sensitivity_bandwidth_hz : float, optional
         abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.
     passive_band_hz : (low, high), optional
@@ -92,6 +95,7 @@ class ControllerSpec:
     max_droop_db: Level = BY_NAME["max_droop_db"].default
     max_noise_gain: Level = BY_NAME["max_noise_gain"].default
     min_filter_samples: Level = BY_NAME["min_filter_samples"].default
+    min_friction_margin: Level = BY_NAME["min_friction_margin"].default
     min_sensitivity_bandwidth_hz: Level = None
     passive_band_hz: tuple[float, float] | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"

@@ -106,9 +106,15 @@ def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
     return [verdict.label for verdict in verdicts if not verdict.met]
 
 
+def list_broken_limits(spec: ControllerSpec, loops: Sequence[MeasuredLoop], design_states: int) -> set[str]:
+    """Return the names of the limits that some loop breaks, as `judge_all` judges them."""
+    return {verdict.limit.name for verdict in judge_all(spec, loops, design_states) if not verdict.met}
+
+
 def list_broken_figures(spec: ControllerSpec, states: Sequence[MeasuredLoop]) -> list[str]:
-    """Return the limits that the design plant breaks, sliding and stuck if it has friction; not a passive band."""
-    return list_broken(judge_all(replace(spec, passive_band_hz=None), states, len(states)))
+    """Return the limits that the design plant's figures break, sliding and stuck if it has friction."""
+    figures_only = replace(spec, passive_band_hz=None, min_friction_margin=None)
+    return list_broken(judge_all(figures_only, states, len(states)))
 
 
 def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
@@ -129,10 +135,12 @@ def explain_broken(spec: ControllerSpec, verdicts: Sequence[Verdict], design: Me
     broken: dict[str, list[Verdict]] = {}
     for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda one: -one.severity):
         broken.setdefault(verdict.limit.name, []).append(verdict)
-    return [
+    texts = [
         _explain(spec, worst, design, loop) + _format_plants([one.plant for one in (worst, *others) if one.names_plant])
         for worst, *others in broken.values()
     ]
+    alone = list(broken) == ["min_friction_margin"]  # the tuner then gives the law that has most of it
+    return [f"{text}, the largest found at this bandwidth" for text in texts] if alone else texts
 
 
 def join_labels(labels: Sequence[str]) -> str:

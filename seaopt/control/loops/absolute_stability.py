@@ -53,6 +53,7 @@ MULTIPLIER_POINTS = 9  # corner frequencies tried
 ZAMES_FALB_AREAS = (0.5, 0.9, 0.99)
 SMALLEST_INVERSE, LARGEST_INVERSE = 1e-6, 1e6  # 1/kappa looked at, in units of the curves' own 1/slope
 MARGIN_PRECISION = 1e-2
+SIMPLEST = "circle"  # the multiplier that is 1
 WORTHWHILE = 0.9  # of the inverse: a multiplier that gains less is not looked at further
 
 Angles = Float[np.ndarray, " m"]
@@ -89,6 +90,11 @@ class FrictionMargin:
     def proved(self) -> bool:
         """Whether stability is proved for the curves as they are."""
         return self.factor >= 1.0
+
+    @property
+    def least_slope(self) -> float:
+        """The least of the slopes that are proved, N s/m (N m s/rad), of what is not viscous."""
+        return min((slope for slope in self.slopes if slope > 0.0), default=0.0)
 
     def __str__(self) -> str:
         if not self.factor:
@@ -165,14 +171,14 @@ class _Responses:
     order: Float[np.ndarray, " m"]
 
 
-def _respond(loop: FrictionLoop, theta: Angles) -> _Responses:
-    """Return G_v, a (without M) and b at angles."""
+def _respond(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> _Responses:
+    """Return G_v, a (without M) and b at angles; a per unit of K without the feedback."""
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
     orders = np.arange(-ALIASES, ALIASES + 1)
     seen = np.vstack([root[:, None] * loop.velocity, loop.measured])  # phi = slope v: the slope of phi / root is 1
     response = loop.respond(theta, orders, seen)
     by_friction = root * response.by_friction
-    gain = loop.feedback(theta)[:, None, None]
+    gain = loop.feedback(theta)[:, None, None] if feedback else 1.0
     return _Responses(
         theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :-1, :],
         command=-gain * response.by_motor[..., :-1],
@@ -229,14 +235,18 @@ def _compare(
 
     The terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
     """
-    reach = (TAIL_GROWTH * at.order**2 * at.tail)[angles]
-
-    def rest(terms: Complex[np.ndarray, "a n"] | Float[np.ndarray, "a n"]) -> Angles:
-        return reach * np.maximum(np.abs(terms[:, 0]), np.abs(terms[:, -1]))
-
-    product = (np.sum(alpha, axis=1) + rest(alpha)) * (np.sum(beta, axis=1) + rest(beta))
-    least = np.abs(2.0 + np.sum(gamma, axis=1)) - rest(gamma)
+    product = np.sum(alpha, axis=1) + _bound_rest(at, alpha, angles)
+    product = product * (np.sum(beta, axis=1) + _bound_rest(at, beta, angles))
+    least = np.abs(2.0 + np.sum(gamma, axis=1)) - _bound_rest(at, gamma, angles)
     return (np.sign(least) * least**2 - product) / (4.0 + np.abs(product))
+
+
+def _bound_rest(
+    at: _Responses, terms: Complex[np.ndarray, "a n"] | Float[np.ndarray, "a n"], angles: Places = EVERY
+) -> Angles:
+    """Return a bound on what is beyond the last aliases of terms that fall like 1/omega^2."""
+    reach = TAIL_GROWTH * at.order[angles] ** 2 * at.tail[angles]
+    return reach * np.maximum(np.abs(terms[:, 0]), np.abs(terms[:, -1]))
 
 
 def _least_inverse(test: Test, bar: float) -> float | None:
@@ -292,7 +302,7 @@ def _refine(theta: Angles, values: Angles) -> Float[np.ndarray, " new"]:
 
 def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
     """Yield multipliers by name: none, Popov's, and those of Zames and Falb, over corner frequencies."""
-    yield "circle", np.ones_like
+    yield SIMPLEST, np.ones_like
     rates = np.geomspace(0.02, 2.0, MULTIPLIER_POINTS) * np.pi / loop.plant.sample_time_s
 
     def popov(eta: float) -> Multiplier:
@@ -308,3 +318,55 @@ def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
                 name = f"Zames-Falb, {share:g} at {sign * rate / (2 * np.pi):.3g} Hz"
                 # A negative rate is the anticausal one: -rate / (-rate + s) = rate / (rate - s).
                 yield name, zames_falb(share, sign * rate)
+
+
+@record(eq=False)
+class FeedbackLimit:
+    r"""What a proof asks of the feedback, at m angles: abs(C_y) < level abs(1 + plant C_y).
+
+    K, to which a is proportional, is :math:`C_y/(1 + P C_y)`. So :math:`\alpha = |K|^2 \alpha_1`,
+    :math:`\gamma = K \gamma_1`, and :math:`|2 + \gamma|^2 > \alpha\beta` reads
+
+    .. math:: |1 + (P + \tfrac12 \gamma_1) C_y| > \tfrac12 \sqrt{\alpha_1 \beta}\, |C_y| .
+
+    Parameters
+    ----------
+    plant : array, shape (m,)
+        :math:`P + \gamma_1/2`, with the loop's delay.
+    level : array, shape (m,)
+        :math:`2/\sqrt{\alpha_1 \beta}`, less what is beyond the aliases; zero where no feedback does.
+
+    """
+
+    plant: Complex[np.ndarray, " m"]
+    level: Float[np.ndarray, " m"]
+
+
+def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: float) -> FeedbackLimit:
+    """Return what is asked of C_y so that a multiplier proves stability for curves `factor` times as steep as they are.
+
+    Parameters
+    ----------
+    loop : FrictionLoop
+        The loop with its friction taken out; its own law does not matter.
+    theta : array, shape (m,)
+        Angles.
+    multiplier : str
+        As named in a `FrictionMargin`.
+    factor : float
+        Of the curves' own steepest slopes.
+
+    """
+    at = _respond(loop, theta, feedback=False)
+    through = loop.plant.response(theta / (2 * np.pi * loop.plant.sample_time_s))
+    weight = dict(_multipliers(loop))[multiplier](at.s)
+    block = weight[..., None, None] * (at.mobility + np.eye(at.mobility.shape[-1]) / factor)
+    block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
+    possible = np.all(np.linalg.eigvalsh(block) > 0.0, axis=(-2, -1))
+    block = np.where(possible[:, None, None, None], block, np.eye(block.shape[-1]))
+    right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
+    sums = np.conj(np.swapaxes(right, -1, -2)) @ np.linalg.solve(block, right)
+    (alpha, beta), gamma = (np.real(sums[..., i, i]) for i in range(2)), sums[..., 1, 0]
+    alpha, beta = (np.sum(terms, axis=1) + _bound_rest(at, terms) for terms in (alpha, beta))
+    size = np.sqrt(alpha * beta) + _bound_rest(at, gamma)
+    return FeedbackLimit(plant=through + 0.5 * np.sum(gamma, axis=1), level=np.where(possible, 2.0 / size, 0.0))

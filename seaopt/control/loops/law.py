@@ -222,3 +222,10 @@ def _power(polynomial: Float[np.ndarray, " n"], exponent: int) -> Float[np.ndarr
     for _ in range(exponent):
         out = np.convolve(out, polynomial)
     return out
+
+
+def make_static_law(gain: float, sample_time_s: float) -> Law:
+    """Return the law that feeds back a gain of the error and nothing else."""
+    return Law(
+        a=np.zeros((0, 0)), b=np.zeros((0, 2)), c=np.zeros(0), d=np.array([gain, -gain]), sample_time_s=sample_time_s
+    )

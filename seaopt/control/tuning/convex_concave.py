@@ -37,6 +37,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
+    FRICTION,
     GAINS,
     K_D,
     K_P,
@@ -158,11 +159,11 @@ def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _L
     rows, m = _LinearLimits(), grid.f.size
     usage = task.usage(grid, x)
 
-    def chosen(name: str) -> tuple[Any, Any, Any, Any]:
+    def chosen(name: str, plants: Complex[np.ndarray, "k m"] = grid.p) -> tuple[Any, Any, Any, Any]:
         """Return usage, plant response, law's columns, and 1 + L of the points that matter."""
         index = choose_prominent(usage[name], ROWS_PER_LIMIT)
         index = index[usage[name].ravel()[index] > 0.4]
-        p, column = grid.p.ravel()[index], index % m
+        p, column = plants.ravel()[index], index % m
         return usage[name].ravel()[index], p, column, 1.0 + p * law.c_y[column]
 
     for name, curve in CURVES.items():
@@ -179,6 +180,11 @@ def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _L
         used, _, column, _ = chosen(PASSIVE)
         turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
         rows.add(used, -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * size[:, None]))
+    if FRICTION in usage:
+        used, p, column, one = chosen(FRICTION, grid.rubbing)
+        c_y, by_y = law.c_y[column], law.by_y[:, column]
+        near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
+        rows.add(used, used[:, None] * (_differentiate_size(c_y, by_y) / np.abs(c_y)[:, None] - near))
     _add_bandwidth(task, grid, x, law, rows)
     return rows
 

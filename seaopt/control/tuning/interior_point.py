@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 from seaopt.control.laws.structures import evaluate_terms
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
+    FRICTION,
     GAINS,
     K_D,
     K_I,
@@ -161,9 +162,11 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
 
 
 @lru_cache(maxsize=32)
-def _build_program(quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool) -> tuple[Any, list[str]]:
+def _build_program(
+    quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool, proof: bool
+) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
-    kinds = (*CURVES, *([PASSIVE] * passive))
+    kinds = (*CURVES, *([PASSIVE] * passive), *([FRICTION] * proof))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
     shapes = {
@@ -200,6 +203,10 @@ def _build_program(quadrature: int, observer: bool, notch: bool, noise: bool, pa
             cosine = (u.re * one.re[where] + u.im * one.im[where]) / ca.sqrt(distance[where])
             usage[kind] = (1 - cosine) / ca.exp(data["ln_level"][where]) - 1
             continue
+        if kind == FRICTION:  # a noise gain, on a plant of its own
+            size = (c_y.square()[where] + SMOOTHING) / distance[where]
+            usage[kind] = 0.5 * ca.log(size) - data["ln_level"][where]
+            continue
         curve = CURVES[kind]
         value = curve.numerator(p, c_y, c_r, open_loop)
         top = value.square()[where] if isinstance(value, _Complex) else value
@@ -233,7 +240,7 @@ def _build_program(quadrature: int, observer: bool, notch: bool, noise: bool, pa
 def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    m, kinds, passive = grid.f.size, (*CURVES,), task.port is not None
+    m, kinds, passive, proof = grid.f.size, (*CURVES,), task.port is not None, grid.rubbing.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
     levels = [task.level(kind, grid.f[chosen[kind] % m]) for kind in kinds]
@@ -242,6 +249,10 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         levels.append(np.full(at_port.size, 1.0 - spec.reserve))
         columns, p = np.concatenate([columns, at_port]), np.concatenate([p, grid.port[at_port]])
         unit = np.where(grid.unit[at_port] == 0.0, 1.0, grid.unit[at_port])  # outside the band nothing is asked
+    if proof:
+        at_proof = chosen[FRICTION]
+        levels.append(grid.rubbing_level.ravel()[at_proof])
+        columns, p = np.concatenate([columns, at_proof % m]), np.concatenate([p, grid.rubbing.ravel()[at_proof]])
     weights = np.zeros(0)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
@@ -276,6 +287,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         spec.notch is not None,
         noise,
         passive,
+        proof,
     )
     used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
     value = task.objective(grid, start)

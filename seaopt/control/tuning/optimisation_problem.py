@@ -13,7 +13,8 @@ reserve, these are for the rows of today
 
 with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`. In the passive band there is a further one,
 1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.laws.passivity`), the gap that the reserve leaves
-taken off.
+taken off; and where a friction margin is asked for, one of each plant with friction, the proof with one multiplier
+(`seaopt.control.loops.absolute_stability.FeedbackLimit`): a noise gain, on another plant and below a level of its own.
 
 The reference's weights are counted from feedforward and feedback of the error: with :math:`w_r = 1/P(0) + k_p - k_r`
 and :math:`w_c = (1 - c) k_d`,
@@ -27,14 +28,18 @@ and :math:`w_c = (1 - c) k_d`,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from seaopt.control.laws.friction_proof import prove_loop
 from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
+from seaopt.control.loops.absolute_stability import LOWEST_ANGLE, SIMPLEST, FrictionMargin, limit_feedback
+from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.control.loops.port import PortModel, weigh_passivity
@@ -56,7 +61,8 @@ SCOPES: dict[Scope, tuple[str, ...]] = {
     scope: tuple(name for name in CURVES if BY_NAME[name].scope == scope) for scope in ("every plant", "design plant")
 }
 TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
-PASSIVE = "passive_band_hz"
+PASSIVE, FRICTION = "passive_band_hz", "min_friction_margin"
+PROOF_RESERVE = 0.02  # of the slope to be proved: the proof gives its margin to a hundredth, and looks between angles
 
 LawNumbers = Float[np.ndarray, " 10"]  # k_p, k_i, k_d, w_r, w_c, T_f, T_q, notch_w, notch_width, notch_depth
 K_P, K_I, K_D, W_R, W_C, T_F, T_Q, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH = range(10)
@@ -79,6 +85,8 @@ class Grid:
         The nominal plant's parts at q; zeros without an observer.
     port, unit
         The loop with link 2 held but for C_y, and G_22/abs(G_22), in the passive band; zeros elsewhere.
+    rubbing, rubbing_level : arrays, shape (frictions, m)
+        Plant and level of a `FeedbackLimit` for each friction that is to be proved harmless.
 
     """
 
@@ -90,13 +98,36 @@ class Grid:
     inverse: Complex[np.ndarray, " m"]
     port: Complex[np.ndarray, " m"]
     unit: Complex[np.ndarray, " m"]
+    rubbing: Complex[np.ndarray, "k m"]
+    rubbing_level: Float[np.ndarray, "k m"]
 
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
             f=self.f[index], q=self.q[index], p=self.p[:, index], rows=self.rows, kept=self.kept[index],
-            inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
+            inverse=self.inverse[index], port=self.port[index], unit=self.unit[index], rubbing=self.rubbing[:, index],
+            rubbing_level=self.rubbing_level[:, index],
         )  # fmt: skip
+
+
+@record(eq=False)
+class RubbingPlant:
+    """A plant with friction, of which stability is to be proved for steeper friction than its own.
+
+    Parameters
+    ----------
+    plant : int
+        Which of the task's plants slides as it does.
+    loop : FrictionLoop
+        The loop with its friction taken out; its own law does not matter.
+    multiplier : str
+        That of the proof aimed at; empty where none is chosen yet, and nothing asked while the law is looked for.
+
+    """
+
+    plant: int
+    loop: FrictionLoop
+    multiplier: str = ""
 
 
 @record(eq=False)
@@ -104,7 +135,7 @@ class Task:
     """A specification with the plants it is to hold for.
 
     The first is the design plant, whose port must be passive; of two `design_states` it is the sliding one, and the
-    second plant is the same one stuck by its friction.
+    second plant is the same one stuck by its friction. `rubbing` are those of which a friction margin is asked.
     """
 
     spec: ControllerSpec
@@ -114,6 +145,7 @@ class Task:
     nominal: Nominal | None
     port: PortModel | None = None
     design_states: int = 1
+    rubbing: tuple[RubbingPlant, ...] = ()
 
     def integrates(self, x: LawNumbers) -> bool:
         """Tell whether the law integrates the error: not a pd, nor a disturbance observer that is alone at it."""
@@ -227,7 +259,28 @@ class Task:
             port[inside], unit[inside] = weigh_passivity(
                 self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside]
             )  # fmt: skip
-        return Grid(f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit)
+        asked = [one for one in self.rubbing if one.multiplier and one.plant in rows]
+        rubbing, level = np.zeros((len(asked), f.size), dtype=complex), np.zeros((len(asked), f.size))
+        for k, one in enumerate(asked):
+            rubbing[k], level[k] = self._limit_feedback(one, f)
+        return Grid(
+            f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit, rubbing=rubbing,
+            rubbing_level=level,
+        )  # fmt: skip
+
+    def _limit_feedback(
+        self, rubbing: RubbingPlant, f: Float[np.ndarray, " m"]
+    ) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Return plant and level of what a proof asks; nothing is asked below its lowest angle."""
+        slope, own = self.spec.level(FRICTION), rubbing.loop.slopes
+        assert slope is not None, "rubbing plants belong to a specification with a friction margin"
+        factor = slope * (1.0 + self.spec.reserve + PROOF_RESERVE) / float(np.min(own[own > 0.0]))
+        theta = 2 * np.pi * f * self.spec.sample_time_s
+        asked = theta >= LOWEST_ANGLE
+        limit = limit_feedback(rubbing.loop, theta[asked], rubbing.multiplier, factor)
+        plant, level = np.zeros(f.size, dtype=complex), np.full(f.size, NO_LIMIT)
+        plant[asked], level[asked] = limit.plant, np.maximum(limit.level, 1.0 / NO_LIMIT)
+        return plant, level
 
     def terms(self, grid: Grid, x: LawNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
@@ -249,7 +302,7 @@ class Task:
         for position in range(len(grid.rows)):
             for name, curve in self.design_usage(grid, position, c_y, c_r).items():
                 rows.setdefault(name, []).append(curve)
-        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r)
+        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r) | self.rubbing_usage(grid, c_y)
         return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
     def curves(
@@ -301,6 +354,26 @@ class Task:
         cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
         return {PASSIVE: np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)}
 
+    def rubbing_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
+        """Return the usage of the proofs aimed at, of each law one row per proof, where there are any."""
+        if not grid.rubbing.size:
+            return {}
+        own = c_y[..., None, :]
+        return {FRICTION: np.abs(own) / (grid.rubbing_level * np.abs(1.0 + grid.rubbing * own))}
+
+    def aim_proofs(self, x: LawNumbers, multiplier: str = "") -> Task:
+        """Return the task with one multiplier for every rubbing plant: that named, or the one that proves most of x."""
+        names = [multiplier] * len(self.rubbing) if multiplier else [
+            margin.multiplier if margin.factor else SIMPLEST for margin in self.prove(x)
+        ]  # fmt: skip
+        aimed = (replace(one, multiplier=name) for one, name in zip(self.rubbing, names, strict=True))
+        return replace(self, rubbing=tuple(aimed))
+
+    def prove(self, x: LawNumbers) -> list[FrictionMargin]:
+        """Return the friction margin of every rubbing plant."""
+        law = self.law_of(x)
+        return [prove_loop(replace(one.loop, law=law)) for one in self.rubbing]
+
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""
         port, spec, band, law = None, self.spec, self.spec.passive_band_hz, self.law_of(x).balanced()
@@ -308,10 +381,11 @@ class Task:
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
         filter_samples = float(x[T_F] / spec.sample_time_s) if x[K_D] > 0.0 else np.inf
         integral_rad_s = float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf
+        slopes = dict(zip((one.plant for one in self.rubbing), (one.least_slope for one in self.prove(x)), strict=True))
         return [
             MeasuredLoop(
                 name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,
-                filter_samples=filter_samples, integral_rad_s=integral_rad_s,
+                filter_samples=filter_samples, integral_rad_s=integral_rad_s, friction_slope=slopes.get(i, np.inf),
             )
             for i, name in enumerate(self.names)
         ]  # fmt: skip

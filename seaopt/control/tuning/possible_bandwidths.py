@@ -46,7 +46,7 @@ class _Probes:
     """What was found at the bandwidths tried: how much of a limit is used, 0 where all are kept, and the numbers."""
 
     def __init__(self, task: Task, x: LawNumbers) -> None:
-        self.task, self.asked = task, task.spec.bandwidth_hz
+        self.task, self.asked = task.aim_proofs(x), task.spec.bandwidth_hz
         self.tried: dict[float, tuple[float, LawNumbers]] = {self.asked: (np.inf, x)}
 
     def find(self) -> tuple[PossibleBandwidths, list[LawNumbers]]:

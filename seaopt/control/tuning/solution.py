@@ -5,27 +5,35 @@
 3. an interior-point method in all numbers at once, on exact derivatives (`interior_point`);
 4. a recheck on frequencies that resolve every pole of plants and closed loops; where a limit is broken between the
    frequencies, those are added and step 3 is repeated.
+
+A friction margin is asked for afterwards, of the law that is best without, and everything repeated with it as a limit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ
+from seaopt.control.laws.verdict import list_broken_limits
+from seaopt.control.loops.absolute_stability import SIMPLEST
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import Grid, LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.optimisation_problem import FRICTION, Grid, LawNumbers, Task, place_frequencies
 from seaopt.control.tuning.starts import find_starts
 
 STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
 STARTS_REFINED = 2  # one more with an observer, all with a notch
 RECHECKS = 3
+MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
+LEAST_MARGIN = 1e-3  # of the one asked: less is not looked for
+Solution = tuple[LawNumbers, list[MeasuredLoop]]  # with the loop of every plant
 
 
-def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> tuple[LawNumbers, list[MeasuredLoop]]:
+def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> Solution:
     """Find the best numbers, and return them with every plant's loop.
 
     Parameters
@@ -36,6 +44,56 @@ def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> tuple[LawNumbers, list
         Numbers to start from besides those of the scan, which then tries one less.
 
     """
+    x, loops = _solve_once(task, warm)
+    return _meet_friction_margin(task, x, loops) if task.rubbing else (x, loops)
+
+
+def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
+    """Return the best law with the friction margin asked for, from the best without.
+
+    The multiplier that proves most of a law is made a limit, and the best law with that looked for, as another may then
+    prove more. Where none has the margin, it is the law with the largest that keeps all other limits.
+    """
+    best = (x, loops)
+    for multiplier in ("", "", SIMPLEST):
+        broken = list_broken_limits(task.spec, best[1], task.design_states)
+        if not broken:
+            return best
+        tried = _solve_once(task.aim_proofs(best[0], multiplier), (best[0],))
+        missed = list_broken_limits(task.spec, tried[1], task.design_states)
+        if not missed or broken - {FRICTION}:  # what cannot be kept without a margin cannot be kept with it
+            return tried
+        if missed == {FRICTION} and _least_slope(tried[1]) > _least_slope(best[1]):
+            best = tried
+    return _raise_friction_margin(task, *best)
+
+
+def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
+    """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept."""
+    high = task.spec.level(FRICTION)
+    assert high is not None
+    low, f = max(_least_slope(loops), LEAST_MARGIN * high), place_frequencies(task)
+    while high / low > MARGIN_RESOLUTION:
+        middle = float(np.sqrt(low * high))
+        easier = replace(task, spec=replace(task.spec, min_friction_margin=middle))
+        for aimed in (easier.aim_proofs(x), easier.aim_proofs(x, SIMPLEST)):
+            grid = aimed.grid(f)
+            tried = refine(aimed, grid, improve(aimed, grid, x)[1])
+            measured = aimed.measure(tried)
+            if not list_broken_limits(aimed.spec, measured, aimed.design_states):
+                x, loops, low = tried, measured, _least_slope(measured)
+                break
+        else:
+            high = middle
+    return x, loops
+
+
+def _least_slope(loops: Sequence[MeasuredLoop]) -> float:
+    return min(loop.friction_slope for loop in loops)
+
+
+def _solve_once(task: Task, warm: Sequence[LawNumbers]) -> Solution:
+    """Find the best numbers with the multipliers that are aimed at, or no proof where none is."""
     grid = task.grid(place_frequencies(task))
     x = find_best(task, grid, warm)
     for _ in range(RECHECKS):

@@ -20,15 +20,24 @@ from jaxtyping import Complex
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.friction_proof import make_friction_loops
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Nominal
-from seaopt.control.laws.verdict import PossibleBandwidths, explain_broken, judge_all, list_active, list_broken
+from seaopt.control.laws.verdict import (
+    PossibleBandwidths,
+    explain_broken,
+    judge_all,
+    list_active,
+    list_broken,
+    list_broken_limits,
+)
+from seaopt.control.loops.law import make_static_law
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import sample
 from seaopt.control.tuning.feasibility import check_current, check_delay
-from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, LawNumbers, Task
+from seaopt.control.tuning.optimisation_problem import FRICTION, OBJECTIVE_HZ, LawNumbers, RubbingPlant, Task
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve
 from seaopt.errors import ControlError, suggestion
@@ -93,7 +102,9 @@ def tune(
     check_current(spec, task.k_ff, command, find_dry_friction(plant, values))
     x, loops = solve(task)
     possible = None
-    if list_broken(judge_all(spec, loops, task.design_states)):
+    if list_broken_limits(spec, loops, task.design_states) - {
+        FRICTION
+    }:  # of a margin alone it is known what can be had
         possible, near = find_possible_bandwidths(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
@@ -121,10 +132,12 @@ def make_task(
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in robust_to.items()}
     varied = {parameter for draw in draws for parameter in draw}
     models: dict[str, tuple[Plant, CompletedParameters]] = {}
+    whole: dict[Plant, Plant] = {}  # the plant with its friction, of one that slides
     for name, (model, given) in named.items():
         completed = model.complete(given)
         variants = split_friction({name: model}, completed, varied)
         models |= {one: (variant, variant.complete(completed)) for one, variant in variants.items()}
+        whole |= {variant: model for one, variant in variants.items() if one.endswith(SLIDING)}
     pairs = [*models.items(), *_draw_plants(models, draws)]
     design_plant = pairs[0][1][0]
     plants = tuple(
@@ -147,7 +160,31 @@ def make_task(
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
         design_states=1 if design_plant is plant else 2,
+        rubbing=_find_rubbing(spec, [pair for _, pair in pairs], whole, gain),
     )  # fmt: skip
+
+
+def _find_rubbing(
+    spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]], whole: Mapping[Plant, Plant], gain: float
+) -> tuple[RubbingPlant, ...]:
+    """Return the plants of which a friction margin is asked: of those that slide, `whole` is the one with friction."""
+    if spec.level(FRICTION) is None:
+        return ()
+    open_law = make_static_law(0.0, spec.sample_time_s)
+    out: list[RubbingPlant] = []
+    for number, (model, values) in enumerate(pairs):
+        if model not in whole:
+            continue
+        (loop,) = make_friction_loops(whole[model], [values], spec.measured, gain, spec.loop_delay_samples, open_law)
+        if loop is None:
+            continue
+        if np.any(loop.through * loop.slopes):
+            raise ControlError(
+                f"{FRICTION} = {spec.level(FRICTION):g} cannot be proved on {whole[model].name}: friction acts on the "
+                "measured output itself; leave the limit out, or measure another output"
+            )
+        out.append(RubbingPlant(plant=number, loop=loop))
+    return tuple(out)
 
 
 def _draw_plants(

@@ -70,8 +70,6 @@ class Requirement:
     @property
     def sense(self) -> str:
         """What the value must be to the limit, as a sign; of draws and worst cases it is at most that."""
-        if self.name == MIN_FRICTION_MARGIN:
-            return "≥"
         return BY_REQUIREMENT[self.name].symbol if self.name in BY_REQUIREMENT else "≤"
 
 

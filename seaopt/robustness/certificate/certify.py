@@ -28,6 +28,7 @@ from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.certificate.certificate import (
     DESIGN_NAMES,
+    MIN_FRICTION_MARGIN,
     Certificate,
     MonteCarlo,
     Requirement,
@@ -133,7 +134,7 @@ def certify(
         Required of that bound, so that too few draws do not pass; if left out, the bound is stated, not required.
     min_friction_margin : float, optional
         Required of every plant with friction, N s/m (N m s/rad): stability is proved for friction curves of this slope,
-        counted from the flattest, at the nominal parameters and at up to 100 draws.
+        counted from the flattest, at the nominal parameters and at up to 100 draws; the specification's if left out.
     bounds : Budget, optional
         Also bound the worst case from above, with this much work on each plant; not at all if left out. The bounds
         are not a requirement; a plant that this meets and that is worse than the worst case found replaces it.
@@ -163,6 +164,8 @@ def certify(
 
     """
     _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
+    if min_friction_margin is None:
+        min_friction_margin = controller.spec.level(MIN_FRICTION_MARGIN)
     models, others = _with_design(controller, plants, others or ParameterSet())
     unknown = combine_uncertainty(parameters, others, ranges or {}, models)
     _check_delay(controller, unknown.ranges)

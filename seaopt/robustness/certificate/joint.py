@@ -12,7 +12,7 @@ that the one which passes holds at `confidence`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -25,10 +25,10 @@ from seaopt.formatting import format_count, format_table, format_values, html_te
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
-from seaopt.robustness.certificate.certificate import Certificate
+from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, Certificate
 from seaopt.robustness.certificate.certify import CONFIDENCE, certify
 from seaopt.robustness.uncertainty.severity import UNSTABLE
-from seaopt.robustness.uncertainty.worst import Worst
+from seaopt.robustness.uncertainty.worst import Worst, place_values
 
 MOST_ROUNDS = 6
 SAME_WITNESS = 1e-6  # witnesses that differ by less than this share in every parameter are one
@@ -232,21 +232,31 @@ def _merge_values(parameters: Fit | ParameterSet, others: ParameterSet) -> Param
 def _list_new_witnesses(
     certificate: Certificate | None, known: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
-    """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need."""
+    """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need.
+
+    Of friction it is the draw with the least margin, where that is not what is asked.
+    """
     if certificate is None or certificate.passed:
         return {}
+    cases = {name: (*worst, worst.parameters) for name, worst in certificate.worst.items()}
+    least = certificate.controller.spec.level(MIN_FRICTION_MARGIN)
+    for name, draws in certificate.friction_draws.items():
+        if least is not None and draws.least_slope < least:
+            plant = certificate.models[name]
+            values = place_values(plant, certificate.parameters, draws.parameters)
+            cases[f"{name}'s friction"] = (plant, values, draws.parameters)
     return {
-        f"{name}, round {number}: {_describe_place(worst)}": worst
-        for name, worst in certificate.worst.items()
-        if not any(_is_same(worst, pair) for pair in known)
+        f"{name}, round {number}: {format_values(place, missing='nominal')}": (plant, values)
+        for name, (plant, values, place) in cases.items()
+        if not any(plant is pair[0] and _agree(values, pair[1], place) for pair in known)
     }
 
 
-def _is_same(worst: Worst, pair: tuple[Plant, ParameterSet]) -> bool:
-    plant, values = worst
-    return plant is pair[0] and all(
-        name in pair[1] and np.isclose(values[name].value, pair[1][name].value, rtol=SAME_WITNESS, atol=0.0)
-        for name in worst.parameters
+def _agree(values: ParameterSet, others: ParameterSet, names: Iterable[str]) -> bool:
+    """Tell whether two sets have the same values of some parameters."""
+    return all(
+        name in others and np.isclose(values[name].value, others[name].value, rtol=SAME_WITNESS, atol=0.0)
+        for name in names
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -42,8 +43,9 @@ def design_requirements(controller: Controller, states: Mapping[str, Plant], val
 
 
 def plant_requirements(controller: Controller, name: str, figures: LoopFigures) -> list[Requirement]:
-    """Return what is required of every plant at the nominal parameters."""
-    verdicts = judge(controller.spec, MeasuredLoop(name=name, figures=figures), "every plant")
+    """Return what is required of every plant at the nominal parameters, but for friction margins."""
+    spec = replace(controller.spec, min_friction_margin=None)
+    verdicts = judge(spec, MeasuredLoop(name=name, figures=figures), "every plant")
     return [
         _make_requirement(verdict, "" if figures.stable or verdict.limit.has_field else ": the loop is UNSTABLE")
         for verdict in verdicts
@@ -98,7 +100,7 @@ def friction_requirements(
         return []
     rows: list[Requirement] = []
     for name, margin in margins.items():
-        value, where = min(margin.slopes), f"{name}: {margin.multiplier} at {margin.frequency_hz:.4g} Hz"
+        value, where = margin.least_slope, f"{name}: {margin.multiplier} at {margin.frequency_hz:.4g} Hz"
         drawn = draws.get(name)
         if drawn is not None and drawn.least_slope < value:
             value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
