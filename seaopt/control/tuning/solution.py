@@ -65,20 +65,25 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) 
             return tried
         if missed == {FRICTION} and _least_slope(tried[1]) > _least_slope(best[1]):
             best = tried
-    return _raise_friction_margin(task, *best)
+    return _raise_friction_margin(task, *best, tried[0])
 
 
-def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
-    """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept."""
+def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], other: LawNumbers) -> Solution:
+    """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept.
+
+    At every slope two laws are tried: from the best so far, with the multiplier that proves most of it; and from the
+    `other`, which misses all limits evenly with the simplest.
+    """
     high = task.spec.level(FRICTION)
     assert high is not None
     low, f = max(_least_slope(loops), LEAST_MARGIN * high), place_frequencies(task)
     while high / low > MARGIN_RESOLUTION:
         middle = float(np.sqrt(low * high))
         easier = replace(task, spec=replace(task.spec, min_friction_margin=middle))
-        for aimed in (easier.aim_proofs(x), easier.aim_proofs(x, SIMPLEST)):
+        for start, multiplier in ((x, ""), (other, SIMPLEST)):
+            aimed = easier.aim_proofs(start, multiplier)
             grid = aimed.grid(f)
-            tried = refine(aimed, grid, improve(aimed, grid, x)[1])
+            tried = refine(aimed, grid, improve(aimed, grid, start)[1])
             measured = aimed.measure(tried)
             if not list_broken_limits(aimed.spec, measured, aimed.design_states):
                 x, loops, low = tried, measured, _least_slope(measured)

@@ -238,7 +238,9 @@ def _list_new_witnesses(
     """
     if certificate is None or certificate.passed:
         return {}
-    cases = {name: (*worst, worst.parameters) for name, worst in certificate.worst.items()}
+    cases: dict[str, tuple[Plant, ParameterSet, Mapping[str, float]]] = {
+        name: (worst[0], worst[1], worst.parameters) for name, worst in certificate.worst.items()
+    }
     least = certificate.controller.spec.level(MIN_FRICTION_MARGIN)
     for name, draws in certificate.friction_draws.items():
         if least is not None and draws.least_slope < least:

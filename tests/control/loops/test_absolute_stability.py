@@ -189,3 +189,21 @@ def test_a_multiplier_tried_first_proves_no_more_than_all_of_them():
     assert again.multiplier == best.multiplier
     assert again.factor == pytest.approx(best.factor, rel=0.02)
     assert proof.friction_margin(loop, least=2.0 * best.factor).factor == 0.0
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0, 100.0])
+def test_what_a_proof_asks_of_the_feedback_is_the_proof(factor):
+    """|C_y| below level |1 + plant C_y| at an angle is the test itself, for laws of every kind and every multiplier."""
+    rng, theta = np.random.default_rng(1), np.linspace(0.01, 3.1, 40)
+    agreed = []
+    for _ in range(5):
+        law = pid(rng.uniform(0.1, 4.0), rng.uniform(0.0, 0.04), k_i=rng.uniform(0.3, 200.0))
+        loop = loop_of(law, slope=6250.0)
+        at, c_y = proof._respond(loop, theta), law.measurement_response(theta / (2 * np.pi * PERIOD))
+        for name, multiplier in list(proof._multipliers(loop))[::7]:
+            limit = proof.limit_feedback(loop, theta, name, factor)
+            kept = np.abs(c_y) < limit.level * np.abs(1.0 + limit.plant * c_y)
+            proved = proof._weigh(at, multiplier)(1.0 / factor, proof.EVERY) > 0.0
+            np.testing.assert_array_equal(kept, proved)
+            agreed += [proved]
+    assert 0.0 < np.mean(agreed) < 1.0

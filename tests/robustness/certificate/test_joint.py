@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.errors import ControlError
 from seaopt.robustness import tune_certified
+from seaopt.robustness.certificate.joint import _list_new_witnesses
 
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25,
@@ -102,7 +104,7 @@ def test_what_cannot_be_had_names_witness_limit_and_bandwidth(stand, swing, thor
     done = tune_certified(stand, thor, SPEC, {"swing": swing}, ranges={"delay_s": (0.0, 2e-3)}, samples=5)
     assert done.status == "infeasible"
     assert done.certificate is None
-    assert "(swing, round 1: delay_s = 0.002)" in done.explanation
+    assert "(swing, round 1: delay_s = 0.002 and" in done.explanation
     assert done.controller.largest_bandwidth_hz < 30
     assert f"{done.controller.largest_bandwidth_hz:.4g} Hz is possible" in repr(done)
 
@@ -116,3 +118,19 @@ def test_too_few_rounds_are_no_certificate(stand, swing, thor):
 def test_bad_input(stand, swing, thor):
     with pytest.raises(ControlError, match="rounds = 0"):
         tune_certified(stand, thor, SPEC, {"swing": swing}, rounds=0)
+
+
+def test_a_friction_margin_is_certified_and_the_draw_that_lacks_it_goes_back_to_the_tuner(stand):
+    rubbing = so.plants.thor().update(k=120e3, l=0.005, K_tau=0.075, J=1.2e-5, b_r=2.5e-4, f_c=25.0, v_s=0.004)
+    spec = so.ControllerSpec(bandwidth_hz=20, delay_samples=2, min_friction_margin=4e4)
+    done = tune_certified(stand, rubbing, spec, {"stand": stand}, ranges={"k": (1.1e5, 1.2e5)}, samples=10)
+    (row,) = (row for row in done.certificate.requirements if row.name == "min_friction_margin")
+    assert row.met and row.limit == 4e4 and row.value >= 4e4
+    draws = done.certificate.friction_draws["stand"]
+    lacking = replace(draws, least_slope=3e4)
+    certificate = replace(done.certificate, passed=False, friction_draws={"stand": lacking})
+    ((plant, values),) = (
+        pair for name, pair in _list_new_witnesses(certificate, [], 1).items() if name.startswith("stand's friction")
+    )
+    assert plant is stand
+    assert values["k"].value == draws.parameters["k"]
