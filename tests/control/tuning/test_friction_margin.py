@@ -20,8 +20,8 @@ RUBBING = {
 }  # fmt: skip
 SPEC = so.ControllerSpec(bandwidth_hz=20, delay_samples=lifted.DELAY, max_sensitivity=1.6, max_noise_gain=25)
 ASKED = 2e5  # N s/m; the best law without has 2.5e4, and the friction's own slope is 6.3e3
-# The largest slope at which scipy's differential evolution finds a law that keeps all limits without any reserve, by the
-# equations of benchmarks/bench_friction_margin.py: in 15 s 2.3e5 with the circle criterion, 2.4e5 with Popov's.
+# The largest slope at which scipy's differential evolution finds a law that keeps all limits, without any reserve, by
+# the equations of benchmarks/bench_friction_margin.py: in 15 s 2.3e5 with the circle criterion, 2.4e5 with Popov's.
 SEARCHED = 2.4e5
 
 
@@ -65,7 +65,7 @@ def test_what_is_asked_costs_disturbance_rejection_and_no_other_limit(designed):
 
 
 def test_a_margin_that_cannot_be_had_is_answered_with_the_largest(stand, rubbing):
-    """The other limits are kept, with the tuner's reserve, and what a global search finds is no more than a tenth more."""
+    """The other limits are kept, with the tuner's reserve; what a global search finds is no more than a tenth more."""
     controller = so.tune(stand, rubbing, replace(SPEC, min_friction_margin=1e7))
     slope = prove_friction(controller, stand, rubbing).slopes[0]
     assert not controller.feasible
