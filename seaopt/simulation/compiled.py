@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
-from seaopt.simulation.discretisation import transition
+from seaopt.simulation.discretisation import Clock, transition
 from seaopt.simulation.integrator import rate_functions
 from seaopt.simulation.model import Model
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
@@ -107,9 +107,15 @@ def _pad_to_vectors(count: int) -> int:
     return (count + 3) // 4 * 4
 
 
+@lru_cache(maxsize=8)
+def _discretise(model: Model, theta: bytes, clock: Clock) -> Float[np.ndarray, "blocks rows cols"]:
+    """Return the transition matrices, which all segments of a log share."""
+    return transition(model, np.frombuffer(theta), clock)
+
+
 def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray, " m"]:
     """Return D and A of pass.c: rows of [x+; y], forced with derivatives last, and by the state."""
-    blocks = transition(model, point.theta, point.clock)
+    blocks = _discretise(model, point.theta.tobytes(), point.clock)
     nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _needs_delay(model, point)
     used = [*range(nx + nu * (1 + delayed))] + ([nx + 2 * nu] if _has_constant(model) else [])
     d = np.zeros((rows, len(used), _pad_to_vectors(layout.states)))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, zip_longest
 from typing import TypeVar
 
 import numpy as np
@@ -36,7 +36,8 @@ ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that
 SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the cause, and others need not be tried
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
-MOST_REFITTED = 4  # fixed parameters
+MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
+ALIKE = 1e-3  # of a test's figures, by which parameters that act alike may differ
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
@@ -270,13 +271,17 @@ def _list_candidates(
 
 
 def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTest]) -> Iterator[_Candidate]:
-    """Yield the fixed parameters that are at odds with the logs, and what would make a linear plant nonlinear."""
+    """Yield the fixed parameters that are at odds with the logs, and what would make a linear plant nonlinear.
+
+    One of each group that acts alike, such as a screw's lead and its gear, is tried before the second of any.
+    """
     plain, bending = find_candidates(minimum.problem, fit)
     tests = dict(suspects)
-    for name in bending[:MOST_REFITTED]:
+    for name in bending[:MOST_BENDING]:
         tests |= run_score_tests(minimum, fit, (name,)) if name not in tests else {}
-    chosen = [name for name in tests if name in plain][:MOST_REFITTED] + [name for name in tests if name in bending]
-    for name in chosen:
+    groups = _group_alike({name: test for name, test in tests.items() if name in plain})
+    in_turn = [name for rank in zip_longest(*groups) for name in rank if name is not None]
+    for name in [*in_turn[:MOST_REFITTED], *(name for name in tests if name in bending)]:
         parameter, test = fit.parameters[name], tests[name]
         if name in bending and not parameter.min < test.preferred < parameter.max:
             continue
@@ -290,6 +295,21 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
             )
 
         yield _Candidate(where=name, experiments=fit.experiments, params=params, describe=describe)
+
+
+def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
+    """Return the names in groups of the same test: what no residual distinguishes near the fit."""
+    groups: list[list[str]] = []
+    for name, test in tests.items():
+        for group in groups:
+            first = tests[group[0]]
+            same = abs(test.fall - first.fall) < ALIKE * first.fall and abs(test.chi2 - first.chi2) < ALIKE * first.chi2
+            if same:
+                group.append(name)
+                break
+        else:
+            groups.append([name])
+    return groups
 
 
 def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:

@@ -41,6 +41,7 @@ HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
 FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
+ALIKE = 0.9  # of what the best cause gains: no reason to prefer one
 FAR = 3.0  # times beyond a plausible range
 
 
@@ -262,10 +263,13 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
             )  # fmt: skip
         return
     best = causes[0]
-    alike = [cause for cause in causes[1:] if cause.gain > 0.9 * best.gain]
-    words = "".join(f"; or {cause.text}, which explains as much" for cause in alike[:2])
+    rivals = [cause for cause in causes if cause.gain > ALIKE * best.gain][:3]
+    if len(rivals) == 1:
+        text = f"likely cause: {best.text}{best.consequence}"
+    else:
+        each = "; or ".join(f"{cause.text}{cause.consequence}" for cause in rivals)
+        text = f"{len(rivals)} likely causes explain as much, and the logs do not tell which: {each}"
     yield FitFinding(
-        severity="error" if any(cause.material for cause in (best, *alike)) else "warning", kind="cause",
-        where=best.where,
-        text=f"likely cause: {best.text}{best.consequence}{words}",
+        severity="error" if any(cause.material for cause in rivals) else "warning", kind="cause",
+        where=", ".join(dict.fromkeys(cause.where for cause in rivals)), text=text,
     )  # fmt: skip
