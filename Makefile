@@ -8,7 +8,7 @@ export SEAOPT_CACHE_DIR := $(CURDIR)/$(CACHE)
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test slow check lint types contract notebooks bench bench-peers fuzz nocompiler clean setup
+.PHONY: demo test slow check lint types contract notebooks floors bench bench-peers fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -36,6 +36,15 @@ slow: $(READY)
 # The same numbers without a C compiler: the tests that compare both ways, and the simulation and fit tests.
 nocompiler: $(READY)
 	SEAOPT_COMPILER=none $(PYTEST) -n 2 -q -m "not slow" $(INTERPRETED)
+
+# The lowest versions of the libraries that pyproject.toml declares; FLOOR_TESTS=... for some of the tests. What they
+# themselves depend on is newer, so that they may use what is deprecated there.
+FLOORS      := $(VENV)-floors
+FLOOR_TESTS := tests
+floors: $(READY)
+	$(BIN)/python tools/floors.py > $(CACHE)/floors.txt
+	@sh tools/setup.sh $(FLOORS) $(CACHE)/floors.txt formats,test
+	$(FLOORS)/bin/python -m pytest -n 2 --dist worksteal -q -m "not slow" -W default::DeprecationWarning $(FLOOR_TESTS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -71,4 +80,4 @@ fuzz: $(READY)
 	for target in csv json mat; do $(BIN)/python tools/fuzz.py $$target --seconds $(FUZZ_SECONDS) || exit 1; done
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) $(FLOORS) out

@@ -48,8 +48,9 @@ def _parse(unit: str) -> Any:
     nested = _POWER_OF_POWER.search(unit) or (len(powers) > 1 and re.search(r"\)\s*(?:\^|\*\*)", unit))
     if nested or len(powers) > MAX_POWERS or any(len(digits) > 2 for digits in powers):
         raise UnitError(f'unit "{unit}" raises to a power that no unit has; write it like "N", "kg m^2" or "rad/s"')
+    registry = _registry()
     try:
-        return _registry().Unit(_pint_text(unit))
+        return registry.Unit(_pint_text(unit))
     except Exception as error:  # pint raises many kinds, tokenizer errors among them
         raise UnitError(f'unit "{unit}" is not known; write it like "N", "mA", "kg m^2" or "rad/s"') from error
 

@@ -65,3 +65,7 @@ def test_every_name_on_the_page_exists():
 def test_no_room_is_crowded():
     for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
         assert len(list(folder.glob("*.py"))) <= 15, folder
+
+
+def test_type_checkers_are_told_that_it_is_typed():
+    assert Path(seaopt.__file__).with_name("py.typed").is_file()

@@ -1,7 +1,9 @@
 #!/bin/sh
-# Make a virtual environment with seaopt and its development tools: sh tools/setup.sh FOLDER
+# Make a virtual environment with seaopt: sh tools/setup.sh FOLDER [CONSTRAINTS EXTRAS]; the development tools by default
 set -eu
 venv=$1
+constraints=${2:-constraints.txt}
+extras=${3:-dev}
 python=""
 for candidate in "${PYTHON:-}" python3 python3.14 python3.13 python3.12 python3.11 python; do
     [ -n "$candidate" ] || continue
@@ -17,11 +19,11 @@ fi
 echo "setting up $venv with $("$python" --version); this takes a minute or two, once" >&2
 if command -v uv >/dev/null 2>&1; then
     uv venv --quiet --allow-existing --python "$python" "$venv"
-    VIRTUAL_ENV=$venv uv pip install --quiet --constraint constraints.txt --editable '.[dev]'
+    VIRTUAL_ENV=$venv uv pip install --quiet --constraint "$constraints" --editable ".[$extras]"
 else
     if ! "$python" -m venv "$venv"; then
         echo "this Python cannot make virtual environments: install its venv package (Debian: python3-venv), or uv" >&2
         exit 2
     fi
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$constraints" --editable ".[$extras]"
 fi

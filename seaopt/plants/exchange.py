@@ -67,8 +67,6 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     States start at zero. An output with the name of a state is called NAME_out.
 
     """
-    if not hasattr(ca.DaeBuilder, "export_fmu"):
-        raise PlantError("the installed CasADi has no FMU exporter; install CasADi 3.8 or newer")
     if ca.depends_on(ca.vertcat(plant.dynamics, plant.output), plant.t):
         raise PlantError(f"plant {plant.name} depends on time explicitly, which the export leaves out")
     target = Path(path)

@@ -392,3 +392,12 @@ def test_a_missing_library_names_its_extra(tmp_path, monkeypatch, magic, module,
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(LogError, match=rf"pip install 'seaopt\[{extra}\]'"):
         read_table(path)
+
+
+def test_a_library_too_old_is_no_damaged_file(tmp_path):
+    import polars as pl
+
+    from seaopt.logs.formats.source import translate_errors
+
+    with pytest.raises(LogError, match="not at fault"), translate_errors(tmp_path / "log.csv", "CSV"):
+        pl.read_csv(b"a", an_option_of_the_future=True)

@@ -21,6 +21,7 @@ from seaopt.records import record
 # What one file may unfold to in memory: archives are checked before they are unpacked.
 MAX_UNPACKED = 8 << 30
 _NUMBER_KIND = re.compile(r"bool|u?int\d+|float\d+")
+_WRONG_CALL = re.compile(r"unexpected keyword argument|required positional argument|module '[\w.]+' has no attribute")
 MAX_FIELDS = 100_000
 MAX_PARTS = 256  # columns of one matrix, or elements of one array, that get a name each
 MAX_DEPTH = 32  # of groups, structs, objects or messages inside one another
@@ -243,6 +244,11 @@ def translate_errors(path: Path, form: str) -> Generator[None]:
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise  # an interrupt; a panic of polars is no Exception, but a damaged file all the same
+        if _WRONG_CALL.search(str(error)):
+            raise LogError(
+                f"{path}: the library that reads {form} is not one that seaopt works with ({summarise_error(error)}); "
+                "the file is not at fault, run pip install --upgrade seaopt"
+            ) from error
         raise LogError(
             f"{path}: cannot be read as {form} ({summarise_error(error)}); the file may be cut off or damaged, "
             "copy or record it again"
