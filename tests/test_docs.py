@@ -84,6 +84,7 @@ def test_the_design_of_the_how_to_works():
     assert ratio["J"] > 2.5 and ratio["b_r"] > 2.0
 
 
+@pytest.mark.slow
 def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = (DOCS / "diagnostics.md").read_text(encoding="utf-8")

@@ -109,6 +109,7 @@ def cantilever():
     return share * root_curvature / 3, beta**2 / 3
 
 
+@pytest.mark.slow
 def test_flexlink_frequency_and_damping(data):
     """2.94 Hz as a rigid rod; free damping is negative because the link is a beam, as the link alone shows."""
     flexlink = script("flexlink")
@@ -123,6 +124,7 @@ def test_flexlink_frequency_and_damping(data):
     assert link.derived["clamped_hz"].value == pytest.approx(2.94 * stiffer, rel=0.03)
 
 
+@pytest.mark.slow
 def test_xl330_on_trajectories_not_fitted(data):
     """Friction from the load takes four tenths of the error on other trajectories; the inertia is the published one."""
     xl330 = script("xl330")
@@ -200,6 +202,7 @@ def test_a_missing_log_is_said(name):
     assert "is not there" in out.stdout
 
 
+@pytest.mark.slow
 def test_the_paper_is_reproduced(tmp_path):
     """Printed numbers are met within their own rounding, but for the inconsistencies that the table names."""
     orekhov = script("orekhov2015")

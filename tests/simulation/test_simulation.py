@@ -78,6 +78,7 @@ def test_simulation_is_dop853s(name, hold, thor):
         np.testing.assert_allclose(run[output], expected[:, column], atol=1e-6 * scale, rtol=0)
 
 
+@pytest.mark.slow
 @given(
     st.integers(0, 10_000), st.sampled_from([n for n in CASES if n != "every part"]), st.sampled_from(["zero", "first"])
 )
@@ -165,7 +166,7 @@ SETTINGS = [
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-@pytest.mark.parametrize("case", ["stand", "swing", "swing friction"])
+@pytest.mark.parametrize("case", ["stand", pytest.param("swing", marks=pytest.mark.slow), "swing friction"])
 @pytest.mark.parametrize("options", SETTINGS)
 def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
     keep = {"outputs": True, "columns": True, "states": True}

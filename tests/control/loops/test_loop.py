@@ -68,7 +68,7 @@ def independent(loop, f):
 
 @pytest.mark.parametrize("structure", ["pd", "pid"])
 @pytest.mark.parametrize("name", ["stand", "swing"])
-@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(3, marks=pytest.mark.slow)])
 def test_figures_by_an_independent_calculation(structure, name, delay, request, thor):
     loop = loop_of(structure, request.getfixturevalue(name), thor, delay)
     figures = loop.figures()
@@ -120,6 +120,7 @@ def test_an_unstable_loop_has_no_margins(stand, thor):
     assert np.isinf(figures.ms)
 
 
+@pytest.mark.slow
 def test_a_light_mode_between_grid_points_is_found():
     """zeta = 1e-5 at 77.123 Hz under unit feedback: the peak of S stands on a line 1e-3 Hz wide."""
     wn, zeta, ts = 2 * np.pi * 77.123, 1e-5, 1e-3

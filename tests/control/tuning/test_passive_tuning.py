@@ -18,6 +18,8 @@ BAND = (1.0, 60.0)
 LIFTED = dict.fromkeys(["max_complementary", "max_reference_peak", "max_droop_db", "min_filter_samples"], False)
 LIFTED["reference_weights"] = "error"
 
+SLOW = pytest.mark.slow
+
 
 def real_part(controller, thor, f):
     """Return Re Z from M q'' = F_m - b q' - F2, F1 = k (q + x2), F2 = F1 + m_l (q'' + x2''), with hold and delay."""
@@ -35,8 +37,10 @@ def real_part(controller, thor, f):
     "spec",
     [
         QUIET,
-        {"bandwidth_hz": 30, "max_sensitivity": 2.2, "delay_samples": 2, **LIFTED},
-        {"bandwidth_hz": 15, "max_sensitivity": 2.5, "max_noise_gain": 10},
+        pytest.param(
+            {"bandwidth_hz": 30, "max_sensitivity": 2.2, "delay_samples": 2, **LIFTED}, marks=pytest.mark.slow
+        ),
+        pytest.param({"bandwidth_hz": 15, "max_sensitivity": 2.5, "max_noise_gain": 10}, marks=pytest.mark.slow),
         {"bandwidth_hz": 30, "max_sensitivity": 1.6, "objective": "noise", "structure": "pid_dob"},
     ],
 )
@@ -68,6 +72,7 @@ def test_a_limit_that_is_kept_anyway_changes_nothing(stand, thor):
     assert rejected[1] == pytest.approx(rejected[0], rel=0.005)
 
 
+@SLOW
 def test_a_band_that_the_delay_rules_out_is_said(stand, thor):
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=60, passive_band_hz=(1, 159))
     controller = so.tune(stand, thor, spec)

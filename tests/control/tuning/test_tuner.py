@@ -20,7 +20,7 @@ def tuned(stand, swing, thor, **spec):
     return so.tune(stand, thor, so.ControllerSpec(**{**LIMITS, **spec}), robust_to={"swing": swing})
 
 
-@pytest.mark.parametrize("structure", ["pd", "pid"])
+@pytest.mark.parametrize("structure", [pytest.param("pd", marks=pytest.mark.slow), "pid"])
 @pytest.mark.parametrize("bandwidth", [15, 30, 45, 60])
 def test_thor_from_15_to_60_hz(stand, swing, thor, structure, bandwidth):
     """Every limit, recomputed in NumPy alone on both plants, at Ms 1.6 with the swing plant in robust_to."""
@@ -48,6 +48,7 @@ def test_thor_from_15_to_60_hz(stand, swing, thor, structure, bandwidth):
         assert gains["k_i"] == 0.0
 
 
+@pytest.mark.slow
 def test_it_is_as_good_as_a_long_global_search(stand, thor):
     """scipy's differential evolution over the same four numbers, penalised, a hundred times the time."""
     from scipy.optimize import differential_evolution

@@ -51,6 +51,7 @@ def test_swing_logs_of_the_unlumped_plant_prefer_it_decisively(thor):
     assert "lumped falls short most in bench." in "".join(ranking.sentences)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outputs", [("F1",), ("F1", "F2")])
 def test_swing_logs_of_the_lumped_plant_never_prefer_the_other(thor, outputs):
     log = log_of(so.plants.moving_output, "lumped", PAPER_SWING, thor, duration_s=10)

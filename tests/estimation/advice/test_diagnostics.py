@@ -127,7 +127,7 @@ def test_a_disturbance_is_told_from_what_follows_the_input(stand, thor, log):
     assert item.one_step.used > item.free_run.used + 3
 
 
-@pytest.mark.parametrize("method", [so.OutputError(), so.PredictionError()])
+@pytest.mark.parametrize("method", [so.OutputError(), pytest.param(so.PredictionError(), marks=pytest.mark.slow)])
 def test_held_out_samples_are_predicted_one_step_ahead_too(stand, thor, log, method):
     slow = 60.0 * np.sqrt(1 - 0.99**2) * ar1(0.99, len(log), np.random.default_rng(2))
     moved = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + slow, F2=log["F2"] + slow)

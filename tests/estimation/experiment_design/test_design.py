@@ -46,6 +46,7 @@ def design(plant, params, **options):
 # Powers, phases and information, each by itself
 
 
+@pytest.mark.slow
 def test_the_lags_d_optimal_line_is_at_one_over_root_three_tau():
     """H = K/(1 + i w tau): det F of one line is x^2/(1 + x^2)^4 with x = w tau, largest at 1/sqrt(3)."""
     found = design(LAG, GUESS.free("K", "tau"), criterion="D", signal=Multisines(lines=400))
@@ -208,6 +209,7 @@ def test_peaks_are_kept_to(stand, thor):
     assert "of 500" in repr(found)
 
 
+@pytest.mark.slow
 def test_where_peaks_bind_the_better_of_multisine_and_chirp_is_returned(stand, thor):
     """At 400 N a chirp, whose peak is 1.4 times its rms, may be larger than two lines, whose peak is twice theirs."""
     limits = Limits(duration_s=10, rate_hz=400, rms=np.sqrt(3.0), peaks={"F1": 400.0})
@@ -290,6 +292,7 @@ def test_fits_scatter_as_expected_on_the_swing(swing, swing_design):
         assert value == pytest.approx(best.std[name], rel=0.35)
 
 
+@pytest.mark.slow
 def test_friction_needs_more_than_the_linear_plant(stand, thor):
     """Linearised, f_c/v_s and b_m are one damping; the samples tell them apart, and better than the paper's."""
     truth = thor.update(f_c=30.0, v_s=5e-3).free("b_r", "f_c")

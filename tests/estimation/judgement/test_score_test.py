@@ -88,6 +88,7 @@ def test_a_stiffness_held_20_percent_off_is_named_and_not_the_models_structure(b
     assert "k = 786000 N/m held fixed: chi-square" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_parameter_that_nothing_stands_for_is_named_alone(swing, thor):
     """Friction held at zero: no input is followed, the residual is coloured, and freeing it leaves it white."""
     truth = thor.update(f_c=30.0, v_s=5e-3)

@@ -77,7 +77,7 @@ def test_what_an_arrow_does_not_show_is_named(lost):
     np.testing.assert_allclose(inverse[np.ix_(others, others)], exact[np.ix_(kept, kept)], atol=1e-9)
 
 
-@pytest.mark.parametrize("f_c", [0.0, 20.0])
+@pytest.mark.parametrize("f_c", [0.0, pytest.param(20.0, marks=pytest.mark.slow)])
 def test_a_fit_of_many_segments_is_that_of_the_whole_matrix(f_c, monkeypatch):
     """A linear plant's initial states follow the other unknowns, a nonlinear one's are searched for with them."""
     rng = np.random.default_rng(5)

@@ -26,6 +26,8 @@ METHODS = {
     "multiple_shooting": so.MultipleShooting(segments=20),
     "prediction_error": so.PredictionError(),
 }
+SLOW = pytest.mark.slow
+SLOW_METHODS = [pytest.param(name, marks=SLOW) for name in ("multiple_shooting", "prediction_error")]
 FRICTION = {"f_c": 30.0, "v_s": 5e-3, "d": 0.1}
 
 
@@ -44,7 +46,10 @@ def experiment(plant, log, **options):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("case", ["stand", "swing", "swing, friction"])
+@pytest.mark.parametrize(
+    "case",
+    ["stand", pytest.param("swing", marks=pytest.mark.slow), pytest.param("swing, friction", marks=pytest.mark.slow)],
+)
 def test_each_method_recovers_the_truth(case, method, stand, swing, thor):
     plant = stand if case == "stand" else swing
     truth = thor.update(**(FRICTION if "friction" in case else {"d": 0.1}))
@@ -167,7 +172,7 @@ def test_the_filter_leaves_out_what_no_output_shows():
     assert np.max(np.abs(found)) < 2 * np.max(np.abs(expected))  # and what is not seen is let alone
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["output_error", *SLOW_METHODS])
 def test_a_light_mode_of_free_bodies_is_found(method, thor):
     """Two free masses resonate at 57 Hz with 1 part in 1000 damping: a start a little off is soon out of phase."""
     plant = so.plants.two_link("mass", "mass")
@@ -208,6 +213,7 @@ def test_a_mode_that_rings_through_the_log_is_found(method, factor):
     so.testing.assert_recovered(fit, truth, sigmas=4)
 
 
+@pytest.mark.slow
 def test_noise_that_is_not_there_does_not_slow_the_search(stand, thor):
     """J, b_r and k are a valley of condition 600; the plant is undisturbed, and its noise ends where the prior says."""
     free = thor.update(J=1.1e-5, b_r=2e-5, k=1.5e5).free("J", "b_r", "k")
@@ -217,6 +223,7 @@ def test_noise_that_is_not_there_does_not_slow_the_search(stand, thor):
     so.testing.assert_recovered(fit, thor, sigmas=4)
 
 
+@pytest.mark.slow
 def test_noise_that_rules_a_state_does_not_slow_the_search(thor):
     """Forces on two free masses that no log has: the speed of one is all noise, the rest is told."""
     plant = so.plants.two_link("mass", "mass")
@@ -234,6 +241,7 @@ def test_noise_that_rules_a_state_does_not_slow_the_search(thor):
     so.testing.assert_recovered(fit, truth, sigmas=4)
 
 
+@pytest.mark.slow
 def test_the_published_bad_start_is_overcome():
     """EMPS: single shooting and nlgreyest recover none of these; the benchmark runs a hundred."""
     sys.path.insert(0, str(PROBLEMS))
@@ -346,7 +354,9 @@ IDENTIFIABILITY = [
     ("stand", ("F1",), ("k", "J", "b_r"), "J, b_r and k enter only together"),
     ("stand", ("F1",), ("m_l", "J"), "J and m_l enter only together"),
     ("stand", ("F1", "F2"), ("l", "N_p", "J"), "N_p and l enter only together, as their ratio"),
-    ("swing", ("F1", "F2"), ("m", "L"), "L and m enter only together, as their product"),
+    pytest.param(
+        "swing", ("F1", "F2"), ("m", "L"), "L and m enter only together, as their product", marks=pytest.mark.slow
+    ),
 ]
 
 
@@ -367,6 +377,7 @@ def test_what_no_log_can_tell_is_said_in_words(case, outputs, free, words, stand
     assert all(np.isfinite(fit.parameters[name].std) for name in seen)
 
 
+@pytest.mark.slow
 def test_small_swings_hardly_tell_the_lever_arm(swing, thor):
     """At 10 degrees L_a, I_p, m and d are told apart by the sine's curvature alone: said, and gone with L_a known."""
     truth = thor.update(d=0.3)
@@ -453,6 +464,7 @@ def test_shots_start_where_the_plant_is(options):
         assert fit.outputs["experiment"]["y"].sigma == pytest.approx(1e-3, rel=0.1)
 
 
+@pytest.mark.slow
 def test_stretches_of_a_few_samples_count_in_the_covariance():
     """A log of stretches of seven samples has the std that linear least squares states, not none."""
     time, u, y = lag_log(noise=0.01)
@@ -474,7 +486,7 @@ def test_a_band_without_0_hz_leaves_the_level_to_the_rest(stand, thor):
     assert fit.outputs["log"]["F1"].rms_residual < 3
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["output_error", *SLOW_METHODS])
 def test_noise_alone_is_not_called_a_fit(stand, thor, method):
     rng = np.random.default_rng(3)
     n = 4000

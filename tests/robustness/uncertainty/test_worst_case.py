@@ -127,6 +127,7 @@ def test_the_gaussian_part_stays_inside_its_ellipsoid(controller, swing, thor):
     assert size == pytest.approx(chi2.ppf(0.999, 2), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_worst_case_on_a_physical_bound_is_a_dense_searchs(controller, swing, thor):
     """The bound on b_r cuts the ellipse where the gradient leads: the best point lies along it."""
     tight = thor.prior(J=2e-7, b_r=4e-5).with_parameters(

@@ -160,6 +160,7 @@ def test_with_play_nothing_is_proved_and_no_step_is_absurd(stand, thor):
     assert min(step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]) > 1.0
 
 
+@pytest.mark.slow
 def test_play_makes_the_cycle_of_an_independent_simulator(stand, thor):
     """An integral and little damping: within the play the spring is soft, and the loop grows into it."""
     loose = so.plants.high_impedance(parts=["backlash"])
