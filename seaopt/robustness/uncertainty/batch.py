@@ -74,6 +74,17 @@ def batch_figures(
     """
     values, extra = expand_draws(plant, nominal, draws)
     count = values.shape[1]
+    columns = np.vstack([values, *extra.values()])
+    if count > 1 and np.array_equal(columns, np.repeat(columns[:, :1], count, axis=1)):
+        # Nothing that is drawn concerns this plant: all draws are one loop.
+        one = {name: column[:1] for name, column in draws.items()}
+        single = batch_figures(controller, plant, nominal, one, None, threads, peaks)
+        if progress is not None:
+            progress(count)
+        return BatchFigures(
+            spectral_radius=np.repeat(single.spectral_radius, count), ms=np.repeat(single.ms, count),
+            mt=np.repeat(single.mt, count),
+        )  # fmt: skip
     chain = float(np.max(extra.get(DELAY, np.zeros(1))))
     parts: list[tuple[Float[np.ndarray, " _"], ...]] = []
     with ThreadPoolExecutor(threads) as pool:
