@@ -65,19 +65,21 @@ EVERY = slice(None)
 
 @record
 class FrictionMargin:
-    """How much steeper than they are all friction curves may be with stability still proved.
+    """How much steeper than they are all friction curves may be for the test of stability to hold.
 
     Parameters
     ----------
     factor : float
-        Of the curves' own steepest slopes, 1 and more where stability is proved for the curves as they are; infinite
-        where even a jump (ideal Coulomb friction) is proved, zero where nothing is.
+        Of the curves' own steepest slopes, 1 and more where the test holds for the curves as they are; infinite where
+        it does even for a jump (ideal Coulomb friction), zero where it does for nothing.
     slopes : tuple of float
-        The slopes that are proved, N s/m (N m s/rad).
+        The slopes up to which it holds, N s/m (N m s/rad).
     frequency_hz : float
         Where the test fails first with steeper curves.
     multiplier : str
-        What proves it.
+        With which it holds.
+    angles : int
+        At how many angles it was looked at, those about the worst of them included; between them nothing is enclosed.
 
     """
 
@@ -85,10 +87,11 @@ class FrictionMargin:
     slopes: tuple[float, ...]
     frequency_hz: float
     multiplier: str
+    angles: int = 0
 
     @property
     def proved(self) -> bool:
-        """Whether stability is proved for the curves as they are."""
+        """Whether the test of stability holds, at every angle looked at, for the curves as they are."""
         return self.factor >= 1.0
 
     @property
@@ -98,17 +101,18 @@ class FrictionMargin:
 
     def __str__(self) -> str:
         if not self.factor:
-            return f"friction: stability between sliding and stuck is not proved ({self.multiplier})"
+            return f"friction: stability between sliding and stuck is not shown ({self.multiplier})"
         steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as its own"
         missing = "" if self.proved else "; for its own it is not"
-        return f"friction: stability is proved for every curve {steep}, between the samples too{missing}"
+        where = f"by a test at {self.angles} angles, between the samples too"
+        return f"friction: stability is shown for every curve {steep}, {where}{missing}"
 
 
 def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> FrictionMargin:
-    """Return the steepest friction for which the loop is proved stable, the best over all multipliers tried.
+    """Return the steepest friction for which the test of stability holds, the best over all multipliers tried.
 
     The loop without friction must be stable, by its eigenvalues; the caller sees to that. Sums over aliases are
-    truncated with a bound on the rest; rounding is not enclosed.
+    truncated with a bound on the rest; rounding is not enclosed, nor is what lies between the angles looked at.
 
     Parameters
     ----------
@@ -128,7 +132,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         inverse = _least_inverse(test, WORTHWHILE / best.factor if best.factor else bar)
         if inverse is None:
             continue
-        theta, test, inverse = _settle(loop, responses.theta, test, multiplier, inverse)
+        theta, test, inverse, count = _settle(loop, responses.theta, test, multiplier, inverse)
         if np.isinf(inverse) or (best.factor and inverse >= 1.0 / best.factor):
             continue
         worst = int(np.argmin(test(inverse * (1.0 - 0.01), EVERY)))
@@ -136,6 +140,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         best = FrictionMargin(
             factor=float(factor), slopes=tuple(float(slope) for slope in factor * loop.slopes),
             frequency_hz=float(theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
+            angles=count,
         )  # fmt: skip
         if name == first and best.proved:
             break
@@ -144,18 +149,23 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
 
 def _settle(
     loop: FrictionLoop, theta: Angles, test: Test, multiplier: Multiplier, inverse: float
-) -> tuple[Float[np.ndarray, " new"], Test, float]:
-    """Look between the angles, where the test may fail, and give way until it holds; infinite where it never does."""
+) -> tuple[Float[np.ndarray, " new"], Test, float, int]:
+    """Look between the angles, where the test may fail, and give way until it holds; infinite where it never does.
+
+    Returns the last angles, the test at them, 1/kappa and the number of all angles looked at.
+    """
+    count = theta.size
     for _ in range(REFINEMENTS):
         theta = _refine(theta, test(inverse, EVERY))
+        count += theta.size
         test = _weigh(_respond(loop, theta), multiplier)
         again = _least_inverse(test, LARGEST_INVERSE)
         if again is None:
-            return theta, test, np.inf
+            return theta, test, np.inf, count
         if again <= inverse * (1.0 + MARGIN_PRECISION):
-            return theta, test, max(again, inverse)
+            return theta, test, max(again, inverse), count
         inverse = again
-    return theta, test, inverse
+    return theta, test, inverse, count
 
 
 @record(eq=False)

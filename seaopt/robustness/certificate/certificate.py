@@ -194,14 +194,14 @@ class Certificate:
     steps : Verification, str or None
         The simulated steps that every plant is judged by; the reason where they cannot be simulated.
     cycles : mapping of name to tuple of FoundCycle
-        Of each model whose friction is not proved harmless, or whose play makes some: limit cycles predicted and
+        Of each model whose friction is not shown to be harmless, or whose play makes some: limit cycles predicted and
         simulated.
     brackets : mapping of name to Bracket
         Proven bounds on the worst case; empty if bounds were not requested.
     friction : mapping of name to FrictionMargin
-        Of each model with friction: for how steep a friction stability is proved, between sliding and stuck.
+        Of each model with friction: for how steep a friction stability is shown, between sliding and stuck.
     friction_draws : mapping of name to FrictionDraws
-        The same over draws, of those models that are proved at the nominal parameters.
+        The same over draws, of those models for which it is shown at the nominal parameters.
     remarks : tuple of str
         What only the fit could tell, one sentence each: a delay that the controller does not count on.
 

@@ -133,7 +133,7 @@ def certify(
     max_failure_probability : float, optional
         Required of that bound, so that too few draws do not pass; if left out, the bound is stated, not required.
     min_friction_margin : float, optional
-        Required of every plant with friction, N s/m (N m s/rad): stability is proved for friction curves of this slope,
+        Required of every plant with friction, N s/m (N m s/rad): stability is shown for friction curves of this slope,
         counted from the flattest, at the nominal parameters and at up to 100 draws; the specification's if left out.
     bounds : Budget, optional
         Also bound the worst case from above, with this much work on each plant; not at all if left out. The bounds

@@ -1,4 +1,4 @@
-"""How steep a friction stability is proved for, at nominal parameters and over draws, for the certificate.
+"""How steep a friction stability is shown for, at nominal parameters and over draws, for the certificate.
 
 At the nominal parameters every multiplier is tried. Over draws the one that served there is tried first, and the others
 only where it proves too little: a margin of a draw is then a lower bound of what could be proved.
@@ -49,10 +49,10 @@ class FrictionDraws:
     parameters: dict[str, float]
 
     def __str__(self) -> str:
-        head = f"over draws, it is proved for {self.proved} of {self.samples}"
+        head = f"over draws, it is shown for {self.proved} of {self.samples}"
         where = f"at {format_values(self.parameters)}"
         if not self.least_slope:
-            return f"{head}; the first without a proof is {where}"
+            return f"{head}; the first for which it is not is {where}"
         if np.isinf(self.least_slope):
             return f"{head}, however steep"
         return f"{head}, the least up to {self.factor:.3g} times its own {where}"

@@ -95,7 +95,7 @@ def draw_requirements(
 def friction_requirements(
     margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None
 ) -> list[Requirement]:
-    """Return that stability is proved for friction as steep as asked, N s/m, at the nominal values and over draws."""
+    """Return that stability is shown for friction as steep as asked, N s/m, at the nominal values and over draws."""
     if least is None:
         return []
     rows: list[Requirement] = []
