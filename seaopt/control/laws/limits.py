@@ -68,7 +68,7 @@ class MeasuredLoop:
     integral_rad_s : float
         How fast the integral takes an error away, k_i/(1 + k_p); infinite without one.
     friction_slope : float
-        The steepest friction for which stability is proved, N s/m (N m s/rad); infinite where none is to be proved.
+        The steepest friction for which stability is shown, N s/m (N m s/rad); infinite where none is to be proved.
 
     """
 
@@ -340,7 +340,7 @@ LIMITS = (
     Limit(
         name="min_friction_margin", label="friction margin", figure=lambda loop: loop.friction_slope, sense="at least",
         scope="every plant", unit="N s/m",
-        meaning="steepest friction, counted from its flattest slope, for which stability is proved",
+        meaning="steepest friction, counted from its flattest slope, for which stability is shown",
         remedy="ask for the largest that the result names, lower the bandwidth, or allow more noise gain",
     ),
     Limit(
