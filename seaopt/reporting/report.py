@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from seaopt.control import Controller, Frontier
+from seaopt.control import Controller, ForceMPC, Frontier
 from seaopt.control.laws.verdict import join_labels, list_design_figures
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
@@ -26,7 +26,7 @@ from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.verification import Verification
 
-Result = Fit | Ranking | Controller | Certificate | Verification | StabilityMap | LargeSignal
+Result = Fit | Ranking | Controller | ForceMPC | Certificate | Verification | StabilityMap | LargeSignal
 _CAPTIONS = {
     "time": "Measured and model outputs in the time domain",
     "response": "Frequency response: H1 estimate of the log, the fitted model and the second-order fit (16)",
@@ -51,7 +51,7 @@ def write_report(
 
     Parameters
     ----------
-    results : sequence of Fit, Ranking, Controller, Certificate, Verification, StabilityMap, LargeSignal
+    results : sequence of Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, LargeSignal
         At most one of each, of the last any number; sections without a result are left out. A fit that was not
         read from a file has a section of diagnostics. A certificate's simulations need not be listed.
     path : path
@@ -82,8 +82,8 @@ def write_report(
     'report.html'
 
     """
-    kinds = (Fit, Ranking, Controller, Certificate, Verification, StabilityMap)
-    fit, ranking, controller, certificate, verification, coupled = (_select(results, kind) for kind in kinds)
+    kinds = (Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap)
+    fit, ranking, controller, mpc, certificate, verification, coupled = (_select(results, kind) for kind in kinds)
     large = [result for result in results if isinstance(result, LargeSignal)]
     if not any(isinstance(result, (*kinds, LargeSignal)) for result in results):
         raise SeaoptError(
@@ -120,7 +120,8 @@ def write_report(
     port = certificate.simulated if certificate is not None else None
     page = render_template(
         "report.html.jinja", title=title, fit=fit, diagnostics=diagnostics, ranking=ranking, controller=controller,
-        certificate=certificate, figures=sections, verdict=verdict(fit, controller, certificate, verification),
+        certificate=certificate, figures=sections, verdict=verdict(fit, controller, certificate, verification, mpc),
+        mpc=mpc,
         swinging=_swings(certificate), forces=_describe_forces(controller),
         limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
         simulated=render_verification(verification, large, coupled, port, svgs),
@@ -245,7 +246,7 @@ def _describe_simulations(certificate: Certificate) -> str:
 
 def verdict(
     fit: Fit | None, controller: Controller | None, certificate: Certificate | None,
-    verification: Verification | None = None,
+    verification: Verification | None = None, mpc: ForceMPC | None = None,
 ) -> list[tuple[bool, str]]:  # fmt: skip
     """Return one line per stage: whether it is met, and what to say."""
     lines: list[tuple[bool, str]] = []
@@ -254,6 +255,9 @@ def verdict(
     if controller is not None:
         what = "every limit met" if controller.feasible else "not met: " + join_labels(controller.active_constraints)
         lines.append((controller.feasible, f"Controller at {controller.spec.bandwidth_hz:g} Hz: {what}"))
+    if mpc is not None:
+        what = "every limit met" if mpc.feasible else f"not met: {join_labels(mpc.broken)}"
+        lines.append((mpc.feasible, f"Predictive control at {mpc.spec.bandwidth_hz:g} Hz: {what}"))
     if certificate is not None:
         mc = certificate.monte_carlo
         broken = [f"{row.name} ({row.where})" for row in certificate.requirements if not row.met]

@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes
 from seaopt.control.laws.limits import Limit, MeasuredLoop, PortFigures
-from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
 from seaopt.control.laws.verdict import (
     PossibleBandwidths,
@@ -148,7 +148,7 @@ class Controller:
     @property
     def lifted_notes(self) -> tuple[str, ...]:
         """A remark on every limit that the specification lifts."""
-        return tuple(f"{name} = false: this limit is not imposed" for name in self.spec.lifted)
+        return describe_lifted(self.spec)
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -9,13 +9,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
-from seaopt.control.laws.spec import ControllerSpec
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
+
+@runtime_checkable
+class DelayedSpec(Protocol):
+    """What a specification says of time."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def delay_samples(self) -> int | None:
+        """Whole samples from measurement to output, besides the hold; None: not given."""
+        ...
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Of the controller."""
+        ...
+
+
+SpecT = TypeVar("SpecT", bound=DelayedSpec)
 NEGLIGIBLE = 0.01  # of a sample: a delay that is beyond whole samples by less is that many
 
 
@@ -31,8 +50,8 @@ def count_delay_samples(delay_s: float, sample_rate_hz: float) -> int:
     return max(0, math.ceil(delay_s * sample_rate_hz - NEGLIGIBLE))
 
 
-def settle_delay(spec: ControllerSpec, plant: Plant, source: Fit | ParameterSet) -> ControllerSpec:
-    """Return the specification with its delay: as given, or that of a fit's experiments rounded up, 1 at least."""
+def settle_delay(spec: SpecT, plant: Plant, source: Fit | ParameterSet) -> SpecT:
+    """Return a specification with its delay: as given, or that of a fit's experiments rounded up, 1 at least."""
     if spec.delay_samples is not None:
         return spec
     found = count_delay_samples(source.delay_s(plant), spec.sample_rate_hz) if isinstance(source, Fit) else 0

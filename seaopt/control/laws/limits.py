@@ -21,6 +21,7 @@ from typing import Any, Literal
 
 from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, SHOULDER, SHOULDER_FALL, STABLE, LoopFigures
 from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.errors import ControlError
 from seaopt.records import record
 
 LIMIT_ROUNDING = 1e-6  # by which a figure that lies on its limit may be beyond it
@@ -223,6 +224,40 @@ class Limit:
     def in_range(self, asked: float) -> bool:
         """Tell whether a loop could keep what is asked."""
         return (self.above is None or asked > self.above) and (self.below is None or asked < self.below)
+
+    def allow(self, level: float | Literal[False] | None, bandwidth_hz: float) -> float | None:
+        """Return what a specification's level allows, None being its default; None where nothing is imposed.
+
+        `bandwidth_hz` is the one that is asked for. A limit without a field has no level.
+        """
+        if level is False or (self.allowed is not None and self.has_field and level is None):
+            return None
+        if self.allowed is not None:
+            return self.allowed
+        if level is not None:
+            return level
+        return self.default if self.bandwidth_divisor is None else bandwidth_hz / self.bandwidth_divisor
+
+    def check(self, level: Any, bandwidth_hz: float) -> None:
+        """Refuse a level that is no number, or that no loop can keep.
+
+        Raises
+        ------
+        ControlError
+            It is one.
+
+        """
+        if level is None or level is False:
+            return
+        if isinstance(level, bool) or not isinstance(level, (int, float)) or math.isnan(level):
+            raise ControlError(f"{self.name} = {level!r} is not a number; give one")
+        if self.above is not None and not self.in_range(level):
+            upper = "" if self.below is None else f" and less than {self.below:g}"
+            raise ControlError(f"{self.name} = {level:g} can be met by no loop; give more than {self.above:g}{upper}")
+        if self.bandwidth_divisor is not None and not 0.0 <= level < bandwidth_hz:
+            raise ControlError(
+                f"{self.name} = {level:g} is not between 0 and bandwidth_hz = {bandwidth_hz:g}; lower it"
+            )
 
     def keeps(self, value: float, allowed: float) -> bool:
         """Tell whether a figure keeps the limit."""

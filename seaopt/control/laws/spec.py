@@ -146,19 +146,8 @@ class ControllerSpec:
                 raise ControlError(f"{name} = {value!r} is not a number; give one")
 
     def _check_limits(self) -> None:
-        for limit in LEVELS:
-            value = getattr(self, limit.name)
-            if value is not None and value is not False and not limit.in_range(value):
-                upper = "" if limit.below is None else f" and less than {limit.below:g}"
-                raise ControlError(
-                    f"{limit.name} = {value:g} can be met by no loop; give more than {limit.above:g}{upper}"
-                )
-        wanted = self.min_sensitivity_bandwidth_hz
-        if wanted is not None and wanted is not False and not 0.0 <= wanted < self.bandwidth_hz:
-            raise ControlError(
-                f"min_sensitivity_bandwidth_hz = {wanted:g} is not between 0 and bandwidth_hz = "
-                f"{self.bandwidth_hz:g}; lower it"
-            )
+        for name in LIFTABLE:
+            BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
         self._check_notch()
         self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
@@ -205,14 +194,7 @@ class ControllerSpec:
 
     def allowed(self, limit: Limit) -> float | None:
         """Return the value that a limit allows; None where it is not imposed."""
-        value = getattr(self, limit.name) if limit.has_field else None
-        if value is False or (limit.allowed is not None and limit.has_field and value is None):
-            return None
-        if limit.allowed is not None:
-            return limit.allowed
-        if value is not None:
-            return value
-        return limit.default if limit.bandwidth_divisor is None else self.bandwidth_hz / limit.bandwidth_divisor
+        return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
 
     def level(self, name: str) -> float | None:
         """Return the value that the limit of a name allows; None where it is not imposed."""
@@ -221,7 +203,7 @@ class ControllerSpec:
     @property
     def lifted(self) -> tuple[str, ...]:
         """The limits with a default that are not imposed."""
-        return tuple(name for name in LIFTABLE if getattr(self, name) is False and BY_NAME[name].is_default)
+        return list_lifted(self)
 
     @property
     def sensitivity_bandwidth_limit_hz(self) -> float:
@@ -233,3 +215,13 @@ class ControllerSpec:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         notch = None if self.notch is None else asdict(self.notch)
         return values | {"notch": notch, "delay_samples": self.loop_delay_samples}
+
+
+def list_lifted(spec: object) -> tuple[str, ...]:
+    """Return the limits with a default that a specification, of whatever law, does not impose."""
+    return tuple(name for name in LIFTABLE if getattr(spec, name, None) is False and BY_NAME[name].is_default)
+
+
+def describe_lifted(spec: object) -> tuple[str, ...]:
+    """Return a remark on every limit that a specification lifts."""
+    return tuple(f"{name} = false: this limit is not imposed" for name in list_lifted(spec))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +16,20 @@ from seaopt.records import record
 
 BLOCKED_CHARACTERS = 145  # of the limits that a message names, so that it stays below three lines of 80
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
+
+
+@runtime_checkable
+class Limits(Protocol):
+    """What limits need of a specification."""
+
+    @property
+    def bandwidth_hz(self) -> float:
+        """The bandwidth that is asked for."""
+        ...
+
+    def allowed(self, limit: Limit) -> float | None:
+        """Return the value that a limit allows; None where it is not imposed."""
+        ...
 
 
 @record(eq=False)
@@ -75,7 +90,7 @@ class PossibleBandwidths:
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
 
 
-def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
+def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
     """Judge a loop by every limit of a scope that the specification imposes.
 
     With `stuck`, only by those that also hold where the design plant is stuck by its friction.
@@ -91,7 +106,7 @@ def judge(spec: ControllerSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool
     return verdicts
 
 
-def judge_all(spec: ControllerSpec, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
+def judge_all(spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
     """Judge every plant's loop, and the design plant's, which is the first, by its own limits too.
 
     Of two `design_states` the first is the design plant sliding, the second the same plant stuck by its friction.
@@ -127,7 +142,7 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
     ]
 
 
-def explain_broken(spec: ControllerSpec, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
+def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
     """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
 
     `loop` is the design plant's. What is broken most comes first.
@@ -188,14 +203,15 @@ def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[tupl
     return rows
 
 
-def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:
+def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:
     limit, port = verdict.limit, design.port
     if limit.name == "stability":
         return limit.name
     if limit.curve is not None and limit.curve.symbol:
         return f"{limit.name} ({_reached(spec, verdict, loop)})"
-    if limit.name == "passive_band_hz" and port is not None and spec.passive_band_hz is not None:
-        low, high = spec.passive_band_hz
+    band = spec.passive_band_hz if isinstance(spec, ControllerSpec) else None
+    if limit.name == "passive_band_hz" and port is not None and band is not None:
+        low, high = band
         growth = "" if port.held_stable else "; the loop grows with its link held"
         return (
             f"{limit.name} = [{low:g}, {high:g}], Re Z/|Z| {port.least_cosine:.3g} of 0 at {port.at_hz:.4g} Hz{growth}"
@@ -205,7 +221,7 @@ def _explain(spec: ControllerSpec, verdict: Verdict, design: MeasuredLoop, loop:
     return f"{limit.name} {verdict.value:.4g} of {verdict.allowed:g}"
 
 
-def _reached(spec: ControllerSpec, verdict: Verdict, loop: Loop) -> str:
+def _reached(spec: Limits, verdict: Verdict, loop: Loop) -> str:
     """Return how far a curve is off its level: where it first crosses says little when it lies along the level."""
     curve = verdict.limit.curve
     assert curve is not None and curve.until_hz is not None

@@ -59,7 +59,7 @@ def _format_data(mpc: ForceMPC) -> str:
     kalman, prediction, spec = mpc.kalman, mpc.prediction, mpc.spec
     rows = prediction.knots.size + len(prediction.M)
     sizes = {
-        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": spec.delay_samples,
+        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": mpc.delay_samples,
         "KNOTS": prediction.knots.size, "ROWS": rows, "GATE": int(mpc.gate is not None),
         "MAX_HELD": 0 if mpc.gate is None else mpc.gate.max_held,
     }  # fmt: skip

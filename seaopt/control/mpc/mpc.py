@@ -10,6 +10,10 @@ disturbance,
 make the force free of offset wherever a current within limits can (Pannocchia and Rawlings, AIChE J. 49, 2003); and
 the program of `prediction`, which always has a solution, is solved from the last one shifted by a sample.
 
+While no limit is active the controller is a linear law (`ForceMPC.law`), whose loop is judged by the table of limits as
+a tuned controller's is: on the sliding design plant, which it is designed for, and on the stuck one where there is
+friction. The drift carries what friction has above its flattest slope.
+
 What the solver returns is not trusted: its status is checked, its currents are held against the limits, and the one
 that is used is clipped to them. If it fails, the current goes towards :math:`u_s` as fast as the slew limit lets it,
 and the step says so.
@@ -17,32 +21,42 @@ and the step says so.
 
 from __future__ import annotations
 
+import math
 import time
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import field, replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import command_of
+from seaopt.control.laws.delay import settle_delay, warn_short_delay
+from seaopt.control.laws.friction_proof import lack_proof, make_friction_loops, prove_loop
+from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
+from seaopt.control.laws.spec import describe_lifted
+from seaopt.control.laws.verdict import Verdict, explain_broken, join_labels, judge_all, list_broken, shorten_blocked
+from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
 from seaopt.control.mpc.quadratic_program import make_solver, solve_program
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.errors import ControlError, suggestion
+from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
-from seaopt.formatting import format_count, html_text
+from seaopt.formatting import format_count, format_number, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
-from seaopt.plants.friction import take_sliding
+from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.records import record
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
+STEP_DOWN, STEPS_DOWN, BISECTIONS = 0.85, 12, 4  # of the search for a bandwidth that is possible: down to a seventh
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
 
 
@@ -131,6 +145,17 @@ class ForceMPC:
     gate : PlausibilityGate, optional
         Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
         current goes to zero.
+    loops : mapping of name to Loop
+        Around the design plant while no limit is active, efforts in newtons of motor force; with friction sliding and
+        then stuck.
+    verdicts : tuple of Verdict
+        Every limit of the specification against these loops.
+    possible_hz : float or None
+        Where a limit is broken: the largest bandwidth that keeps them all; None where none is known.
+    friction : FrictionMargin or None
+        How much steeper friction may be with stability proved while no limit is active; None without friction.
+    warnings : tuple of str
+        What is doubtful, such as a delay that is too short.
 
     """
 
@@ -144,6 +169,66 @@ class ForceMPC:
     shift: Float[np.ndarray, "n n"]
     solver: Any
     gate: PlausibilityGate | None = None
+    loops: Mapping[str, Loop] = field(default_factory=dict[str, Loop])
+    verdicts: tuple[Verdict, ...] = ()
+    possible_hz: float | None = None
+    friction: FrictionMargin | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def measured(self) -> str:
+        """The output that is fed back."""
+        return self.spec.measured
+
+    @property
+    def sample_time_s(self) -> float:
+        """Seconds between samples."""
+        return self.spec.sample_time_s
+
+    @property
+    def delay_samples(self) -> int:
+        """Whole samples from measurement to output, besides the hold."""
+        return self.spec.loop_delay_samples
+
+    @property
+    def per_effort(self) -> float:
+        """The command for one unit of effort, of the design plant."""
+        return command_of(*self.design, self.measured).per_effort
+
+    @property
+    def achieved(self) -> LoopFigures:
+        """Of the design plant while no limit is active, sliding where it has friction."""
+        return next(iter(self.loops.values())).figures()
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every limit is met, as measured."""
+        return all(verdict.met for verdict in self.verdicts)
+
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """The limits that are broken, with the state of the design plant that breaks them."""
+        return tuple(list_broken(self.verdicts))
+
+    @property
+    def explanation(self) -> str:
+        """One line: the limits that block, and the bandwidth that is possible; empty where every limit is met."""
+        if self.feasible:
+            return ""
+        name, loop = next(iter(self.loops.items()))
+        design = MeasuredLoop(name=name, figures=loop.figures())
+        blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, design, loop))
+        remedy = (
+            f"{self.possible_hz:.4g} Hz is possible" if self.possible_hz is not None
+            else "no lower bandwidth is known that keeps them; shorten the delay, sample faster, or raise a limit"
+        )  # fmt: skip
+        return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}; {remedy}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks besides the limits, one sentence each."""
+        proof = () if self.friction is None else (f"{self.friction}, while no limit is active",)
+        return (*describe_lifted(self.spec), *self.warnings, *proof)
 
     @property
     def start(self) -> MPCState:
@@ -256,7 +341,7 @@ class ForceMPC:
     def unlimited(self) -> Law:
         """Return what the controller is as long as no limit is active: from reference and measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.spec.current_limit_A
-        n, delay = len(self.kalman.A), self.spec.delay_samples
+        n, delay = len(self.kalman.A), self.delay_samples
         past = max(delay, 1)  # of which the last command is one
 
         def respond(s: Float[np.ndarray, " k"], r: float, y: float) -> Float[np.ndarray, " k1"]:
@@ -285,22 +370,56 @@ class ForceMPC:
 
         A plant with friction slides, as in `Controller.close`.
         """
-        scale = command_of(*self.design, self.spec.measured).per_effort
-        law = self.unlimited()
-        spec, sliding = self.spec, take_sliding(plant, params)
-        digital = sample(sliding, params, spec.measured, scale, spec.sample_time_s, spec.delay_samples)
-        return Loop(plant=digital, law=replace(law, b=law.b / scale, d=law.d / scale))
+        sliding = take_sliding(plant, params)
+        digital = sample(sliding, params, self.measured, self.per_effort, self.sample_time_s, self.delay_samples)
+        return Loop(plant=digital, law=self.law)
+
+    @property
+    def law(self) -> Law:
+        """What it is while no limit is active, from reference and measurement to effort."""
+        law, scale = self.unlimited(), self.per_effort
+        return replace(law, b=law.b / scale, d=law.d / scale)
+
+    def judged(self) -> ForceMPC:
+        """Return it with the loops of its design plant, and every limit held against them."""
+        plant, values = self.design
+        states = split_friction({"design plant": plant}, values)
+        loops = {name: self.close(one, values) for name, one in states.items()}
+        measured = [MeasuredLoop(name=name, figures=loop.figures()) for name, loop in loops.items()]
+        return replace(self, loops=loops, verdicts=tuple(judge_all(self.spec, measured, len(measured))))
+
+    def describe_figures(self) -> list[str]:
+        """Return a line of margins for each loop of the design plant: with friction sliding and stuck."""
+        lines: list[str] = []
+        for name, loop in self.loops.items():
+            a = loop.figures()
+            late = None if a.delay_margin_s is None else 1e3 * a.delay_margin_s
+            bandwidth, gain, phase, delay = (
+                format_number(value, missing="none")
+                for value in (a.bandwidth_hz, a.gain_margin_db, a.phase_margin_deg, late)
+            )
+            lines.append(
+                f"{name}: bandwidth {bandwidth} Hz, Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak "
+                f"{a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}; gain margin {gain} dB, phase margin {phase} "
+                f"deg, delay margin {delay} ms"
+            )
+        return lines
 
     def __repr__(self) -> str:
         s, slew = self.spec, self.spec.current_slew_A_per_s
         limits = f"{s.current_limit_A:g} A" + ("" if slew is None else f", {slew:g} A/s")
-        return (
+        verdict = "every limit met" if self.feasible else f"NOT FEASIBLE: {join_labels(self.broken)}"
+        lines = [
             f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
-            f"delay of {format_count(s.delay_samples, 'sample')}\n"
-            f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} N\n"
-            f"  bandwidth {s.bandwidth_hz:g} Hz without limits; horizon {1e3 * s.horizon_s:g} ms, "
-            f"{self.prediction.knots.size} free currents"
-        )
+            f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
+            f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} N",
+            f"  bandwidth {s.bandwidth_hz:g} Hz while no limit of the current is active; horizon "
+            f"{1e3 * s.horizon_s:g} ms, {self.prediction.knots.size} free currents",
+            *(f"  {line}" for line in self.describe_figures()),
+            *([] if self.feasible else [f"  {self.explanation}"]),
+            *(f"  note: {note}" for note in self.notes),
+        ]
+        return "\n".join(lines)
 
     _repr_html_ = html_text
 
@@ -310,10 +429,14 @@ def force_mpc(
 ) -> ForceMPC:
     """Return a force controller that plans within current and slew limits.
 
+    A bandwidth at which a limit of its margins is broken gives a controller that is not `feasible`, and says which
+    bandwidth is possible.
+
     Parameters
     ----------
     plant, params
-        The design plant, the test stand as a rule, and its parameters; its first input is the motor current.
+        The design plant, the test stand as a rule, and its parameters or a fit, whose experiments' delay is taken where
+        the specification leaves it out; its first input is the motor current.
     spec : MPCSpec
         Limits and bandwidth.
     gate : PlausibilityGate, optional
@@ -329,18 +452,69 @@ def force_mpc(
     --------
     >>> import seaopt as so
     >>> from seaopt.control import MPCSpec, force_mpc
-    >>> mpc = force_mpc(so.plants.high_impedance(), so.plants.thor(), MPCSpec(current_limit_A=9.0))
+    >>> spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=20)
+    >>> mpc = force_mpc(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> step = mpc.step(mpc.start, reference_N=2000.0, measurement_N=0.0)
-    >>> step.solved, round(step.current_A, 3)
-    (True, 9.0)
+    >>> mpc.feasible, step.solved, round(step.current_A, 3)
+    (True, True, 9.0)
 
     """
-    values = params.parameters if isinstance(params, Fit) else params
-    completed = plant.complete(values)
+    require_type(plant, Plant, "plant", "give a Plant", ControlError)
+    require_type(params, (ParameterSet, Fit), "params", "give a ParameterSet or a Fit", ControlError)
+    require_type(spec, MPCSpec, "spec", "give an MPCSpec", ControlError)
     if spec.measured not in plant.outputs:
         raise ControlError(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
         )
+    spec = settle_delay(spec, plant, params)
+    mpc = _design(plant, params.parameters if isinstance(params, Fit) else params, spec, gate)
+    return replace(
+        mpc, possible_hz=None if mpc.feasible else _find_possible(mpc), friction=_prove(mpc),
+        warnings=warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, plant, params),
+    )  # fmt: skip
+
+
+def _find_possible(mpc: ForceMPC) -> float | None:
+    """Return the largest bandwidth below the one asked that keeps every limit; None where none is found."""
+    high = mpc.spec.bandwidth_hz
+    for _ in range(STEPS_DOWN):
+        low = STEP_DOWN * high
+        if _is_possible(mpc, low):
+            break
+        high = low
+    else:
+        return None
+    for _ in range(BISECTIONS):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if _is_possible(mpc, middle) else (low, middle)
+    return low
+
+
+def _is_possible(mpc: ForceMPC, bandwidth_hz: float) -> bool:
+    try:
+        return _design(*mpc.design, replace(mpc.spec, bandwidth_hz=bandwidth_hz), None).feasible
+    except ControlError:  # slower than any weight makes it
+        return False
+
+
+def _prove(mpc: ForceMPC) -> FrictionMargin | None:
+    """Return the friction margin of the design plant; where more than friction is not linear, nothing is proved."""
+    plant, values = mpc.design
+    (loop,) = make_friction_loops(plant, [values], mpc.measured, mpc.per_effort, mpc.delay_samples, mpc.law)
+    if loop is None:
+        return None
+    sliding = take_sliding(plant, values)
+    slopes = [ca.vec(ca.jacobian(curve, sliding.x)) for curve in (sliding.dynamics, sliding.output)]
+    if ca.depends_on(ca.vertcat(*slopes), sliding.x):
+        return lack_proof(loop.slopes.size, "the plant is not linear besides its friction")
+    return prove_loop(loop)
+
+
+def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, gate: PlausibilityGate | None) -> ForceMPC:
+    """Return the controller of a specification whose delay is settled, judged; friction slides in its model."""
+    design = (plant, values)
+    plant = take_sliding(plant, values)
+    completed = plant.complete(values)
     digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
     gain = _static_gain(plant, digital, spec)
     noise = spec.noise or NoiseModel(
@@ -353,7 +527,7 @@ def force_mpc(
         )
     kalman = estimator(
         plant, completed, noise, outputs=(spec.measured,), sample_time_s=spec.sample_time_s,
-        delay_samples=spec.delay_samples,
+        delay_samples=spec.loop_delay_samples,
     )  # fmt: skip
     a, b, c = digital.a, digital.b, digital.c
     weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, completed, spec.measured)
@@ -362,10 +536,10 @@ def force_mpc(
     prediction = condense(a, b, weighted, gain, regulator, knots, spec.current_limit_A, spec.slew_per_sample_A)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
-        spec=spec, design=(plant, values), kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
+        spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
         gate=gate,
-    )  # fmt: skip
+    ).judged()  # fmt: skip
 
 
 def _rate(plant: Plant, params: CompletedParameters, measured: str) -> Float[np.ndarray, " nx"]:

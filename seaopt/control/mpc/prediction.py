@@ -19,6 +19,8 @@ such a line holds everywhere if it holds at the knots, so that nothing is lost b
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -98,7 +100,9 @@ def tune_regulator(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], c: Float[np.ndarray, " nx"],
     w: Float[np.ndarray, " nx"], gain: float, bandwidth_hz: float, sample_time_s: float,
 ) -> Regulator:  # fmt: skip
-    """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by bisection on rho."""
+    """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by a search for rho."""
+    from scipy.optimize import brentq  # deferred: scipy is slow to load
+
     nx = b.size
     rest = np.linalg.solve(np.eye(nx) - a, b) / gain  # x_s per newton
     A = np.block([[a, b[:, None]], [np.zeros((1, nx)), np.eye(1)]])
@@ -112,20 +116,19 @@ def tune_regulator(
         closed = A - np.outer(B, np.append(candidate.K_x, candidate.K_u))
         return np.abs(np.linalg.solve(z * np.eye(nx + 1) - closed, drive)[:, :, 0] @ row)
 
-    low, high = (np.log(w) for w in WEIGHTS)
-    if tracking(solve_regulator(a, b, w, gain, np.exp(low)))[0] < HALF_POWER:
+    def excess(log_rho: float) -> float:
+        """Return ln of abs(F/F_ref) over -3 dB at the bandwidth; it falls with the weight."""
+        return float(np.log(tracking(solve_regulator(a, b, w, gain, float(np.exp(log_rho))))[0] / HALF_POWER))
+
+    low, high = (float(np.log(w)) for w in WEIGHTS)
+    if excess(low) < 0.0:
         raise ControlError(
             f"bandwidth_hz = {bandwidth_hz:g} is beyond what any weight gives at {1 / sample_time_s:g} Hz; lower it"
         )
-    if tracking(solve_regulator(a, b, w, gain, np.exp(high)))[0] > HALF_POWER:
+    if excess(high) > 0.0:
         raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if tracking(solve_regulator(a, b, w, gain, np.exp(middle)))[0] > HALF_POWER:
-            low = middle
-        else:
-            high = middle
-    regulator = solve_regulator(a, b, w, gain, float(np.exp(0.5 * (low + high))))
+    root: Any = brentq(excess, low, high, xtol=1e-12)
+    regulator = solve_regulator(a, b, w, gain, float(np.exp(root)))
     dips = np.flatnonzero(tracking(regulator, below) < 0.99 * HALF_POWER)
     if dips.size:
         raise ControlError(

@@ -6,17 +6,28 @@ import math
 
 import numpy as np
 
+from seaopt.control.laws.limits import BY_NAME, Limit
+from seaopt.control.laws.spec import Level
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError
 from seaopt.records import record
 
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
+MPC_LIMITS = (
+    "max_sensitivity",
+    "max_complementary",
+    "min_disk_margin",
+    "max_reference_peak",
+    "max_droop_db",
+    "max_noise_gain",
+    "min_sensitivity_bandwidth_hz",
+)  # fmt: skip; of the table of limits, those of a loop without gains: the weight makes the bandwidth to 2 %
 
 
 @record
 class MPCSpec:
-    """Limits of the plan, and the bandwidth while none is active.
+    """Limits of the plan, and bandwidth and margins while none of them is active.
 
     Parameters
     ----------
@@ -31,8 +42,9 @@ class MPCSpec:
         plant; it sets the weight of the current's increments.
     sample_rate_hz : float
         Of the controller.
-    delay_samples : int
-        Whole samples from measurement to output, besides the hold.
+    delay_samples : int, optional
+        Whole samples from measurement to output, besides the hold. Left out: where `force_mpc` is given a fit, the
+        delay of its experiments on the design plant, rounded up; at least 1.
     decay : float
         Time constant with which the force error should die out, times 2 pi bandwidth_hz, from 0 to below 1: the
         larger, the less overshoot and the more noise in the current.
@@ -45,6 +57,10 @@ class MPCSpec:
     noise : NoiseModel, optional
         Of the Kalman filter, with a drift of the current. If left out, one that makes the filter quick: its sensor
         noise is 1/120 of the static gain (2 N for THOR), the noise of the current 1 A s^(1/2), its drift 3 A s^(-1/2).
+    max_sensitivity, max_complementary, min_disk_margin : float, optional
+        Limits of the loop, as in `ControllerSpec`: left out, each has its default; False lifts one.
+    max_reference_peak, max_droop_db, max_noise_gain, min_sensitivity_bandwidth_hz : float, optional
+        Likewise.
 
     Raises
     ------
@@ -58,12 +74,19 @@ class MPCSpec:
     measured: str = "F1"
     bandwidth_hz: float = 30.0
     sample_rate_hz: float = 1000.0
-    delay_samples: int = 1
+    delay_samples: int | None = None
     decay: float = 0.8
     horizon_s: float = 0.05
     moves: int = 12
     largest_force_N: float | None = None
     noise: NoiseModel | None = None
+    max_sensitivity: Level = BY_NAME["max_sensitivity"].default
+    max_complementary: Level = BY_NAME["max_complementary"].default
+    min_disk_margin: Level = BY_NAME["min_disk_margin"].default
+    max_reference_peak: Level = BY_NAME["max_reference_peak"].default
+    max_droop_db: Level = BY_NAME["max_droop_db"].default
+    max_noise_gain: Level = BY_NAME["max_noise_gain"].default
+    min_sensitivity_bandwidth_hz: Level = None
 
     def __post_init__(self) -> None:
         for name in ("current_limit_A", "bandwidth_hz", "sample_rate_hz", "horizon_s"):
@@ -75,6 +98,8 @@ class MPCSpec:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
         for name, least, most in (("delay_samples", 0, MAX_MPC_DELAY_SAMPLES), ("moves", 2, MAX_HORIZON_SAMPLES)):
             value = getattr(self, name)
+            if name == "delay_samples" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise ControlError(f"{name} = {value!r} is not a whole number from {least} to {most}")
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
@@ -88,10 +113,24 @@ class MPCSpec:
                 f"{MAX_HORIZON_SAMPLES}"
             )
 
+        for name in MPC_LIMITS:
+            BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
+
     def _positive(self, name: str) -> None:
         value = getattr(self, name)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
             raise ControlError(f"{name} = {value!r} is not a number above zero; give one")
+
+    @property
+    def loop_delay_samples(self) -> int:
+        """Whole samples of delay that a loop is closed with: as given, or 1."""
+        return 1 if self.delay_samples is None else self.delay_samples
+
+    def allowed(self, limit: Limit) -> float | None:
+        """Return the value that a limit allows; None where it is not imposed, or is not for predictive control."""
+        if limit.has_field and limit.name not in MPC_LIMITS:
+            return None
+        return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
 
     @property
     def sample_time_s(self) -> float:

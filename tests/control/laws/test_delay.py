@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
+from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.laws.delay import warn_short_delay
 
 DELAY_S = 2.04e-3
@@ -63,6 +64,21 @@ def test_a_delay_that_is_given_stands_and_is_warned_of(fit, stand):
     certificate = so.certify(controller, {"stand": stand}, fit, samples=10)
     assert "delay_samples = 3" in certificate.notes[0]
     assert not warn_short_delay(3, 1000.0, stand, fit)
+
+
+def test_predictive_control_has_the_fits_delay(fit, stand, thor):
+    """Left out it is the fit's, and the margin is that of a loop with it; a shorter one is warned of."""
+    mpc = force_mpc(stand, fit, MPCSpec(current_limit_A=9.0, bandwidth_hz=15))
+    assert (mpc.delay_samples, mpc.warnings) == (3, ())
+    response = np.exp(2j * np.pi * np.geomspace(0.01, 499.9, 60_000) * 1e-3)
+    system, law = stand.linearize(fit.parameters), mpc.unlimited()
+    p = control.sample_system(control.ss(system.A, system.B, system.C[:1], system.D[:1]), 1e-3, "zoh")(response)
+    c_y = control.ss(law.a, -law.b[:, 1:], law.c[None], -law.d[1], 1e-3)(response)
+    true_ms = np.max(1.0 / np.abs(1.0 + p * response**-3 * c_y))
+    assert mpc.achieved.ms == pytest.approx(true_ms, rel=1e-3)
+    short = force_mpc(stand, fit, MPCSpec(current_limit_A=9.0, bandwidth_hz=15, delay_samples=1))
+    assert short.delay_samples == 1 and "delay_samples = 3" in short.warnings[0] and short.warnings[0] in repr(short)
+    assert force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=15)).delay_samples == 1
 
 
 def test_without_a_fit_it_is_one_sample(stand, thor):
