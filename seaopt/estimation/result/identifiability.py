@@ -9,7 +9,7 @@ the sensitivities to a rich made-up input. What that does not show, no log of th
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from seaopt.simulation import Segment, run_passes
 from seaopt.units import unit_after
 
 WEAK = 1e-5  # eigenvalues below this part of the largest: standard deviations a few hundred times those of one alone
+ROUNDING = 1e-5  # of the largest relative change along a direction: less is none
 RICH = 600  # samples of made-up input
 
 
@@ -52,6 +53,28 @@ class Identifiability:
     unidentifiable: tuple[dict[str, float], ...]
     weak: tuple[dict[str, float], ...] = ()
     structural_rank: int = -1
+
+    @property
+    def unidentified(self) -> frozenset[str]:
+        """Every parameter that changes along a direction without effect: its value is one choice among others."""
+        return frozenset(name for direction in self.unidentifiable for name in direction)
+
+    def determines(self, slope: Mapping[str, float], values: Mapping[str, float]) -> bool:
+        """Tell whether a figure with this slope in the parameters is the same along every direction without effect.
+
+        Parameters
+        ----------
+        slope : mapping of name to float
+            The figure's derivatives.
+        values : mapping of name to float
+            The parameters', to which the directions are relative.
+
+        """
+        for direction in self.unidentifiable:
+            parts = [slope.get(name, 0.0) * weight * (abs(values[name]) or 1.0) for name, weight in direction.items()]
+            if abs(sum(parts)) > ROUNDING * sum(abs(part) for part in parts):
+                return False
+        return True
 
 
 def assess_identifiability(
@@ -84,7 +107,7 @@ def assess_identifiability(
         rank=p - int(np.count_nonzero(unseen)),
         free=p,
         condition=float(np.sqrt(largest / smallest)) if smallest > RANK * largest else np.inf,
-        unidentifiable=directions(unseen.astype(float), 1e-3),
+        unidentifiable=directions(unseen.astype(float), ROUNDING),
         weak=directions((~unseen & (eigenvalues <= WEAK * largest)).astype(float), 0.1),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -57,9 +57,11 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     if not np.isfinite(evaluation.cost):
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
     statistics = compute_statistics(problem, z) if diagnostics else None
-    white, robust = _compute_covariances(problem, evaluation, statistics)
+    seen_white, seen_robust, unseen = _compute_covariances(problem, evaluation, statistics)
     names = unknowns.names[:p]
     known = assess_identifiability(evaluation.hessian, names, z[:p])
+    unseen = np.where([name in known.unidentified for name in names], 1.0, unseen)
+    white, robust = mark_unseen(seen_white, unseen), mark_unseen(seen_robust, unseen)
     if known.rank < known.free:
         known = replace(known, structural_rank=compute_structural_rank(problem, z))
     std, variance = np.sqrt(np.diag(robust)), np.diag(invert(evaluation.hessian)[0])
@@ -69,10 +71,9 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
             for i, name in enumerate(names)
         )
     )
-    covariance = Covariance(names=names, matrix=robust)
     status, message = _find_status(solution, known, evaluation.hessian, names, solved.step_error)
     if status == "converged":
-        fitted, message = _mark_vague(fitted, params, message)
+        fitted, message = _mark_vague(fitted, params, known, message)
         status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
     outputs = _describe_outputs(problem, z, statistics) if statistics is not None else {}
     if statistics is not None and not _explains_something(problem, outputs, statistics):
@@ -93,9 +94,9 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         status=status,
         message=message,
         parameters=fitted,
-        covariance=covariance,
+        covariance=Covariance(names=names, matrix=robust),
         white_covariance=Covariance(names=names, matrix=white),
-        derived=_derive_figures(experiments, fitted, covariance),
+        derived=_derive_figures(experiments, fitted, Covariance(names=names, matrix=seen_robust), known),
         outputs=outputs,
         nuisance={
             experiment.name: describe_nuisance(experiment, z, statistics, variance)
@@ -142,12 +143,15 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
-    """Return the covariance of the plants' parameters for white residuals, and for those that there are."""
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+    """Return the parameters' covariance for white residuals, for those that there are, and what is unseen.
+
+    Both are over what is seen alone, and the last how much of each parameter is not (0 to 1, squared).
+    """
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
     bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z) + np.diag(prior)
     if not p:
-        return np.zeros((0, 0)), np.zeros((0, 0))
+        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0)
     inverse, unseen = invert(bread)
     columns = inverse[:, :p]
     known = (columns.T * prior) @ columns
@@ -155,10 +159,8 @@ def _compute_covariances(
     if not problem.loss.quadratic:
         sums = statistics if statistics is not None else compute_statistics(problem, z)
         white = columns.T @ compute_white_meat(problem, z, sums) @ columns + known
-    white = mark_unseen(white, unseen[:p])
-    if statistics is None:
-        return white, white
-    return white, mark_unseen(compute_meat(problem, z, columns, statistics) + known, unseen[:p])
+    robust = white if statistics is None else compute_meat(problem, z, columns, statistics) + known
+    return white, robust, unseen[:p]
 
 
 def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> float:
@@ -176,17 +178,30 @@ def _mark_unidentified(fitted: ParameterSet, names: Sequence[str]) -> ParameterS
     return fitted.with_parameters(*(replace(fitted[name], identified=False) for name in names))
 
 
-def _mark_vague(fitted: ParameterSet, params: ParameterSet, message: str) -> tuple[ParameterSet, str]:
-    """Mark those parameters as not identified that are less certain than their size: the log hardly shows them."""
+def _mark_vague(
+    fitted: ParameterSet, params: ParameterSet, known: Identifiability, message: str
+) -> tuple[ParameterSet, str]:
+    """Mark those parameters as not identified that are less certain than their size: the log hardly shows them.
+
+    Of several that hardly have an effect but together, a std beyond the value is enough: another start ends elsewhere.
+    """
+    together = {name for direction in known.weak for name in _find_beyond(fitted, direction)}
     vague = {
         name: f"{name} = {p.value:.3g} ± {p.std:.2g}{unit_after(p.unit)}"
         for name, p in fitted.items()
-        if p.free and p.std is not None and p.std > VAGUE * max(abs(p.value), abs(params[name].value))
-    }
+        if p.free and p.std is not None
+        and (name in together or p.std > VAGUE * max(abs(p.value), abs(params[name].value)))
+    }  # fmt: skip
     if not vague:
         return fitted, message
     message = f"the logs hardly show {', '.join(vague.values())}: excite more, fix it, or give it a prior"
     return _mark_unidentified(fitted, tuple(vague)), message
+
+
+def _find_beyond(fitted: ParameterSet, direction: Mapping[str, float]) -> list[str]:
+    """Return the parameters of a direction whose stds are beyond their values; nothing of one alone."""
+    beyond = [name for name in direction if (fitted[name].std or 0.0) > abs(fitted[name].value)]
+    return beyond if len(beyond) > 1 else []
 
 
 def _find_status(
@@ -224,24 +239,27 @@ def _compile_figures(plant: Plant) -> tuple[Any, dict[str, str]]:
 
 
 def _derive_figures(
-    experiments: tuple[Experiment, ...], fitted: ParameterSet, covariance: Covariance
+    experiments: tuple[Experiment, ...], fitted: ParameterSet, seen: Covariance, known: Identifiability
 ) -> dict[str, DerivedFigure]:
-    """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g."""
+    """Return the plants' derived figures; their variance is g' Sigma g with CasADi's gradient g.
+
+    Sigma is over what is seen. A figure that is the same along every direction that is not has its variance from that,
+    whatever single parameters have (an estimable function: Searle, Linear Models, 1971, ch. 5); any other has none.
+    """
     out: dict[str, DerivedFigure] = {}
+    sizes = {name: fitted[name].value for name in seen.names}
     for experiment in experiments:
         plant = experiment.plant
         function, units = _compile_figures(plant)
         values, slopes = (np.array(array) for array in function(plant.complete(fitted).vector))
         names = list(plant.parameters)
-        free = [name for name in covariance.names if name in names]
-        rows = [covariance.names.index(name) for name in free]
-        matrix = covariance.matrix[np.ix_(rows, rows)]
+        free = [name for name in seen.names if name in names]
+        rows = [seen.names.index(name) for name in free]
+        matrix = seen.matrix[np.ix_(rows, rows)]
         for i, (name, unit) in enumerate(units.items()):
             g = slopes[i, [names.index(parameter) for parameter in free]]
-            used = g != 0.0
-            block = matrix[np.ix_(used, used)]
-            variance = float(g[used] @ block @ g[used]) if np.all(np.isfinite(block)) else np.inf
-            std = float(np.sqrt(max(variance, 0.0)))
+            determined = known.determines(dict(zip(free, g.tolist(), strict=True)), sizes)
+            std = float(np.sqrt(max(float(g @ matrix @ g), 0.0))) if determined else np.inf
             out.setdefault(name, DerivedFigure(value=float(values[i, 0]), unit=unit, std=std))
     return out
 

@@ -6,10 +6,12 @@ import json
 import time
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
@@ -223,6 +225,57 @@ def test_what_cannot_be_told_is_named(stand, short_log, thor):
     assert again.parameters.unidentified_names == fit.parameters.unidentified_names
     assert fit.parameters.update(eta=0.95).unidentified_names == ("K_tau",)
     assert fit.parameters["J"].value == pytest.approx(3.31e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize("start", [{}, {"J_m": 0.01, "b_r": 0.2, "K_tau": 0.3, "k_s": 40.0}, {"J_m": 1e-3, "k_s": 5.0}])
+@pytest.mark.parametrize("J_l", [1e4, 1e6])
+def test_what_a_heavy_link_hides_is_marked_whatever_the_start(J_l, start, thor):
+    """tau_s of a motor against a link that hardly moves has J_m, b_r and k_s over each other, and K_tau alone."""
+    plant, free = so.plants.rotary(), ("J_m", "b_r", "K_tau", "k_s")
+    truth = plant.complete(thor).update(J_m=0.0032, b_r=0.588, K_tau=0.867, k_s=16.5, N=1.0, J_l=J_l)
+    log = so.virtual_log(plant, truth, (Noise(std=1.0, band_hz=60),), duration_s=10, rate_hz=400, seed=1)
+    torque = log["tau_s"] + 0.005 * np.std(log["tau_s"]) * np.random.default_rng(1).normal(size=len(log))
+    measured = so.Log.from_arrays(time=log.time, I=log["I"], tau_s=torque)
+    fit = so.fit([experiment(plant, measured, outputs=("tau_s",))], truth.update(**start).free(*free))
+    assert fit.status == "not_identifiable"
+    assert set(fit.parameters.unidentified_names) == {"J_m", "b_r", "k_s"}
+    assert fit.parameters["K_tau"].value == pytest.approx(0.867, rel=1e-3)
+    resonance = np.sqrt(16.5 / 0.0032) / (2 * np.pi)  # k_s over J_m, which the data do tell
+    figure = fit.derived["resonance_hz"]
+    assert 0.0 < figure.std < 0.01
+    assert abs(figure.value - resonance) < 4 * figure.std
+
+
+def test_a_figure_that_the_data_tell_keeps_its_std():
+    """Of a spring-mass with J, b, k and the gain free, the frequency is as certain as with k known; stiffness is not.
+
+    The scatter over 30 logs is the reference; the response is scipy's.
+    """
+    J, b, k, rate = 2e-3, 4e-3, 10.0, 500.0
+    plant = so.Plant(
+        name="spring-mass", states={"q": "rad", "w": "rad/s"}, inputs={"T": "N m"}, outputs={"q": "rad"},
+        parameters={"J": "kg m^2", "b": "N m s/rad", "k": "N m/rad", "g": "-"},
+        f=lambda t, x, u, p: {"q": x.w, "w": (p.g * u.T - p.b * x.w - p.k * x.q) / p.J},
+        h=lambda t, x, u, p: {"q": x.q},
+        derived=lambda p: {"f_n": (ca.sqrt(p.k / p.J) / (2 * ca.pi), "Hz"), "compliance": (1 / p.k, "rad/(N m)")},
+    )  # fmt: skip
+    truth = so.ParameterSet.of(J=(J, "kg m^2"), b=(b, "N m s/rad"), k=(k, "N m/rad"), g=(1.0, "-"))
+    num, den, _ = cont2discrete(([1.0], [J, b, k]), 1.0 / rate, "zoh")
+    figures = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=2000)
+        y = lfilter(num.ravel(), den, u)
+        log = so.Log.from_arrays(time=np.arange(2000) / rate, T=u, q=y + 0.02 * np.std(y) * rng.normal(size=2000))
+        free = so.fit([so.Experiment(plant=plant, log=log)], truth.free("J", "b", "k", "g"), diagnostics=False)
+        figures.append(free.derived["f_n"])
+        if not seed:
+            known = so.fit([so.Experiment(plant=plant, log=log)], truth.free("J", "b", "g"), diagnostics=False)
+            assert free.parameters.unidentified_names == ("J", "b", "k", "g")
+            assert np.isinf(free.derived["compliance"].std)
+            assert free.derived["f_n"].std == pytest.approx(known.derived["f_n"].std, rel=1e-3)
+    z = np.array([(figure.value - np.sqrt(k / J) / (2 * np.pi)) / figure.std for figure in figures])
+    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.35  # chi-square of 30: 0.1 % on either side
 
 
 def test_a_parameter_without_effect_is_named(stand, short_log, thor):
