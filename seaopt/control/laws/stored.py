@@ -130,6 +130,8 @@ class StoredPossible(ResultTable):
     largest_hz: Finite | None
     closest_hz: Finite
     missed_by: Finite
+    fall: Finite | None = None
+    largest_fall: Finite | None = None
 
 
 class StoredController(ResultTable):

@@ -74,6 +74,9 @@ class PossibleBandwidths:
         The largest.
     closest_hz, missed_by : float
         Where the limits are missed least, and by which share; zero where they are kept.
+    fall, largest_fall : float or None
+        By how much friction falls with speed, N s/m (N m s/rad), where that makes the sliding plant grow without
+        control, and with how much the limits can be kept at the bandwidth asked; no others are then looked for.
 
     """
 
@@ -81,8 +84,15 @@ class PossibleBandwidths:
     largest_hz: float | None = None
     closest_hz: float
     missed_by: float
+    fall: float | None = None
+    largest_fall: float | None = None
 
     def __str__(self) -> str:
+        if self.fall is not None:
+            return (
+                f"friction that falls by {self.fall:.4g} N s/m with speed makes sliding unstable, "
+                f"{self.largest_fall:.4g} can be had at this bandwidth: check v_st, sample faster or cut the delay"
+            )
         if self.largest_hz is None:
             return f"none is known that keeps them; {self.closest_hz:.4g} Hz misses them least, by {self.missed_by:.1%}"
         nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)
@@ -145,11 +155,13 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
 def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
     """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
 
-    `loop` is the design plant's. What is broken most comes first.
+    `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
     """
     broken: dict[str, list[Verdict]] = {}
     for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda one: -one.severity):
         broken.setdefault(verdict.limit.name, []).append(verdict)
+    if "stability" in broken:
+        broken = {"stability": broken["stability"]}
     texts = [
         _explain(spec, worst, design, loop) + _format_plants([one.plant for one in (worst, *others) if one.names_plant])
         for worst, *others in broken.values()

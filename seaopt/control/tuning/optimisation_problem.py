@@ -41,7 +41,7 @@ from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms,
 from seaopt.control.loops.absolute_stability import LOWEST_ANGLE, SIMPLEST, FrictionMargin, limit_feedback
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import STABLE, Loop
+from seaopt.control.loops.loop import GROWING, STABLE, Loop
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.records import record
@@ -112,7 +112,7 @@ class Grid:
 
 @record(eq=False)
 class RubbingPlant:
-    """A plant with friction, of which stability is to be proved for steeper friction than its own.
+    """A plant with friction: of which stability is to be proved, or that grows as it slides.
 
     Parameters
     ----------
@@ -120,6 +120,8 @@ class RubbingPlant:
         Which of the task's plants slides as it does.
     loop : FrictionLoop
         The loop with its friction taken out; its own law does not matter.
+    flattest : array, shape (p,)
+        The flattest slope of each friction, N s/m (N m s/rad), which the loop has in it.
     multiplier : str
         That of the proof aimed at; empty where none is chosen yet, and nothing asked while the law is looked for.
 
@@ -127,6 +129,7 @@ class RubbingPlant:
 
     plant: int
     loop: FrictionLoop
+    flattest: Float[np.ndarray, " p"]
     multiplier: str = ""
 
 
@@ -135,7 +138,8 @@ class Task:
     """A specification with the plants it is to hold for.
 
     The first is the design plant, whose port must be passive; of two `design_states` it is the sliding one, and the
-    second plant is the same one stuck by its friction. `rubbing` are those of which a friction margin is asked.
+    second plant is the same one stuck by its friction. `rubbing` are those of which a friction margin is asked, and
+    those that friction which falls with speed makes grow.
     """
 
     spec: ControllerSpec
@@ -146,6 +150,11 @@ class Task:
     port: PortModel | None = None
     design_states: int = 1
     rubbing: tuple[RubbingPlant, ...] = ()
+
+    @property
+    def asks_proof(self) -> bool:
+        """Whether a friction margin is asked of some plant."""
+        return bool(self.rubbing) and self.spec.level(FRICTION) is not None
 
     def integrates(self, x: LawNumbers) -> bool:
         """Tell whether the law integrates the error: not a pd, nor a disturbance observer that is alone at it."""
@@ -363,6 +372,8 @@ class Task:
 
     def aim_proofs(self, x: LawNumbers, multiplier: str = "") -> Task:
         """Return the task with one multiplier for every rubbing plant: that named, or the one that proves most of x."""
+        if not self.asks_proof:
+            return self
         names = [multiplier] * len(self.rubbing) if multiplier else [
             margin.multiplier if margin.factor else SIMPLEST for margin in self.prove(x)
         ]  # fmt: skip
@@ -381,7 +392,9 @@ class Task:
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
         filter_samples = float(x[T_F] / spec.sample_time_s) if x[K_D] > 0.0 else np.inf
         integral_rad_s = float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf
-        slopes = dict(zip((one.plant for one in self.rubbing), (one.least_slope for one in self.prove(x)), strict=True))
+        slopes: dict[int, float] = {}
+        if self.asks_proof:
+            slopes = {one.plant: margin.least_slope for one, margin in zip(self.rubbing, self.prove(x), strict=True)}
         return [
             MeasuredLoop(
                 name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,
@@ -427,11 +440,16 @@ def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:
 
 
 def find_light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
-    """Return frequency (Hz) and damping ratio of the modes that are lightly damped."""
+    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly."""
     values = np.linalg.eigvals(plant.a).astype(complex)
     poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
-    modes = [(abs(p) / (2 * np.pi), -p.real / abs(p)) for p in poles]
+    modes = [(abs(p) / (2 * np.pi), abs(p.real) / abs(p)) for p in poles]
     return [(float(f), float(max(zeta, 1e-9))) for f, zeta in modes if zeta < LIGHT_DAMPING]
+
+
+def count_growing(plant: DigitalPlant) -> int:
+    """Return how many of a plant's poles grow without control."""
+    return int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
 
 
 def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:

@@ -105,8 +105,10 @@ class _Probes:
             usage, _ = task.rank(grid, x)
             if usage == 0.0 or (apart < np.log(PROBE_RATIO) and usage > HOPELESS_USAGE):
                 return usage, x
-        starts = [x, *find_starts(task, grid, STARTS_TRIED)]
-        x = min((improve(task, grid, one) for one in starts if task.is_stable(one)), key=lambda pair: pair[0])[1]
+        starts = [one for one in (x, *find_starts(task, grid, STARTS_TRIED)) if task.is_stable(one)]
+        if not starts:
+            return np.inf, x
+        x = min((improve(task, grid, one) for one in starts), key=lambda pair: pair[0])[1]
         usage, _ = task.rank(grid, x)
         if usage > PROMISING_USAGE:
             return usage, x

@@ -45,7 +45,7 @@ def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> Solution:
 
     """
     x, loops = _solve_once(task, warm)
-    return _meet_friction_margin(task, x, loops) if task.rubbing else (x, loops)
+    return _meet_friction_margin(task, x, loops) if task.asks_proof else (x, loops)
 
 
 def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:

@@ -47,6 +47,7 @@ from seaopt.control.tuning.optimisation_problem import (
     Grid,
     LawNumbers,
     Task,
+    count_growing,
     find_light_modes,
 )
 from seaopt.records import record
@@ -302,7 +303,8 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
             worst = np.maximum(worst, np.max(curve, axis=1))
         distance = 1.0 + p * c_y
         turn = np.unwrap(np.angle(distance), axis=1)
-        turned = np.minimum(turned, turn[:, -1] - turn[:, 0])
+        # A stable loop turns by half a circle more for every pole of the plant that grows.
+        turned = np.minimum(turned, turn[:, -1] - turn[:, 0] - np.pi * count_growing(task.plants[grid.rows[row]]))
         if task.spec.objective == "disturbance":
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
         elif row < task.design_states:

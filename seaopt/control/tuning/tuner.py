@@ -33,11 +33,20 @@ from seaopt.control.laws.verdict import (
     list_broken_limits,
 )
 from seaopt.control.loops.law import make_static_law
-from seaopt.control.loops.loop import GROWING, Loop
+from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.port import port_of
-from seaopt.control.loops.sampled_plant import sample
+from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
-from seaopt.control.tuning.optimisation_problem import FRICTION, OBJECTIVE_HZ, LawNumbers, RubbingPlant, Task
+from seaopt.control.tuning.optimisation_problem import (
+    FRICTION,
+    OBJECTIVE_HZ,
+    LawNumbers,
+    RubbingPlant,
+    Task,
+    count_growing,
+    place_frequencies,
+)
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve
 from seaopt.errors import ControlError, suggestion
@@ -45,7 +54,7 @@ from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.friction import SLIDING, find_dry_friction, split_friction
+from seaopt.plants.friction import SLIDING, find_dry_friction, friction_slopes, split_friction
 
 
 def tune(
@@ -80,9 +89,10 @@ def tune(
     Raises
     ------
     ControlError
-        The measured output does not respond to the motor at 0 Hz, the plant is unstable without control, a draw names
-        a parameter that no plant has, delay or current limit make the request impossible for every controller, or a
-        passive band is required of a plant without a port at link 2, or with an elastic screw before it.
+        The measured output does not respond to the motor at 0 Hz, a draw names a parameter that no plant has, delay or
+        current limit make the request impossible for every controller, a passive band is required of a plant without
+        a port at link 2, or with an elastic screw before it, or a friction margin where friction acts on the measured
+        output itself.
 
     Examples
     --------
@@ -105,11 +115,24 @@ def tune(
     if list_broken_limits(spec, loops, task.design_states) - {
         FRICTION
     }:  # of a margin alone it is known what can be had
-        possible, near = find_possible_bandwidths(task, x)
+        possible, near = _find_possible(task, x)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
             x, loops = solve(task, (x, *near))
     return make_controller(task, x, loops, (plant, params), possible)
+
+
+def _find_possible(task: Task, x: LawNumbers) -> tuple[PossibleBandwidths, list[LawNumbers]]:
+    """Return what is possible instead, and laws near it: with friction that falls less, or at other bandwidths."""
+    eased = find_largest_fall(task) if any(map(count_growing, task.plants)) else None
+    if eased is None:
+        return find_possible_bandwidths(task, x)
+    fall, largest, law = eased
+    missed, _ = task.rank(task.grid(place_frequencies(task)), x)
+    possible = PossibleBandwidths(
+        largest_hz=None, closest_hz=task.spec.bandwidth_hz, missed_by=missed - 1.0, fall=fall, largest_fall=largest
+    )
+    return possible, [law]
 
 
 def make_task(
@@ -151,40 +174,40 @@ def make_task(
             "feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
     names = tuple(name for name, _ in pairs)
-    for name, sampled in zip(names, plants, strict=True):
-        if np.max(np.abs(np.linalg.eigvals(sampled.a))) > GROWING:
-            remedy = "; where friction falls with speed (Stribeck): tune without that part" if SLIDING in name else ""
-            raise ControlError(f"{name} is unstable without control, which the tuner does not treat{remedy}")
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
     port = None if spec.passive_band_hz is None else port_of(design_plant, values, spec.measured, gain)
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
         design_states=1 if design_plant is plant else 2,
-        rubbing=_find_rubbing(spec, [pair for _, pair in pairs], whole, gain),
+        rubbing=_find_rubbing(spec, [pair for _, pair in pairs], plants, whole, gain),
     )  # fmt: skip
 
 
 def _find_rubbing(
-    spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]], whole: Mapping[Plant, Plant], gain: float
-) -> tuple[RubbingPlant, ...]:
-    """Return the plants of which a friction margin is asked: of those that slide, `whole` is the one with friction."""
-    if spec.level(FRICTION) is None:
-        return ()
-    open_law = make_static_law(0.0, spec.sample_time_s)
-    out: list[RubbingPlant] = []
+    spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]], plants: Sequence[DigitalPlant],
+    whole: Mapping[Plant, Plant], gain: float,
+) -> tuple[RubbingPlant, ...]:  # fmt: skip
+    """Return the plants of which a friction margin is asked, and those that grow as they slide.
+
+    Of those that slide, `whole` is the one with friction.
+    """
+    slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s)
+    rubbing: list[RubbingPlant] = []
     for number, (model, values) in enumerate(pairs):
-        if model not in whole:
+        if model not in whole or (slope is None and not count_growing(plants[number])):
             continue
-        (loop,) = make_friction_loops(whole[model], [values], spec.measured, gain, spec.loop_delay_samples, open_law)
+        plant = whole[model]
+        (loop,) = make_friction_loops(plant, [values], spec.measured, gain, spec.loop_delay_samples, open_law)
         if loop is None:
             continue
-        if np.any(loop.through * loop.slopes):
+        if slope is not None and np.any(loop.through * loop.slopes):
             raise ControlError(
-                f"{FRICTION} = {spec.level(FRICTION):g} cannot be proved on {whole[model].name}: friction acts on the "
-                "measured output itself; leave the limit out, or measure another output"
+                f"{FRICTION} = {slope:g} cannot be proved on {plant.name}: friction acts on the measured output "
+                "itself; leave the limit out, or measure another output"
             )
-        out.append(RubbingPlant(plant=number, loop=loop))
-    return tuple(out)
+        flattest, _ = friction_slopes(plant, values)
+        rubbing.append(RubbingPlant(plant=number, loop=loop, flattest=flattest))
+    return tuple(rubbing)
 
 
 def _draw_plants(

@@ -1,0 +1,78 @@
+r"""How steeply friction may fall with speed at a bandwidth, for the tuner's answer where a sliding plant grows.
+
+Where Stribeck's friction falls, :math:`\sigma < 0` is the flattest slope, and a plant that slides has the damping
+:math:`b + \sigma`, which may be negative: it then needs its controller to be stable. With a share of the fall it is
+
+.. math:: A_\lambda = A + (1 - \lambda)\, B_f\, \sigma\, C_v,
+
+from Coulomb's friction at 0 to the plant's own at 1. The largest share at which the limits are kept is found by
+bisection, each law from the one before: a continuation, whose end is a start for the plant itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control.loops.sampled_plant import DigitalPlant, sample_linear
+from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.interior_point import refine
+from seaopt.control.tuning.optimisation_problem import (
+    LawNumbers,
+    RubbingPlant,
+    Task,
+    count_growing,
+    place_frequencies,
+)
+from seaopt.control.tuning.solution import solve
+
+RESOLUTION = 1.03  # ratio to which the share is found
+SMALLEST_SHARE = 1e-3
+
+
+def find_largest_fall(task: Task) -> tuple[float, float, LawNumbers] | None:
+    """Return the fall of friction, the largest with which the limits are kept, N s/m (N m s/rad), and the law there.
+
+    It is the steepest fall of the plants that grow as they slide; None where no friction falls, or the limits are not
+    kept without a fall either.
+    """
+    falling = [one for one in task.rubbing if count_growing(task.plants[one.plant]) and np.min(one.flattest) < 0.0]
+    if not falling:
+        return None
+
+    def ease(share: float) -> Task:
+        plants = {one.plant: _sample(one, share) for one in falling}
+        return replace(task, plants=tuple(plants.get(number, plant) for number, plant in enumerate(task.plants)))
+
+    f = place_frequencies(task)
+
+    def keeps(eased: Task, x: LawNumbers) -> bool:
+        return eased.is_stable(x) and eased.rank(eased.grid(f), x)[0] == 0.0
+
+    x, _ = solve(ease(0.0))
+    if not keeps(ease(0.0), x):
+        return None
+    low, high = 0.0, 1.0
+    while high > max(RESOLUTION * low, SMALLEST_SHARE):
+        middle = float(np.sqrt(low * high)) if low else 0.25 * high
+        eased = ease(middle)
+        trial = refine(eased, eased.grid(f), improve(eased, eased.grid(f), x)[1]) if eased.is_stable(x) else x
+        if keeps(eased, trial):
+            x, low = trial, middle
+        else:
+            high = middle
+    fall = max(float(-np.min(one.flattest)) for one in falling)
+    return fall, low * fall, x
+
+
+def _sample(rubbing: RubbingPlant, share: float) -> DigitalPlant:
+    """Return a sliding plant, sampled, with a share of the fall of its friction."""
+    loop, left = rubbing.loop, (1.0 - share) * np.minimum(rubbing.flattest, 0.0)
+    a = loop.a + (loop.friction * left) @ loop.velocity
+    c = loop.measured + (loop.through * left) @ loop.velocity
+    linear = (a[None], loop.motor[None], c[None], np.array([loop.plant.d]))
+    (plant,) = sample_linear(
+        linear, np.array([loop.delay_s]), loop.plant.sample_time_s, loop.plant.delay_samples
+    )  # fmt: skip
+    return plant

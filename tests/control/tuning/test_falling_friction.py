@@ -1,0 +1,86 @@
+"""Friction that falls with speed: laws for plants that grow as they slide, by eigenvalues and simulated stick-slip."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import seaopt as so
+from tests.laws import measurement_matrices
+from tests.stick_slip import Mass, simulate
+
+VALUES = {
+    "k": 120e3, "m_l": 0.9, "l": 0.005, "N_p": 1.0, "K_tau": 0.075, "J": 1.2e-5, "b_r": 2.5e-4, "eta": 0.86,
+    "f_c": 25.0, "v_s": 0.004,
+}  # fmt: skip
+SPEC = so.ControllerSpec(
+    bandwidth_hz=20, delay_samples=2, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=10.0
+)  # fmt: skip
+STRIBECK_SLOPE = np.sqrt(2.0 / np.e)  # of (f_s - f_c)/v_st: the steepest fall of exp(-(v/v_st)^2)
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return so.plants.high_impedance(parts=("stribeck",))
+
+
+def falling(plant, f_s, v_st):
+    return plant.complete(so.plants.thor()).update(**VALUES, f_s=f_s, v_st=v_st)
+
+
+def find_radius(law, params, slope):
+    """Return the closed loop's largest eigenvalue with viscous friction of a slope, written out for this test."""
+    mass = Mass.of({name: params[name].value for name in params})
+    a = np.array([[0.0, 1.0], [-mass.k / mass.m, -(mass.b + slope) / mass.m]])
+    whole = expm(np.block([[a, np.array([[0.0], [1.0 / mass.m]])], [np.zeros((1, 3))]]) * 1e-3)
+    law_a, law_b, law_c, law_d = measurement_matrices(law)
+    n = law_a.shape[0]
+    # States: position, velocity, the two commands under way (the older is held now), the law's own.
+    closed = np.zeros((4 + n, 4 + n))
+    closed[:2, :2], closed[:2, 2] = whole[:2, :2], whole[:2, 2]
+    closed[2, 3] = 1.0
+    closed[3, 0], closed[3, 4:] = -law_d * mass.k, -law_c
+    closed[4:, 0], closed[4:, 4:] = law_b * mass.k, law_a
+    return np.max(np.abs(np.linalg.eigvals(closed))), np.max(np.abs(np.linalg.eigvals(whole[:2, :2])))
+
+
+@pytest.fixture(scope="module")
+def tuned(plant):
+    return so.tune(plant, falling(plant, 35.0, 0.02), SPEC)
+
+
+def test_a_plant_that_grows_as_it_slides_is_stabilised_from_its_fall_to_its_steepest_slope(plant, tuned):
+    """At 429 N s/m of fall and 395 of damping it grows without control, and the law holds it at every slope between."""
+    params = falling(plant, 35.0, 0.02)
+    fall = STRIBECK_SLOPE * 10.0 / 0.02
+    assert tuned.feasible
+    assert find_radius(tuned.law, params, -fall)[1] > 1.0
+    for slope in (-fall, -0.5 * fall, 0.0, 1e3, 35.0 / 0.004):
+        assert find_radius(tuned.law, params, slope)[0] < 1.0
+    assert tuned.achieved.bandwidth_hz == pytest.approx(20.0, rel=0.005)
+    assert tuned.achieved.ms <= 1.6
+
+
+def test_steps_of_the_stabilised_plant_end_without_hunting(plant, tuned):
+    """Simulated with the falling curve itself, at sizes from below its friction to well above."""
+    steps = np.array([20.0, 60.0, 200.0, 600.0])
+    params = falling(plant, 35.0, 0.02)
+    mass = Mass.of({name: params[name].value for name in params})
+    runs = simulate([mass] * steps.size, [tuned.to_dict()] * steps.size, np.tile(steps[:, None], 1500), substeps=20)
+    assert np.all(runs.ringing(steps) < 0.02)
+    assert np.all(runs.overshoot(steps) < 0.3 * 1.1)
+
+
+def test_a_fall_that_cannot_be_had_is_answered_with_the_largest_that_can(plant):
+    """With a tenth less than the largest it is feasible, with half as much again it is not."""
+    controller = so.tune(plant, falling(plant, 50.0, 0.005), SPEC)
+    possible, fall = controller.possible, STRIBECK_SLOPE * 25.0 / 0.005
+    assert not controller.feasible
+    assert controller.active_constraints[0].startswith("stability")
+    assert possible.fall == pytest.approx(fall, rel=1e-6)
+    assert f"{fall:.4g} N s/m" in controller.explanation and f"{possible.largest_fall:.4g}" in controller.explanation
+    assert "v_st" in controller.explanation and len(controller.explanation) < 240
+    assert so.tune(plant, falling(plant, 50.0, 0.005 * fall / (0.9 * possible.largest_fall)), SPEC).feasible
+    steeper = so.tune(plant, falling(plant, 50.0, 0.005 * fall / (1.5 * possible.largest_fall)), SPEC)
+    assert not steeper.feasible
