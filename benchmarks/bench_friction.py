@@ -69,7 +69,7 @@ def examine(number: int) -> dict[str, Any]:
     values, asked = draw(number)
     stand, params = so.plants.high_impedance(), so.plants.thor().update(**values)
     out: dict[str, Any] = {"number": number, "feasible": False, "certified": False}
-    begin = time.perf_counter()
+    begin, used = time.perf_counter(), time.process_time()
     try:
         controller = so.tune(stand, params, so.ControllerSpec(**asked, bandwidth_range_hz=(5.0, 60.0)))
         out |= {"feasible": controller.feasible, "tune_s": time.perf_counter() - begin, "law": controller.to_dict()}
@@ -86,6 +86,7 @@ def examine(number: int) -> dict[str, Any]:
             out["broken"] = list(controller.active_constraints)
     except SeaoptError as error:
         out["error"] = f"{type(error).__name__}: {error}"
+    out["processor_s"] = time.process_time() - used
     return json.loads(json.dumps(out, default=lambda value: value.tolist()))
 
 
@@ -155,13 +156,16 @@ def main(count: int, file: Path | None) -> None:
     print(f"  not feasible because of {dict(blocked)}; errors {Counter(row.get('error', '') for row in done)}")
     print(f"  feasible and not certified because of {dict(refused)}")
     print(f"  stability proved for the friction of {sum(row['proved'] for row in certified)} of those certified")
-    for name in ("tune_s", "certify_s"):
+    for name in ("tune_s", "certify_s", "processor_s"):
         times = [row[name] for row in done if name in row]
         if times:
-            print(f"  {name}: median {np.median(times):.2f}, largest {max(times):.1f}")
+            print(f"  {name}: mean {np.mean(times):.2f}, median {np.median(times):.2f}, largest {max(times):.1f}")
     if certified:
+        used = time.process_time()
         for kind, figures in simulate_steps(certified).items():
             print(f"{kind}: {figures}")
+        each = (time.process_time() - used) / len(certified)
+        print(f"  simulated with {each:.2f} s of processor time per actuator")
 
 
 if __name__ == "__main__":

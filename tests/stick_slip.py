@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 THETA = 0.55  # weight of a step's end: at one half what sticks would not come to rest
-NEWTON_STEPS = 8
+NEWTON_STEPS, NEWTON_ROUNDING = 8, 1e-14
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,10 @@ def _solve_velocity(inertia: np.ndarray, push: np.ndarray, friction: np.ndarray,
         for _ in range(NEWTON_STEPS):
             curve = np.tanh(at / scale)
             slope = inertia + friction / scale * (1.0 - curve**2)
-            at = at + (size - inertia * at - friction * curve) / slope
+            change = (size - inertia * at - friction * curve) / slope
+            at = at + change
+            if np.all(np.abs(change) <= NEWTON_ROUNDING * at):
+                break
         w = np.where(smooth, at, w)
     return np.sign(push) * w
 

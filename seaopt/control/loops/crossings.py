@@ -47,6 +47,6 @@ def add_minima(
     low, high = distinct[inner - 1], distinct[inner + 1]
     for _ in range(60 if inner.size else 0):
         left, right = low + (high - low) / 3, high - (high - low) / 3
-        lower = curve(left) < curve(right)
+        lower = np.less(*np.split(curve(np.concatenate([left, right])), 2))
         low, high = np.where(lower, low, left), np.where(lower, right, high)
     return np.unique(np.concatenate([f, 0.5 * (low + high)]))

@@ -203,6 +203,8 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     integrators = [_count_integrators(loop) for loop in loops]
     if half_turns != 2 * (outside[0] - outside[1]) + integrators[0] - integrators[1]:
         return 1.0, None
+    if not np.any(_chord(first, second, f)):  # the same loop: every point is a minimum
+        return 0.0, float(f[0])
     f = add_minima(lambda x: -_chord(first, second, x), f)
     chord = _chord(first, second, f)
     worst = int(np.argmax(chord))
