@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.laws.friction_proof import prove_friction, prove_friction_sets
 from seaopt.control.loops import absolute_stability as proof
 from seaopt.control.loops.friction_loop import FrictionLoop, transfer
 from seaopt.control.loops.sampled_plant import DigitalPlant
@@ -207,3 +207,19 @@ def test_what_a_proof_asks_of_the_feedback_is_the_proof(factor):
             np.testing.assert_array_equal(kept, proved)
             agreed += [proved]
     assert 0.0 < np.mean(agreed) < 1.0
+
+
+def test_many_sets_of_parameters_are_tested_as_one_is():
+    """One linearisation of all, with delays of their own, against one at a time; without friction there is nothing."""
+    stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=4e-3)
+    controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    sets = [
+        rubbing.update(J=J, f_c=f_c).with_parameters(so.Parameter(name="delay_s", value=delay, unit="s"))
+        for J, f_c, delay in ((2e-6, 50.0, 0.0), (4e-6, 20.0, 3e-4), (3e-6, 0.0, 0.0), (3e-6, 80.0, 1.2e-3))
+    ]
+    together = prove_friction_sets(controller, stand, sets)
+    assert together[2] is None
+    for found, each in zip(together, sets, strict=True):
+        alone = prove_friction(controller, stand, each)
+        if found is not None:
+            assert (found.factor, *found.slopes) == pytest.approx((alone.factor, *alone.slopes), rel=1e-9)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.robustness.verification import verification
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
 from seaopt.robustness.verification.large_signal import large_signal
+from seaopt.robustness.verification.playback import play
 from seaopt.robustness.verification.scenarios import step_scenarios
 from seaopt.robustness.verification.verification import verify
 from tests.laws import law_of, multiply_out, scaled
@@ -129,3 +131,21 @@ def test_bandwidth_against_amplitude_is_that_of_an_independent_simulator(blind, 
     predicted = np.abs(predict_gain(smooth, stand, rubbing, sweep.frequency_hz, amplitude))[:, 0]
     assert predicted == pytest.approx(expected, rel=0.05)
     assert expected[2] > 1.5 * expected[0]
+
+
+def test_steps_are_played_once(limited_controller, stand, thor, monkeypatch):
+    """On the same devices `with_simulation` takes over what `certify` played; the rows are those played anew."""
+    certificate = so.certify(limited_controller, {"stand": stand}, thor)
+    played = []
+    monkeypatch.setattr(
+        verification, "play", lambda stage, scenario, *rest, **more: played.append(scenario.name) or play(
+            stage, scenario, *rest, **more
+        )
+    )  # fmt: skip
+    whole = certificate.with_simulation().simulated.verification
+    steps = [scenario.name for scenario in step_scenarios(limited_controller, stand)]
+    assert played and not set(played) & set(steps)
+    assert whole.rows == verify(limited_controller, {"stand": stand}, thor).rows
+    played.clear()
+    certificate.with_simulation(sensors=so.Sensors(noise_std={"F1": 1.0}))
+    assert set(steps) <= set(played)
