@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 import seaopt as so
-from seaopt.control import PlausibilityGate
+from seaopt.control import MPCSpec, PlausibilityGate, force_mpc
 from seaopt.errors import SeaoptError
+from seaopt.logs import assess_quality
 from seaopt.plants.plant import fill_vector
 
 ROOT = Path(__file__).parents[1]
@@ -19,6 +21,17 @@ LOG = so.Log.from_arrays(time=T, I=np.sin(T), F1=np.cos(T))
 PLANT, THOR = so.plants.high_impedance(), so.plants.thor()
 
 GATE = {"range_N": (-1.0, 1.0), "max_step_N": 1.0, "max_held": 1, "ramp_A_per_s": 1.0}
+SPEC = so.ControllerSpec(bandwidth_hz=30)
+STILL = so.Plant(
+    name="still", states={}, inputs={"I": "A"}, outputs={"F1": "N"},
+    parameters={"gain": so.Parameter(name="gain", value=1.0, unit="N/A")},
+    f=lambda t, x, u, p: {}, h=lambda t, x, u, p: {"F1": p.gain * u.I},
+)  # fmt: skip
+
+
+@cache
+def tuned():
+    return so.tune(PLANT, THOR, SPEC)
 
 
 def experiment(**changes):
@@ -76,6 +89,33 @@ CASES = {
     "simulated log": lambda: so.simulate(PLANT, THOR, None),
     "simulated delay": lambda: so.simulate(PLANT, THOR, LOG, delay_s="x"),
     "problem": lambda: so.read_problem(None),
+    "experiments as text": lambda: so.fit("ab", THOR),
+    "experiments of text": lambda: so.fit(["ab"], THOR),
+    "no experiments": lambda: so.fit(None, THOR),
+    "experiment of a plant without states": lambda: so.fit([experiment(plant=STILL)], so.ParameterSet()),
+    "tuned plant": lambda: so.tune(None, THOR, SPEC),
+    "tuned spec": lambda: so.tune(PLANT, THOR, None),
+    "tuned parameters": lambda: so.tune(PLANT, None, SPEC),
+    "tuned for no plant": lambda: so.tune(PLANT, THOR, SPEC, robust_to={"other": None}),
+    "tuned at no draws": lambda: so.tune(PLANT, THOR, SPEC, draws=3),
+    "tuned without states": lambda: so.tune(STILL, so.ParameterSet(), SPEC),
+    "tuned for a plant without states": lambda: so.tune(PLANT, THOR, SPEC, robust_to={"still": STILL}),
+    "swept plant": lambda: so.control.sweep(None, THOR, SPEC, [20.0]),
+    "swept spec": lambda: so.control.sweep(PLANT, THOR, None, [20.0]),
+    "predictive plant": lambda: force_mpc(None, THOR, MPCSpec(current_limit_A=9.0)),
+    "predictive plant without states": lambda: force_mpc(STILL, so.ParameterSet(), MPCSpec(current_limit_A=9.0)),
+    "predictive parameters": lambda: force_mpc(PLANT, None, MPCSpec(current_limit_A=9.0)),
+    "predictive spec": lambda: force_mpc(PLANT, THOR, SPEC),
+    "certified controller": lambda: so.certify(None, {"stand": PLANT}, THOR),
+    "certified plants": lambda: so.certify(tuned(), None, THOR),
+    "certified plant": lambda: so.certify(tuned(), {"stand": None}, THOR),
+    "certified parameters": lambda: so.certify(tuned(), {"stand": PLANT}, None),
+    "certified without states": lambda: so.certify(tuned(), {"still": STILL}, THOR),
+    "report": lambda: so.write_report(None, "report.html"),
+    "report of nothing": lambda: so.write_report([None], "report.html"),
+    "report of one": lambda: so.write_report(tuned(), "report.html"),
+    "report's page": lambda: so.write_report([tuned()], None),
+    "quality": lambda: assess_quality(None),
 }
 
 

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import ParameterError, PlantError, UnitError, require_number, require_type, suggestion
+from seaopt.errors import ParameterError, PlantError, SeaoptError, UnitError, require_number, require_type, suggestion
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.memo import memo
@@ -311,6 +311,13 @@ def describe_parameters(expression: Expression, params: CompletedParameters) -> 
     value = ca.SX(expression(SimpleNamespace(**symbols)))
     used = [parameter for name, parameter in params.items() if ca.depends_on(value, symbols[name])]
     return ", ".join(f"{parameter.name} = {parameter.value:g}{unit_after(parameter.unit)}" for parameter in used)
+
+
+def require_plant(value: Any, argument: str, error: type[SeaoptError]) -> None:
+    """Refuse what is no plant that moves: an argument of another type, or a plant without states."""
+    require_type(value, Plant, argument, "give a Plant", error)
+    if not value.states:
+        raise error(f"{argument}: plant {value.name} has no states, so that nothing moves; give it states and f")
 
 
 @memo

@@ -8,7 +8,7 @@ from typing import Any
 
 from seaopt.control import Controller, ForceMPC, Frontier
 from seaopt.control.laws.verdict import join_labels, list_design_figures
-from seaopt.errors import SeaoptError
+from seaopt.errors import SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import write_text
 from seaopt.formatting import format_number
@@ -82,6 +82,8 @@ def write_report(
     'report.html'
 
     """
+    require_type(results, Sequence, "results", "give a list of results")
+    require_type(path, (str, Path), "path", "give the page to write")
     kinds = (Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap)
     fit, ranking, controller, mpc, certificate, verification, coupled = (_select(results, kind) for kind in kinds)
     large = [result for result in results if isinstance(result, LargeSignal)]

@@ -53,6 +53,7 @@ from seaopt.formatting import format_count, format_number, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
+from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
@@ -456,10 +457,10 @@ def force_mpc(
     >>> mpc = force_mpc(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> step = mpc.step(mpc.start, reference_N=2000.0, measurement_N=0.0)
     >>> mpc.feasible, step.solved, round(step.current_A, 3)
-    (True, True, 9.0)
+    (True, True, 7.99)
 
     """
-    require_type(plant, Plant, "plant", "give a Plant", ControlError)
+    require_plant(plant, "plant", ControlError)
     require_type(params, (ParameterSet, Fit), "params", "give a ParameterSet or a Fit", ControlError)
     require_type(spec, MPCSpec, "spec", "give an MPCSpec", ControlError)
     if spec.measured not in plant.outputs:

@@ -14,12 +14,13 @@ from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
+from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
@@ -143,6 +144,8 @@ def sweep(
     ([True, True], True)
 
     """
+    require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
+    require_plant(plant, "plant", ControlError)
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
     spec = settle_delay(spec, plant, params)

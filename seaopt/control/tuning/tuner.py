@@ -49,12 +49,13 @@ from seaopt.control.tuning.optimisation_problem import (
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve
-from seaopt.errors import ControlError, suggestion
+from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import SLIDING, find_dry_friction, friction_slopes, split_friction
+from seaopt.plants.plant import require_plant
 
 
 def tune(
@@ -103,6 +104,8 @@ def tune(
     (True, 30)
 
     """
+    require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
+    require_plant(plant, "plant", ControlError)
     spec = settle_delay(spec, plant, params)
     params = params.parameters if isinstance(params, Fit) else params
     values = plant.complete(params)
@@ -147,10 +150,14 @@ def make_task(
         As `tune`.
 
     """
+    require_plant(plant, "plant", ControlError)
     values = plant.complete(params)
     gain = command_of(plant, values, spec.measured).per_effort
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
+    require_type(draws, Sequence, "draws", "give a sequence of mappings of parameter to value", ControlError)
+    for name, other in robust_to.items():
+        require_plant(other[0] if isinstance(other, tuple) else other, f"robust_to: {name}", ControlError)
     named = {"design plant": (plant, values)}
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in robust_to.items()}
     varied = {parameter for draw in draws for parameter in draw}

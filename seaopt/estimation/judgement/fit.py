@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.errors import EstimationError
+from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
@@ -19,6 +19,7 @@ from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.plant import require_plant
 from seaopt.simulation.simulate import input_samples
 
 
@@ -123,6 +124,10 @@ def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
         raise EstimationError("fit takes a list of experiments; put the experiment in brackets, [experiment]")
     if not experiments:
         raise EstimationError("no experiment is given; give at least one Experiment(plant=..., log=...)")
+    require_type(experiments, Sequence, "experiments", "give a list of Experiment", EstimationError)
+    for place, experiment in enumerate(experiments):
+        require_type(experiment, Experiment, f"experiments[{place}]", "give an Experiment", EstimationError)
+        require_plant(experiment.plant, f"experiments[{place}]", EstimationError)
     seen: set[str] = set()
     out: list[Experiment] = []
     for experiment in experiments:

@@ -162,6 +162,8 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     [('clipping', 'F1'), ('clipping', 'F1')]
 
     """
+    if not isinstance(getattr(data, "signals", None), Mapping):
+        raise LogError(f"data = {repr(data)[:60]} is a {type(data).__name__}; give a Log")
     if not data.signals:
         raise LogError(f"{data.source}: holds no channel; name the columns to look at")
     for name in inputs or ():

@@ -19,11 +19,12 @@ from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
+from seaopt.plants.plant import require_plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.certificate.certificate import (
@@ -164,6 +165,7 @@ def certify(
 
     """
     _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
+    require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     if min_friction_margin is None:
         min_friction_margin = controller.spec.level(MIN_FRICTION_MARGIN)
     models, others = _with_design(controller, plants, others or ParameterSet())
@@ -219,10 +221,13 @@ def _check_arguments(
     controller: Controller, plants: Mapping[str, Plant], samples: int, seed: int, confidence: float,
     max_failure_probability: float | None, min_friction_margin: float | None,
 ) -> None:  # fmt: skip
+    require_type(controller, Controller, "controller", "give a Controller", ControlError)
     if not isinstance(plants, Mapping):
         raise ControlError(f"plants is a {type(plants).__name__}; give a mapping of name to plant")
     if not plants:
         raise ControlError("certify needs at least one plant; give {name: plant}")
+    for name, plant in plants.items():
+        require_plant(plant, f"plants: {name}", ControlError)
     for name, value, least, what in (("samples", samples, 1, "number of draws"), ("seed", seed, 0, "seed")):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ControlError(f"{name} = {value!r} is not a {what}; give a whole number, {least} or more")
