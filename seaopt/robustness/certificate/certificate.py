@@ -203,7 +203,8 @@ class Certificate:
     friction_draws : mapping of name to FrictionDraws
         The same over draws, of those models for which it is shown at the nominal parameters.
     remarks : tuple of str
-        What only the fit could tell, one sentence each: a delay that the controller does not count on.
+        What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
+        the bandwidth at amplitudes of use.
 
     """
 

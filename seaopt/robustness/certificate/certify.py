@@ -17,13 +17,14 @@ from jaxtyping import Bool, Float
 from seaopt.control import Controller
 from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
+from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction
+from seaopt.plants.friction import has_friction, split_friction
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
@@ -46,8 +47,11 @@ from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
 from seaopt.robustness.uncertainty.worst import combine_worst, find_worst, measure_worst
+from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
+from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 CONFIDENCE = 1.0 - 1e-6
+AMPLITUDES = 9  # looked at for the remark on bandwidth
 DRAWS_PER_BLOCK = 50_000
 MOST_DELAY_SAMPLES = 20  # samples
 WORST_KEPT = 64  # worst draws kept of each plant
@@ -205,7 +209,7 @@ def certify(
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
         brackets=brackets, friction=friction, friction_draws=friction_draws,
-        remarks=_remark_delay(controller, parameters),
+        remarks=(*_remark_delay(controller, parameters), *_remark_amplitude(controller, models, nominal)),
     )  # fmt: skip
     return certificate.with_steps()
 
@@ -215,6 +219,26 @@ def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tup
     assert controller.design is not None
     plant, _ = controller.design
     return warn_short_delay(controller.delay_samples, controller.spec.sample_rate_hz, plant, parameters)
+
+
+def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nominal: ParameterSet) -> tuple[str, ...]:
+    """Say which bandwidth the design plant has at amplitudes of use, where friction makes it depend on them.
+
+    They are shares of the force that the current limit holds at rest, those of the simulated steps.
+    """
+    assert controller.design is not None
+    name, plant = next((name, plant) for name, plant in models.items() if plant is controller.design[0])
+    rest, sliding = controller.force_limit(LOWEST_HZ), controller.achieved.bandwidth_hz
+    if rest is None or sliding is None or not has_friction(plant, nominal):
+        return ()
+    low, high = STEP_SHARES[0], STEP_SHARES[-1]
+    bands = predict_bandwidths(controller, plant, nominal, rest * np.geomspace(low, high, AMPLITUDES))
+    reached = [band for band in bands if band is not None]
+    at = f"at {100 * low:g} to {100 * high:g} % of the current"
+    if not reached:
+        return (f"{name}: bandwidth {sliding:.3g} Hz sliding; below {sliding / SLOWEST_STUCK:.2g} Hz {at}",)
+    least = f"{min(reached):.3g}" if len(reached) == len(bands) else f"less than {min(reached):.3g}"
+    return (f"{name}: bandwidth {sliding:.3g} Hz sliding; between {least} and {max(reached):.3g} Hz {at}, predicted",)
 
 
 def _check_arguments(

@@ -193,6 +193,29 @@ def large_signal(
     )  # fmt: skip
 
 
+def predict_bandwidths(
+    controller: Controller, plant: Plant, parameters: ParameterSet, amplitude: Float[np.ndarray, " a"]
+) -> tuple[float | None, ...]:
+    """Return the bandwidth (Hz) at amplitudes of the reference (N), by describing functions, as in a `LargeSignal`.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
+    >>> controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    >>> small, large = predict_bandwidths(controller, stand, rubbing, np.array([30.0, 1e5]))
+    >>> small < large, round(large)
+    (True, 20)
+
+    """
+    band, values = controller.spec.bandwidth_hz, plant.complete(parameters)
+    f = np.geomspace(band / SLOWEST_STUCK, min(2.0 * band, 0.24 / controller.sample_time_s), PREDICTED_POINTS)
+    linear = controller.close(take_sliding(plant, values), values)
+    static = float(np.abs(linear.tracking(np.array([STATIC_HZ])))[0])
+    gains = np.abs(predict_gain(controller, plant, values, f, amplitude))
+    return tuple(_find_bandwidth(f, row, static, plant.moves) for row in gains)
+
+
 def _choose_amplitudes(at_band: float, friction: float) -> Float[np.ndarray, " a"]:
     """Return amplitudes (N) from stuck to saturation, of what is there of the two."""
     saturating = np.array(AMPLITUDES) * at_band
