@@ -66,6 +66,23 @@ def test_a_fit_has_diagnostics_and_a_ranking_says_why(stand, short_log, thor, tm
     assert "Which model" in alone and "Parameters" not in alone
 
 
+def test_findings_of_a_fit_stand_in_the_report(stand, short_log, thor, tmp_path, without_drawing):
+    swapped = so.Log.from_arrays(time=short_log.time, I=short_log["I"], F1=short_log["F2"], F2=short_log["F1"])
+    bench = so.Experiment(plant=stand, log=swapped, name="chirp", outputs=("F1", "F2"))
+    fit = so.fit([bench], thor.free("J", "b_r"))
+    assert fit.errors
+    read = so.Fit.from_dict(fit.to_dict(), (bench,))  # a report of a stored fit says the same
+    for number, each in enumerate((fit, read)):
+        page = so.write_report([each], tmp_path / f"{number}.html").read_text(encoding="utf-8")
+        section = page.split("<h2>Findings</h2>")[1].split("</ul>")[0]
+        assert section.count("<li") == len(fit.findings)
+        assert section.count("<b>error</b>") == len(fit.errors)
+        assert "F1 and F2 are swapped" in section
+    clean = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1",))], thor.free("J"))
+    assert not clean.findings
+    assert "Findings" not in so.write_report([clean], tmp_path / "clean.html").read_text(encoding="utf-8")
+
+
 def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path, without_drawing):
     """They need residuals and the problem, which fit.json does not hold."""
     bench = so.Experiment(plant=stand, log=short_log, name="chirp", outputs=("F1",))

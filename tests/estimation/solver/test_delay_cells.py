@@ -1,0 +1,59 @@
+"""Free delays where the input reaches an output at once, on responses of a fine lifted simulation by scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, dlsim, lfilter
+
+import seaopt as so
+
+M, B, K, G, RATE, FINE = 2.0, 300.0, 5e4, 10.0, 400.0, 10
+
+
+def drive() -> so.Plant:
+    """Return a mass on a spring, and the force at its back, which feels the input at once."""
+    return so.Plant(
+        name="drive", states={"q": "m", "v": "m/s"}, inputs={"I": "A"}, outputs={"F1": "N", "F2": "N"},
+        parameters={"M": "kg", "b": "N s/m", "G": "N/A"},
+        f=lambda t, x, u, p: {"q": x.v, "v": (p.G * u.I - p.b * x.v - K * x.q) / p.M},
+        h=lambda t, x, u, p: {"F1": K * x.q, "F2": p.G * u.I - p.b * x.v},
+    )  # fmt: skip
+
+
+def log_of(samples_late: float, seed: int) -> so.Log:
+    """Return a log whose input is so many samples late; at a sample, the input up to then is in force."""
+    rng = np.random.default_rng(seed)
+    current = 3.0 * lfilter([0.3], [1.0, -0.7], rng.normal(size=1500))
+    late = round(samples_late * FINE)
+    u = np.concatenate([np.full(late, current[0]), np.repeat(current, FINE)])[: current.size * FINE]
+    a = np.array([[0.0, 1.0], [-K / M, -B / M]])
+    system = cont2discrete((a, np.array([[0.0], [G / M]]), np.eye(2), np.zeros((2, 1))), 1.0 / (RATE * FINE))
+    _, _, x = dlsim(system, u)
+    sampled, force = x[::FINE], G * u[::FINE]
+    if samples_late % 1.0:  # between samples the older one is still in force
+        assert np.array_equal(u[::FINE][4:], current[4 - int(samples_late) - 1 : current.size - int(samples_late) - 1])
+    outputs = (
+        np.column_stack([K * sampled[:, 0], force - B * sampled[:, 1]]) + rng.normal(size=(current.size, 2)) * 0.05
+    )
+    return so.Log.from_arrays(time=np.arange(current.size) / RATE, I=current, F1=outputs[:, 0], F2=outputs[:, 1])
+
+
+@pytest.mark.parametrize(("samples_late", "start"), [(0.0, 1.9), (2.0, 0.0), (2.0, 4.0), (2.3, 1.9)])
+def test_a_delay_is_found_across_the_jumps_of_an_output_with_feedthrough(samples_late, start):
+    delay = so.Parameter(name="delay_s", value=start / RATE, unit="s", free=True, min=0.0, max=0.05)
+    experiment = so.Experiment(plant=drive(), log=log_of(samples_late, 1), delay_s=delay)
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"))
+    assert fit.status == "converged"
+    assert fit.nuisance["experiment"].delay_s * RATE == pytest.approx(samples_late, abs=5e-3)
+    so.testing.assert_recovered(fit, truth, sigmas=4)
+
+
+def test_a_delay_at_its_bound_is_an_error_where_the_log_wants_it_beyond():
+    delay = so.Parameter(name="delay_s", value=0.0, unit="s", free=True, min=0.0, max=1.5 / RATE)
+    experiment = so.Experiment(plant=drive(), log=log_of(2.3, 1), outputs=("F1",), delay_s=delay)
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    fit = so.fit([experiment], truth.free("M", "b"))
+    assert ("experiment.delay_s", "error") in [(f.where, f.severity) for f in fit.findings if f.kind == "bound"]
+    assert not fit.met
