@@ -7,7 +7,7 @@ parameters that were fixed. What they found is put into plain sentences here.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from seaopt.estimation.advice.forecasts import (
     simulate_freely,
     split_samples,
 )
+from seaopt.estimation.judgement.causes import free_delay
 from seaopt.estimation.judgement.score_test import SIGNIFICANCE, Culprit, ScoreTest, correlate_with_inputs, find_culprit
 from seaopt.estimation.problem.correlation import INPUT_LAGS, QUANTILE, CrossCorrelation, autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitExperiment, FitOutput
@@ -33,8 +34,8 @@ from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.uncertainty.leverage import PRIORS, Leverage, measure_leverage
 from seaopt.formatting import html_text
-from seaopt.parameters import Parameter
 from seaopt.records import record
+from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
 LARGE = 0.05  # of an output's rms: a residual that is worth words for its colour alone
@@ -214,7 +215,7 @@ def diagnose(fit: Fit) -> Diagnostics:
     for output in problem.outputs:
         whiteness_p = white[output.experiment.name][output.name]
         outputs[output.experiment.name][output.name] = _diagnose_output(output, residuals, free, ahead, whiteness_p)
-    leverage, at_bound = measure_leverage(minimum), _find_at_bound(minimum)
+    leverage, at_bound = measure_leverage(minimum), problem.unknowns.find_at_bound(minimum.z)
     tests, culprit = find_culprit(minimum, fit, residuals)
     sentences = [] if fit.status == "converged" else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
     sentences += [f"{name} lies on its bound: widen the bound, or fix it there and say why" for name in at_bound]
@@ -249,13 +250,6 @@ def _diagnose_output(
     )
 
 
-def _find_at_bound(minimum: Minimum) -> tuple[str, ...]:
-    unknowns, z = minimum.problem.unknowns, minimum.z
-    width = 1e-9 * np.maximum(np.abs(z), 1e-300)
-    touching = (z - unknowns.low <= width) | (unknowns.high - z <= width)
-    return tuple(name for name, flag in zip(unknowns.names, touching, strict=True) if flag)
-
-
 def _advise_on_outputs(
     fit: Fit, outputs: Mapping[str, Mapping[str, OutputDiagnostics]], residuals: ResidualsByExperiment,
     free: ResidualsByExperiment, culprit: Culprit | None,
@@ -274,7 +268,11 @@ def _advise_on_outputs(
         row, trial = outputs[output.experiment.name][output.name], trials.get(output.experiment.name)
         about_inputs = _advise_on_inputs(output, row, residuals, trial, culprit)
         whitened = culprit is not None and culprit.remainders[output.label].white
-        sentences += about_inputs or ([] if whitened else _advise_on_colour(output, row, problem.predicts))
+        # What the inputs would explain is not noise, whatever a filter predicts of it.
+        lacking = [one for one in fit.findings if one.kind == "explained" and one.where == output.label]
+        sentences += [f"{one.where}: {one.text}" for one in lacking]
+        quiet = whitened or bool(lacking)
+        sentences += about_inputs or ([] if quiet else _advise_on_colour(output, row, problem.predicts))
         sentences += _advise_on_held_out(output, row, free)
     return sentences
 
@@ -293,14 +291,15 @@ class _DelayTrial:
 
 
 def _try_delay(fit: Fit, experiment: FitExperiment) -> _DelayTrial | None:
-    """Refit from the minimum with the delay free; None where it is free already."""
+    """Refit from the minimum with the delay free; None where it is free already, or cannot be."""
     minimum = fit.require_minimum("diagnose")
-    if experiment.slots.delay.index is not None:
+    if experiment.slots.delay.index is not None or experiment.data.hold == "first" or depends_on_time(experiment.model):
         return None
     known, name = experiment.slots.delay.value, experiment.name
     span = INPUT_LAGS * experiment.period
-    delay = Parameter(name="delay_s", value=known, unit="s", free=True, min=0.0, max=known + span)
-    trial, z = minimum.problem.rebuild(fit.parameters, minimum.z, {name: replace(experiment.data, delay_s=delay)})
+    trial, z = minimum.problem.rebuild(
+        fit.parameters, minimum.z, {name: free_delay(experiment.data, known, known + span)}
+    )
     before = trial.evaluate(z)
     after = minimise(
         trial, before, trial.unknowns.low, trial.unknowns.high, max_iterations=DELAY_REFIT_ITERATIONS

@@ -319,7 +319,7 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
     if any(e.hold == "first" or (isinstance(e.delay_s, Parameter) and e.delay_s.free) for e in experiments):
         return  # between samples that are joined by lines no delay can be free
     shifted = tuple(
-        _delay(_lead(e, lead), value + lead * e.log.period)
+        free_delay(_lead(e, lead), value + lead * e.log.period)
         for e, lead, value in zip(experiments, leads, known, strict=True)
     )
 
@@ -377,9 +377,10 @@ def _only(values: Mapping[str, V], name: str) -> dict[str, V]:
     return {name: values[name]} if name in values else {}
 
 
-def _delay(experiment: Experiment, value: float) -> Experiment:
+def free_delay(experiment: Experiment, value: float, longest: float = np.inf) -> Experiment:
     """Return the experiment with a free delay that starts at a value."""
-    return replace(experiment, delay_s=Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0))
+    delay = Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0, max=longest)
+    return replace(experiment, delay_s=delay)
 
 
 def _lead(experiment: Experiment, samples: int) -> Experiment:

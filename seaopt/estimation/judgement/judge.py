@@ -18,10 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.estimation.judgement.causes import Cause, find_causes
+from seaopt.estimation.judgement.causes import Cause, find_causes, free_delay
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
-from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.result.findings import SEVERITIES, FitFinding, OutputFit
 from seaopt.estimation.result.fit_result import Fit, Minimum
@@ -172,14 +171,14 @@ def _find_held_out(outputs: Mapping[str, Mapping[str, OutputFit]]) -> Iterator[F
 def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
     """Yield unknowns at a bound: errors where the logs want them far beyond it."""
     unknowns, z = minimum.problem.unknowns, minimum.z
-    width = 1e-9 * np.maximum(np.abs(z), 1e-300)
-    touching = np.flatnonzero((z - unknowns.low <= width) | (unknowns.high - z <= width))
-    if not touching.size:
+    touching = unknowns.find_at_bound(z)
+    if not touching:
         return
     here = minimum.problem.evaluate(z)
-    for i in touching:
-        name, curvature = unknowns.names[i], float(here.hessian[i, i])
-        inward = 1.0 if z[i] - unknowns.low[i] <= width[i] else -1.0
+    for name in touching:
+        i = unknowns.names.index(name)
+        curvature = float(here.hessian[i, i])
+        inward = 1.0 if z[i] - unknowns.low[i] <= unknowns.high[i] - z[i] else -1.0
         push = inward * float(here.gradient[i]) / math.sqrt(max(curvature, 1e-300))
         bad = push > PUSH
         remedy = (
@@ -244,12 +243,6 @@ def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
     for name in () if white else bending:
         tests |= run_score_tests(minimum, fit, (name,))
     return tests
-
-
-def free_delay(experiment: Experiment, value: float) -> Experiment:
-    """Return the experiment with its delay free."""
-    free = Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0)
-    return replace(experiment, delay_s=free)
 
 
 def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:

@@ -79,6 +79,12 @@ class Unknowns:
         """What the priors know of each unknown: 1/std^2, zero where there is none."""
         return self.prior_std**-2.0
 
+    def find_at_bound(self, z: Float[np.ndarray, " n"]) -> tuple[str, ...]:
+        """Return the names of those that lie on a bound, to rounding."""
+        width = 1e-9 * np.maximum(np.abs(z), 1e-300)
+        touching = (z - self.low <= width) | (self.high - z <= width)
+        return tuple(name for name, flag in zip(self.names, touching, strict=True) if flag)
+
     def prior(self, z: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
         """Return the priors' part of the cost at `z`, of its gradient and of its Hessian."""
         away = (z - self.start) / self.prior_std

@@ -116,6 +116,23 @@ def test_a_missing_mode_is_found_with_its_frequency(thor):
     assert 70 < float(said.split("below ")[1].split(" Hz")[0]) < 90
 
 
+def test_what_an_input_would_explain_is_not_called_noise(log, stand, thor):
+    """A hundred times the inertia hides the mode from the simulation; a filter predicts the log all the same."""
+    bench = so.Experiment(plant=stand, log=log, name="stand", outputs=("F1",))
+    fit = so.fit([bench], thor.update(J=3e-4).free("b_r"), method=so.OutputError(search=False))
+    assert "stand.F1" in [one.where for one in fit.findings if one.kind == "explained"]
+    said = diagnose(fit).sentences
+    assert not any("PredictionError" in sentence for sentence in said)
+    assert any("the inputs account for" in sentence for sentence in said)
+
+
+def test_a_delay_is_not_tried_where_the_input_is_joined_by_lines(stand, thor, log):
+    late = shifted(log, 3)
+    bench = so.Experiment(plant=stand, log=late, name="stand", outputs=("F1",), hold="first")
+    fit = so.fit([bench], thor.free("J", "b_r"))
+    assert not any("with a delay" in sentence for sentence in diagnose(fit).sentences)
+
+
 def test_a_disturbance_is_told_from_what_follows_the_input(stand, thor, log):
     """Slow noise on the force, independent of the current: coloured, predictable, and followed by nothing."""
     slow = 60.0 * np.sqrt(1 - 0.99**2) * ar1(0.99, len(log), np.random.default_rng(2))
