@@ -103,7 +103,8 @@ def noisy_emps(number: int) -> tuple[so.Experiment, so.ParameterSet, tuple[str, 
     noise = 2e-3 * np.std(log["q"]) * np.random.default_rng([3, number]).normal(size=len(log))
     noisy = so.Log.from_arrays(time=log.time, F=log["F"], q=log["q"] + noise)
     experiment = so.Experiment(plant=emps.drive(), log=noisy, name="log", initial_state="rest", offset=False)
-    return experiment, emps.parameters(emps.TRUTH), tuple(emps.TRUTH)
+    truth = emps.parameters(emps.TRUTH).bound(F_c=(0.0, np.inf))  # of either sign it is the same friction
+    return experiment, truth, tuple(emps.TRUTH)
 
 
 OWN_LOGS = {"light link": light_link, "EMPS": noisy_emps}
