@@ -17,6 +17,7 @@ from jaxtyping import Float
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, free_more, run_score_tests
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_experiment import measure_spread
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.result.fit_result import Fit, Minimum
@@ -82,7 +83,9 @@ class _Candidate:
     """A change to be refitted, and how to say what came of it: nothing where it came to nothing.
 
     `delays` are unknowns whose refit starts from the best of `FIRST_DELAYS`, all alike, `gains` unknowns that start
-    from how a simulation compares with its output. Where `certain`, nothing but a mistake explains a gain.
+    from how a simulation compares with its output. Where `certain`, nothing but a mistake explains a gain. `kept` are
+    the fit's own experiments with the samples that the change leaves, where it leaves out some: residuals of other
+    samples tell a gain of many units by chance.
     """
 
     where: str
@@ -92,6 +95,7 @@ class _Candidate:
     certain: bool = False
     delays: tuple[str, ...] = ()
     gains: tuple[str, ...] = ()
+    kept: tuple[Experiment, ...] = ()
 
 
 def find_causes(
@@ -115,7 +119,7 @@ def find_causes(
 
     """
     minimum = fit.require_minimum("find_causes")
-    before = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
+    whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
     colour = _measure_colour(fit)
     causes: list[Cause] = []
     for candidate in _list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor):
@@ -123,6 +127,7 @@ def find_causes(
             solved = _refit(minimum, candidate)
         except SeaoptError:  # what does not make a problem explains nothing
             continue
+        before = _measure_kept(fit, minimum, candidate.kept) if candidate.kept else whole
         cause = None if solved is None else _weigh(fit, candidate, solved, before, colour, poor=poor)
         if cause is not None:
             causes.append(cause)
@@ -139,6 +144,14 @@ def _measure_powers(here: Evaluation, problem: FitProblem) -> Float[np.ndarray, 
         for squares, count, spread in zip(here.power[e.name].squares, here.power[e.name].counts, e.spread, strict=True)
     ]
     return np.maximum(np.array(rows, dtype=float), 1e-24)
+
+
+def _measure_kept(fit: Fit, minimum: Minimum, kept: Sequence[Experiment]) -> Float[np.ndarray, "outputs 2"]:
+    """Return the powers of the fit's residuals over some of its samples."""
+    problem, z = minimum.problem.rebuild(fit.parameters, minimum.z, {e.name: e for e in kept})
+    spread = {e.name: np.array([measure_spread(e.log[name]) for name in e.outputs]) for e in kept}
+    problem = problem.with_values("spread", spread)
+    return _measure_powers(problem.evaluate(z), problem)
 
 
 def _measure_colour(fit: Fit) -> float:
@@ -332,9 +345,11 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
         return join_words(words) if words else None
 
     names = tuple(f"{e.name}.delay_s" for e in experiments)
+    kept = tuple(_cut_ends(e, lead) for e, lead in zip(experiments, leads, strict=True))
     yield _Candidate(
-        where=experiments[0].name, experiments=shifted, params=params, describe=describe_common, delays=names
-    )
+        where=experiments[0].name, experiments=shifted, params=params, describe=describe_common, delays=names,
+        kept=kept,
+    )  # fmt: skip
     if all(len(e.outputs) == 1 for e in experiments):
         return
     apart = tuple(
@@ -358,7 +373,7 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
 
     yield _Candidate(
         where=experiments[0].name, experiments=apart, params=params, describe=describe_each,
-        delays=tuple(f"{e.name}.delay_s" for e in apart),
+        delays=tuple(f"{e.name}.delay_s" for e in apart), kept=kept,
     )  # fmt: skip
 
 
@@ -387,18 +402,26 @@ def _lead(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment with its inputs so many samples early, without the outputs whose inputs are not known."""
     if not samples:
         return experiment
-    log = experiment.log
-    signals = dict(log.signals)
+    cut = _cut_ends(experiment, samples)
+    signals = dict(cut.log.signals)
     for name in experiment.plant.inputs:
         if name in signals:
             values = signals[name].values
             led = np.concatenate([values[samples:], np.repeat(values[-1:], samples)])
             signals[name] = replace(signals[name], values=led)
+    return replace(cut, log=replace(cut.log, signals=signals))
+
+
+def _cut_ends(experiment: Experiment, samples: int) -> Experiment:
+    """Return the experiment without the outputs of so many samples at either end."""
+    if not samples:
+        return experiment
+    signals = dict(experiment.log.signals)
     for name in experiment.outputs:
         known = signals[name].values.copy()
         known[:samples] = known[-samples:] = np.nan
         signals[name] = replace(signals[name], values=known)
-    return replace(experiment, log=replace(log, signals=signals))
+    return replace(experiment, log=replace(experiment.log, signals=signals))
 
 
 def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *, poor: bool) -> Iterator[_Candidate]:

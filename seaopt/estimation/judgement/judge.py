@@ -33,6 +33,7 @@ HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a w
 RUNS_AWAY = -1e3  # fit percent below which a free run is ten times as large as what was measured
 LITTLE = 0.02  # of an output's energy: where no model explains more, explaining less is no fault
 CHANCE = 1e-6  # probability below which a test is not chance
+DOUBTFUL = 1e-3  # probability of a score below which a refit decides: far from the truth a score falls short of that
 SYSTEMATIC = 0.5  # of a residual's power: more than its noise
 LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
 SMALL = 1e-5  # below which a systematic residual is worth no word
@@ -66,7 +67,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
     findings = [*_find_unexplained(fit, shares), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
     findings += [*_find_implausible(fit), *_find_few_samples(fit, minimum)]
     tests = _run_tests(fit, minimum)
-    suspects = {name: test for name, test in tests.items() if test.p < CHANCE}
+    suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     wrong = bool(suspects) or any(finding.severity != "note" for finding in findings) or fit.status != "converged"
     if wrong:
         poor = any(finding.kind == "explained" for finding in findings) or fit.status == "not_identifiable"
@@ -248,7 +249,7 @@ def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
 def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:
     """Yield the explanation that is the most likely, and others that explain as much."""
     if not causes:
-        for name in list(suspects)[:1]:
+        for name in [name for name, test in suspects.items() if test.p < CHANCE][:1]:
             yield FitFinding(
                 severity="warning", kind="fixed", where=name,
                 text=f"{name} = {suspects[name].value:.4g} is fixed, and the logs are against it (chi-square "

@@ -11,7 +11,7 @@ import pytest
 from scipy import signal
 
 import seaopt as so
-from seaopt.estimation.judgement.causes import find_clipping
+from seaopt.estimation.judgement.causes import find_causes, find_clipping
 from seaopt.estimation.judgement.coherence import measure_coherence
 
 RATE_HZ = 400.0
@@ -99,6 +99,21 @@ def test_a_wrong_fixed_stiffness_is_an_error_where_the_logs_tell():
     result = fit(bench(noise_n=0.5), start={"k": 2 * K})
     assert not result.met
     assert re.search(r"k = 6\.\d+e\+05", cause(result))
+
+
+def test_a_refit_decides_where_the_score_alone_may_be_chance():
+    """Far from the truth a score test falls short: p is 2e-6 here, and k twice its value moves J twofold."""
+    result = fit(bench(seed=4), start={"k": 2 * K})
+    assert not result.met
+    assert "moves J" in cause(result)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_change_explains_an_honest_log_better(seed):
+    """Not a delay either, whose refit leaves out samples at both ends: it is weighed over those that it keeps."""
+    result = fit(bench(seed, noise_n=100.0))
+    residuals = result.require_minimum("test").residuals()
+    assert find_causes(result, residuals, {}, [], poor=False) == []
 
 
 def test_another_plant_of_the_problem_is_named():
