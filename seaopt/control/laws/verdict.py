@@ -100,13 +100,15 @@ class PossibleBandwidths:
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
 
 
-def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
+def judge(
+    spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False, limits: Sequence[Limit] = LIMITS
+) -> list[Verdict]:
     """Judge a loop by every limit of a scope that the specification imposes.
 
     With `stuck`, only by those that also hold where the design plant is stuck by its friction.
     """
     verdicts: list[Verdict] = []
-    for limit in LIMITS:
+    for limit in limits:
         allowed = spec.allowed(limit)
         if limit.scope != scope or allowed is None or (stuck and not limit.stuck_too):
             continue
@@ -116,14 +118,16 @@ def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False
     return verdicts
 
 
-def judge_all(spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
+def judge_all(
+    spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1, limits: Sequence[Limit] = LIMITS
+) -> list[Verdict]:
     """Judge every plant's loop, and the design plant's, which is the first, by its own limits too.
 
     Of two `design_states` the first is the design plant sliding, the second the same plant stuck by its friction.
     """
-    verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant")]
-    verdicts += judge(spec, loops[0], "design plant")
-    return verdicts + (judge(spec, loops[1], "design plant", stuck=True) if design_states == 2 else [])
+    verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant", limits=limits)]
+    verdicts += judge(spec, loops[0], "design plant", limits=limits)
+    return verdicts + (judge(spec, loops[1], "design plant", stuck=True, limits=limits) if design_states == 2 else [])
 
 
 def list_broken(verdicts: Sequence[Verdict]) -> list[str]:

@@ -46,7 +46,7 @@ from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
 from seaopt.control.mpc.quadratic_program import make_solver, solve_program
-from seaopt.control.mpc.spec import MPCSpec
+from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_number, html_text
@@ -146,17 +146,17 @@ class ForceMPC:
     gate : PlausibilityGate, optional
         Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
         current goes to zero.
-    loops : mapping of name to Loop
-        Around the design plant while no limit is active, efforts in newtons of motor force; with friction sliding and
-        then stuck.
-    verdicts : tuple of Verdict
-        Every limit of the specification against these loops.
     possible_hz : float or None
         Where a limit is broken: the largest bandwidth that keeps them all; None where none is known.
     friction : FrictionMargin or None
         How much steeper friction may be with stability proved while no limit is active; None without friction.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
+    loops : mapping of name to Loop
+        Around the design plant while no limit is active, efforts in newtons of motor force; with friction sliding and
+        then stuck. Like `verdicts`, it follows from the fields above and is never given.
+    verdicts : tuple of Verdict
+        Every limit of the specification against these loops.
 
     """
 
@@ -170,11 +170,19 @@ class ForceMPC:
     shift: Float[np.ndarray, "n n"]
     solver: Any
     gate: PlausibilityGate | None = None
-    loops: Mapping[str, Loop] = field(default_factory=dict[str, Loop])
-    verdicts: tuple[Verdict, ...] = ()
     possible_hz: float | None = None
     friction: FrictionMargin | None = None
     warnings: tuple[str, ...] = ()
+    loops: Mapping[str, Loop] = field(init=False)
+    verdicts: tuple[Verdict, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        plant, values = self.design
+        states = split_friction({"design plant": plant}, values)
+        loops = {name: self.close(one, values) for name, one in states.items()}
+        measured = [MeasuredLoop(name=name, figures=loop.figures()) for name, loop in loops.items()]
+        object.__setattr__(self, "loops", loops)
+        object.__setattr__(self, "verdicts", tuple(judge_all(self.spec, measured, len(measured), MPC_LIMITS)))
 
     @property
     def measured(self) -> str:
@@ -221,7 +229,8 @@ class ForceMPC:
         blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, design, loop))
         remedy = (
             f"{self.possible_hz:.4g} Hz is possible" if self.possible_hz is not None
-            else "no lower bandwidth is known that keeps them; shorten the delay, sample faster, or raise a limit"
+            else "no lower bandwidth is known that keeps them; shorten the delay, sample faster, give the plan more "
+            "moves, or raise a limit"
         )  # fmt: skip
         return f"{self.spec.bandwidth_hz:g} Hz is blocked by {blocked}; {remedy}"
 
@@ -381,14 +390,6 @@ class ForceMPC:
         law, scale = self.unlimited(), self.per_effort
         return replace(law, b=law.b / scale, d=law.d / scale)
 
-    def judged(self) -> ForceMPC:
-        """Return it with the loops of its design plant, and every limit held against them."""
-        plant, values = self.design
-        states = split_friction({"design plant": plant}, values)
-        loops = {name: self.close(one, values) for name, one in states.items()}
-        measured = [MeasuredLoop(name=name, figures=loop.figures()) for name, loop in loops.items()]
-        return replace(self, loops=loops, verdicts=tuple(judge_all(self.spec, measured, len(measured))))
-
     def describe_figures(self) -> list[str]:
         """Return a line of margins for each loop of the design plant: with friction sliding and stuck."""
         lines: list[str] = []
@@ -414,8 +415,9 @@ class ForceMPC:
             f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
             f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
             f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} N",
-            f"  bandwidth {s.bandwidth_hz:g} Hz while no limit of the current is active; horizon "
-            f"{1e3 * s.horizon_s:g} ms, {self.prediction.knots.size} free currents",
+            f"  bandwidth {format_number(self.achieved.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}) "
+            f"while no limit of the current is active; horizon {1e3 * s.horizon_s:g} ms, "
+            f"{self.prediction.knots.size} free currents",
             *(f"  {line}" for line in self.describe_figures()),
             *([] if self.feasible else [f"  {self.explanation}"]),
             *(f"  note: {note}" for note in self.notes),
@@ -540,7 +542,7 @@ def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, gate: Plausibilit
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
         gate=gate,
-    ).judged()  # fmt: skip
+    )  # fmt: skip
 
 
 def _rate(plant: Plant, params: CompletedParameters, measured: str) -> Float[np.ndarray, " nx"]:

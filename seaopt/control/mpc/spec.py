@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,15 +15,18 @@ from seaopt.records import record
 
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
-MPC_LIMITS = (
-    "max_sensitivity",
-    "max_complementary",
-    "min_disk_margin",
-    "max_reference_peak",
-    "max_droop_db",
-    "max_noise_gain",
-    "min_sensitivity_bandwidth_hz",
-)  # fmt: skip; of the table of limits, those of a loop without gains: the weight makes the bandwidth to 2 %
+MPC_BANDWIDTH_TOLERANCE = 0.02  # the weight makes the bandwidth of a plan with every current free; few cost accuracy
+MPC_LIMITS = (  # of the table of limits, those of a loop without gains
+    *(BY_NAME[name] for name in (
+        "stability", "max_sensitivity", "max_complementary", "min_disk_margin", "max_reference_peak", "max_droop_db",
+        "max_noise_gain", "min_sensitivity_bandwidth_hz", "shoulder_hz",
+    )),
+    replace(
+        BY_NAME["bandwidth_hz"], tolerance=MPC_BANDWIDTH_TOLERANCE,
+        meaning="lowest frequency at which |F/F_ref| is 3 dB below its value at 0 Hz, met to 2 %",
+        remedy="plan with more moves, or over a shorter horizon",
+    ),
+)  # fmt: skip
 
 
 @record
@@ -39,7 +43,8 @@ class MPCSpec:
         The output that is fed back, F1 as a rule.
     bandwidth_hz : float
         Frequency at which abs(F/F_ref) is 3 dB below its static value as long as no limit is active, on the design
-        plant; it sets the weight of the current's increments.
+        plant; it sets the weight of the current's increments, and is a limit: a plan of few moves over a long
+        horizon may miss it by more than 2 %.
     sample_rate_hz : float
         Of the controller.
     delay_samples : int, optional
@@ -113,8 +118,9 @@ class MPCSpec:
                 f"{MAX_HORIZON_SAMPLES}"
             )
 
-        for name in MPC_LIMITS:
-            BY_NAME[name].check(getattr(self, name), self.bandwidth_hz)
+        for limit in MPC_LIMITS:
+            if limit.has_field:
+                limit.check(getattr(self, limit.name), self.bandwidth_hz)
 
     def _positive(self, name: str) -> None:
         value = getattr(self, name)
@@ -127,9 +133,7 @@ class MPCSpec:
         return 1 if self.delay_samples is None else self.delay_samples
 
     def allowed(self, limit: Limit) -> float | None:
-        """Return the value that a limit allows; None where it is not imposed, or is not for predictive control."""
-        if limit.has_field and limit.name not in MPC_LIMITS:
-            return None
+        """Return the value that one of `MPC_LIMITS` allows; None where it is not imposed."""
         return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
 
     @property

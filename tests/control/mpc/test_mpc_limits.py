@@ -123,6 +123,26 @@ def test_false_lifts_a_limit_and_is_said(stand, thor):
     assert {verdict.limit.name for verdict in tight.verdicts} >= {"max_droop_db", "shoulder_hz", "min_disk_margin"}
 
 
+def test_a_plan_of_few_currents_that_misses_the_bandwidth_is_not_feasible(stand, thor):
+    crude = made(stand, thor, bandwidth_hz=20.0, horizon_s=0.2, moves=4)
+    _, _, tracking = close_by_hand(crude, thor, 0.0)
+    reached = F[np.argmax(tracking < np.sqrt(0.5))]
+    assert reached < 0.97 * 20.0
+    assert not crude.feasible and "bandwidth_hz" in crude.broken and "bandwidth_hz" in crude.explanation
+    bandwidth = next(line for line in repr(crude).splitlines() if line.startswith("  bandwidth"))
+    assert float(bandwidth.split()[1]) == pytest.approx(reached, rel=3e-3)
+    assert {v.limit.name: v.value for v in crude.verdicts}["bandwidth_hz"] == pytest.approx(reached, rel=3e-3)
+
+
+def test_every_copy_is_judged_by_its_own_specification(mpc):
+    """A controller whose specification is replaced is held against the new one, and none is left unjudged."""
+    tightened = replace(mpc, spec=replace(mpc.spec, max_sensitivity=1.1))
+    assert mpc.feasible and not tightened.feasible
+    assert all(label.startswith("max_sensitivity") for label in tightened.broken)
+    with pytest.raises((TypeError, ValueError)):
+        replace(mpc, verdicts=())
+
+
 @pytest.mark.parametrize(
     "level", [{"max_sensitivity": 0.9}, {"max_complementary": np.nan}, {"min_sensitivity_bandwidth_hz": 20.0}]
 )
