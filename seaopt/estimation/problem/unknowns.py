@@ -103,7 +103,9 @@ class _Builder:
         self.linear.append(linear)
         return Slot(value=entry.value, index=len(self.entries) - 1)
 
-    def add_if_free(self, value: float | Parameter, name: str, unit: str, low: float) -> Slot:
+    def add_if_free(
+        self, value: float | Parameter, name: str, unit: str, low: float = -math.inf, high: float = math.inf
+    ) -> Slot:
         """Add a free Parameter under `name`; a number, or one that is not free, is known. Its unit is converted."""
         if not isinstance(value, Parameter):
             return Slot(value=float(value))
@@ -117,7 +119,7 @@ class _Builder:
         return self.add(
             Parameter(
                 name=name, value=scale * value.value, unit=unit, free=True, min=max(scale * value.min, low),
-                max=scale * value.max, prior_std=prior,
+                max=min(scale * value.max, high), prior_std=prior,
             )
         )  # fmt: skip
 
@@ -173,10 +175,9 @@ def _make_slots(
     name = experiment.name
     level = sees_level(band_hz)
     forgotten = not level and _forgets_start(builder, experiment, model, band_hz)
-    delay = builder.add_if_free(experiment.delay_s, f"{name}.delay_s", "s", 0.0)
-    gain = tuple(
-        builder.add_if_free(experiment.gain.get(o, 1.0), f"{name}.gain.{o}", "-", -math.inf) for o in experiment.outputs
-    )
+    # An input that comes after the log's end is not in it.
+    delay = builder.add_if_free(experiment.delay_s, f"{name}.delay_s", "s", 0.0, experiment.log.duration_s)
+    gain = tuple(builder.add_if_free(experiment.gain.get(o, 1.0), f"{name}.gain.{o}", "-") for o in experiment.outputs)
     no_drift: tuple[tuple[Slot, ...], ...] = ((),) * len(experiment.outputs)
     if delay.index is not None and depends_on_time(model):
         raise EstimationError(

@@ -46,10 +46,7 @@ def experiment(plant, log, **options):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(
-    "case",
-    ["stand", pytest.param("swing", marks=pytest.mark.slow), pytest.param("swing, friction", marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("case", ["stand", pytest.param("swing", marks=SLOW), "swing, friction"])
 def test_each_method_recovers_the_truth(case, method, stand, swing, thor):
     plant = stand if case == "stand" else swing
     truth = thor.update(**(FRICTION if "friction" in case else {"d": 0.1}))
@@ -464,7 +461,6 @@ def test_shots_start_where_the_plant_is(options):
         assert fit.outputs["experiment"]["y"].sigma == pytest.approx(1e-3, rel=0.1)
 
 
-@pytest.mark.slow
 def test_stretches_of_a_few_samples_count_in_the_covariance():
     """A log of stretches of seven samples has the std that linear least squares states, not none."""
     time, u, y = lag_log(noise=0.01)
@@ -486,10 +482,10 @@ def test_a_band_without_0_hz_leaves_the_level_to_the_rest(stand, thor):
     assert fit.outputs["log"]["F1"].rms_residual < 3
 
 
-@pytest.mark.parametrize("method", ["output_error", *SLOW_METHODS])
+@pytest.mark.parametrize("method", METHODS)
 def test_noise_alone_is_not_called_a_fit(stand, thor, method):
     rng = np.random.default_rng(3)
-    n = 4000
+    n = 2000
     log = so.Log.from_arrays(
         time=np.arange(n) / 400, I=rng.normal(size=n), F1=rng.normal(size=n), F2=rng.normal(size=n)
     )

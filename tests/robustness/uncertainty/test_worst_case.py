@@ -59,7 +59,7 @@ def test_a_batch_with_conditions_is_the_one_by_one_path(controller, swing, thor)
         assert batched.mt[k] == pytest.approx(figures.mt, rel=1e-9)
 
 
-@pytest.mark.parametrize("b_r", [1e12, 1e160, 1e300])
+@pytest.mark.parametrize("b_r", [1e160, *(pytest.param(b_r, marks=pytest.mark.slow) for b_r in (1e12, 1e300))])
 def test_draws_beyond_computing_are_failures(b_r, controller, stand, thor):
     """A hopeless fit's: entries that overflow were a LinAlgError."""
     figures = batch_figures(controller, stand, thor, {"b_r": np.array([1.31e-4, b_r])})
