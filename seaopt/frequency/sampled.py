@@ -1,9 +1,9 @@
 r"""The response from input samples to output samples of a linear plant, hold and delay included, and its derivatives.
 
-With the sampled model :math:`x^+ = A x + B_a u_{k-l_a} + B_b u_{k-l_b}` of :mod:`seaopt.simulation.discretisation` and
-:math:`z = e^{2 \pi i f T}`,
+With the sampled model :math:`x^+ = A x + B_a u_{k-l_a} + B_b u_{k-l_b} + ...` of
+:mod:`seaopt.simulation.discretisation` and :math:`z = e^{2 \pi i f T}`,
 
-.. math:: G = C (z - A)^{-1} B(z) + D(z), \qquad B(z) = B_a z^{-l_a} + B_b z^{-l_b}
+.. math:: G = C (z - A)^{-1} B(z) + D(z), \qquad B(z) = B_a z^{-l_a} + B_b z^{-l_b} + ...
 
 and likewise for D. This is what an H1 estimate of a log estimates; the continuous-time response lacks the hold's delay
 of half a sample.
@@ -45,11 +45,9 @@ def sampled_response(
     blocks = transition(model, theta, clock)
     nx, nu = model.nx, model.nu
     z = np.exp(2j * np.pi * f * clock.period)
-    lag_a, lag_b = clock.lags
-    drives = (
-        z[:, None] ** -lag_a * blocks[:, None, :, nx + source]
-        + z[:, None] ** -lag_b * blocks[:, None, :, nx + nu + source]
-    )
+    drives = np.zeros((len(blocks), z.size, nx + model.ny), dtype=complex)
+    for i, lag in enumerate(clock.lags):
+        drives += z[:, None] ** -float(lag) * blocks[:, None, :, nx + i * nu + source]
     inner = z[:, None, None] * np.eye(nx) - blocks[0, :nx, :nx]
     state = np.linalg.solve(inner, drives[0, :, :nx, None])[:, :, 0]
     c = blocks[0, nx:, :nx]

@@ -30,9 +30,10 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     pointer, whole, real = np.uint64, np.int64, np.float64
     return np.dtype([
         ("from", whole), ("to", whole), ("length", whole), ("lead", whole), ("u", pointer, (nu,)),
-        ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("settle", whole),
-        ("start", whole), ("output_rows", whole), ("t0", real), ("tau0", real), ("dtau", real), ("model", pointer),
-        ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer), ("drift", pointer),
+        ("y", pointer, (ny,)), ("keep", pointer, (ny,)), ("lag_a", whole), ("lag_b", whole), ("lag_c", whole),
+        ("settle", whole), ("start", whole), ("output_rows", whole), ("t0", real), ("tau0", real), ("dtau", real),
+        ("model", pointer), ("correction", pointer), ("x0", pointer), ("offset", pointer), ("gain", pointer),
+        ("drift", pointer),
         ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
         ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
         ("last", pointer), ("carry", pointer), ("into", pointer), ("correlation", pointer), ("ring", pointer),
@@ -47,23 +48,25 @@ def _has_constant(model: Model) -> bool:
     return not ca.simplify(ca.substitute(both, where, ca.DM.zeros(where.numel()))).is_zero()
 
 
-def _needs_delay(model: Model, point: Point) -> bool:
-    """Tell whether the code must know of a delay: the older input of a linear plant matters, or the delay is free."""
-    older = point.clock.fraction_s > 0.0 or point.clock.hold == "first"
-    return point.clock.delay_free or (model.linear and older)
+def _count_delayed(model: Model, point: Point) -> int:
+    """Return DELAYED of layout.h: inputs in force besides u_a of a linear plant; of others, what a free delay moves."""
+    clock = point.clock
+    if model.linear:
+        return len(clock.lags) - 1 if clock.split or clock.hold == "first" else 0
+    return clock.delay_free * (2 if clock.hold == "first" else 1)
 
 
-def kernel_source(model: Model, layout: Layout, delayed: bool) -> str:
+def kernel_source(model: Model, layout: Layout, delayed: int) -> str:
     """Return the C source of the passes of a model."""
     constants = {
         "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": layout.shared, "NQ": model.np, "ND": layout.drift_terms,
-        "LINEAR": int(model.linear), "CORRECT": int(layout.corrected), "DELAYED": int(delayed),
+        "LINEAR": int(model.linear), "CORRECT": int(layout.corrected), "DELAYED": delayed,
     }  # fmt: skip
     generated = ""
     if model.linear:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     else:
-        rates = rate_functions(model)
+        rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
         chains = (
@@ -95,7 +98,7 @@ def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int,
 
 
 @memo
-def load_passes(model: Model, layout: Layout, delayed: bool) -> Kernel | None:
+def load_passes(model: Model, layout: Layout, delayed: int) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
     kernel = load_kernel(kernel_source(model, layout, delayed), "seaopt_passes")
     if kernel is not None:
@@ -116,8 +119,8 @@ def _discretise(model: Model, theta: bytes, clock: Clock) -> Float[np.ndarray, "
 def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray, " m"]:
     """Return D and A of pass.c: rows of [x+; y], forced with derivatives last, and by the state."""
     blocks = _discretise(model, point.theta.tobytes(), point.clock)
-    nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _needs_delay(model, point)
-    used = [*range(nx + nu * (1 + delayed))] + ([nx + 2 * nu] if _has_constant(model) else [])
+    nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _count_delayed(model, point)
+    used = [*range(nx + nu * (1 + delayed))] + ([blocks.shape[2] - 1] if _has_constant(model) else [])
     d = np.zeros((rows, len(used), _pad_to_vectors(layout.states)))
     d[:, :, : blocks.shape[0]] = blocks[:, :, used].transpose(1, 2, 0)
     d[:, :nx, 0] = 0.0  # the state itself goes through A
@@ -138,7 +141,8 @@ def _memory_of(a: Float[np.ndarray, "nx nx"], limit: int) -> int:
 def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     clock = point.clock
     foh = float(clock.hold == "first")
-    constants = np.array(rate_functions(model).prepare(model.parameters(point.theta))).ravel()
+    rates = rate_functions(model, moving=_count_delayed(model, point) == 2)
+    constants = np.array(rates.prepare(model.parameters(point.theta))).ravel()
     return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
 
 
@@ -179,7 +183,7 @@ class Program:
         base["u"] = [memory.constant(channel) + 8 * segment.lead for channel in segment.u]
         base["y"] = [memory.constant(channel) for channel in segment.y] if segment.y else 0
         base["keep"] = [memory.address(np.ascontiguousarray(mask)) for mask in segment.keep] if segment.keep else 0
-        base["lag_a"], base["lag_b"] = point.clock.lags
+        base["lag_a"], base["lag_b"], base["lag_c"] = (*point.clock.lags, 0)[:3]
         base["settle"], base["t0"] = weights.settle, segment.start_s
         base["tau0"], base["dtau"] = segment.drift_span
         base["model"] = memory.constant(data)
@@ -199,7 +203,7 @@ class Program:
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
         """Return the program, or None where there is no compiler."""
         layout = layout_of(model.nx, model.ny, model.np, point)
-        kernel = load_passes(model, layout, _needs_delay(model, point))
+        kernel = load_passes(model, layout, _count_delayed(model, point))
         return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
 
     def _correction(self, point: Point) -> int:

@@ -1,9 +1,12 @@
 r"""Exact discretisation of a linear plant, with its exact parameter derivatives.
 
-Over one period T the input is a hold of the samples: zero-order, first-order, or zero-order with a delay of which
-:math:`\delta < T` is the fraction (the older sample :math:`u_b` acts for :math:`\delta`, then :math:`u_a`). Each is
-the exponential of an augmented matrix (Van Loan, IEEE TAC 23(3), 1978): with :math:`z = [x, u, 1]`,
-:math:`\dot z = N z`, :math:`z(T) = e^{N T} z(0)`. Its derivatives are those of the same products, rule by rule.
+Between samples the input is held, or joined by straight lines. A delay of :math:`\delta < T` over whole samples puts
+its corners at :math:`\delta` into each period T: two stretches, over each of which the input is a line. A stretch of
+:math:`\tau` is the exponential of an augmented matrix (Van Loan, IEEE TAC 23(3), 1978): with
+:math:`z = [x, u, \dot u, 1]`, :math:`\dot z = N z`, :math:`z(\tau) = e^{N \tau} L w`, where L makes the line of
+:math:`w = [x, u_a, u_b, ..., 1]`, the state at the start and the samples in force. Derivatives are those of the same
+products, rule by rule; with respect to the delay, :math:`d e^{N \delta} = N e^{N \delta}`, and the lines themselves
+move where they are not level.
 """
 
 from __future__ import annotations
@@ -32,9 +35,9 @@ class Clock:
     hold : {"zero", "first"}
         The input between samples: held (a command from a computer) or a straight line (a measured current).
     delay_s : float
-        The plant gets the input this much later; with a first-order hold, a whole number of samples.
+        The plant gets the input this much later.
     delay_free : bool
-        Whether derivatives with respect to the delay are wanted (zero-order hold only).
+        Whether derivatives with respect to the delay are wanted.
 
     """
 
@@ -48,11 +51,6 @@ class Clock:
             raise SimulationError(f'hold = "{self.hold}" is not known; use "zero" or "first"')
         if not 0.0 <= self.delay_s < np.inf:
             raise SimulationError(f"delay_s = {self.delay_s:g} is not a delay; give zero or more seconds")
-        if self.hold == "first" and (self.fraction_s > 0.0 or self.delay_free):
-            raise SimulationError(
-                f"delay_s = {self.delay_s:g} is not a whole number of samples of {self.period:g} s; "
-                'with hold = "first" it must be, and cannot be free; use hold = "zero"'
-            )
 
     @property
     def whole(self) -> int:
@@ -66,9 +64,21 @@ class Clock:
         return rest if rest > 1e-9 * self.period else 0.0
 
     @property
-    def lags(self) -> tuple[int, int]:
-        """The rows of the input in force: u[k - lags[0]] is u_a, u[k - lags[1]] is u_b."""
-        return (self.whole, self.whole - 1) if self.hold == "first" else (self.whole, self.whole + 1)
+    def split(self) -> bool:
+        """Whether a period has two stretches: the older samples act for the first."""
+        return self.fraction_s > 0.0 or self.delay_free
+
+    @property
+    def lags(self) -> tuple[int, ...]:
+        """The rows of the input in force: u[k - lags[0]] is u_a, u[k - lags[1]] is u_b, and so on.
+
+        A line from u_a to u_b, and with a fraction of a delay one from u_c to u_a before it; or u_a is held, and u_b
+        before it.
+        """
+        whole = self.whole
+        if self.hold == "zero":
+            return whole, whole + 1
+        return (whole, whole - 1, whole + 1) if self.split else (whole, whole - 1)
 
 
 @np.errstate(all="ignore")  # a plant far off may overflow: the result is then not finite
@@ -96,81 +106,78 @@ def expm_with_derivatives(
     return e[0, :m, :m], e[1:, :m, m:]
 
 
+@np.errstate(all="ignore")
 def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> Float[np.ndarray, "..."]:
     """Return the sampled model and its derivatives.
 
     Returns
     -------
-    array, shape (1 + np [+ 1], nx + ny, nx + 2 nu + 1)
-        First x+ = F w over y = H w with w = [x, u_a, u_b, 1]; then the derivatives with respect to theta, and with
-        respect to the delay where ``clock.delay_free``.
+    array, shape (1 + np [+ 1], nx + ny, nx + m nu + 1)
+        First x+ = F w over y = H w with w = [x, u_a, u_b, ..., 1], an input for each of ``clock.lags``; then the
+        derivatives with respect to theta, and with respect to the delay where ``clock.delay_free``.
 
     """
-    nx, nu, ny = model.nx, model.nu, model.ny
+    nx, nu = model.nx, model.nu
     g, dg = model.matrices(theta)
-    if clock.hold == "first":
-        f, df = _first_order(g[:nx], dg[:, :nx], nu, clock.period)
-    else:
-        f, df = _zero_order(g[:nx], dg[:, :nx], nu, clock)
-    blocks = np.zeros((1 + df.shape[0], nx + ny, nx + 2 * nu + 1))
-    blocks[0, :nx], blocks[1:, :nx] = f, df
-    shift = nu if clock.fraction_s > 0.0 else 0  # at the sample the older input still acts
+    generator = _augment(np.concatenate([g[None, :nx], dg[:, :nx]]), nu, joined=clock.hold == "first")
+    older, newer = _make_lines(nx, nu, clock)
+    step = _advance(generator, clock.period - clock.fraction_s, newer, nx, -1.0, free=clock.delay_free)
+    if clock.split:
+        first = _advance(generator, clock.fraction_s, older, nx, 1.0, free=clock.delay_free)
+        chained = step[:, :, :nx] @ first[0]
+        chained[1:] += step[0, :, :nx] @ first[1:]
+        chained[:, :, nx:] += step[:, :, nx:]
+        step = chained
+    blocks = np.concatenate([step, np.zeros((len(step), model.ny, step.shape[2]))], axis=1)
+    # At the sample itself the older input still acts, if for any time at all.
+    line = (older if clock.fraction_s > 0.0 or (clock.split and clock.hold == "first") else newer)[:, nx : nx + nu]
     for block, source in zip(blocks, (g, *dg), strict=False):
-        block[nx:, :nx] = source[nx:, :nx]
-        block[nx:, nx + shift : nx + shift + nu] = source[nx:, nx : nx + nu]
-        block[nx:, -1] = source[nx:, -1]
+        block[nx:, :nx], block[nx:, -1] = source[nx:, :nx], source[nx:, -1]
+        block[nx:] += source[nx:, nx : nx + nu] @ line[0]
+    if clock.delay_free:
+        blocks[-1, nx:] += g[nx:, nx : nx + nu] @ line[1]
     return blocks
 
 
-def _zero_order(
-    g: Float[np.ndarray, "nx w"], dg: Float[np.ndarray, "np nx w"], nu: int, clock: Clock
-) -> tuple[Float[np.ndarray, "nx v"], Float[np.ndarray, "nd nx v"]]:
-    nx, w = g.shape
-    count = dg.shape[0]
-    n, dn = np.zeros((w, w)), np.zeros((count, w, w))
-    n[:nx], dn[:, :nx] = g, dg
-    older, newer = clock.fraction_s, clock.period - clock.fraction_s
-    second, dsecond = expm_with_derivatives(n * newer, dn * newer)
-    f = np.zeros((nx, nx + 2 * nu + 1))
-    df = np.zeros((count + clock.delay_free, nx, nx + 2 * nu + 1))
-    ua, ub = slice(nx, nx + nu), slice(nx + nu, nx + 2 * nu)
-    if older == 0.0 and not clock.delay_free:
-        for target, source in ((f, second), (df, dsecond)):
-            target[..., :nx], target[..., ua] = source[..., :nx, :nx], source[..., :nx, nx : nx + nu]
-            target[..., -1] = source[..., :nx, -1]
-        return f, df
-    first, dfirst = expm_with_derivatives(n * older, dn * older)
-    a2, b2, c2 = second[:nx, :nx], second[:nx, nx : nx + nu], second[:nx, -1]
-    a1, b1, c1 = first[:nx, :nx], first[:nx, nx : nx + nu], first[:nx, -1]
-    f[:, :nx], f[:, ua], f[:, ub], f[:, -1] = a2 @ a1, b2, a2 @ b1, a2 @ c1 + c2
-    for j in range(count):
-        da2, db2, dc2 = dsecond[j, :nx, :nx], dsecond[j, :nx, nx : nx + nu], dsecond[j, :nx, -1]
-        da1, db1, dc1 = dfirst[j, :nx, :nx], dfirst[j, :nx, nx : nx + nu], dfirst[j, :nx, -1]
-        df[j, :, :nx] = da2 @ a1 + a2 @ da1
-        df[j, :, ua], df[j, :, ub] = db2, da2 @ b1 + a2 @ db1
-        df[j, :, -1] = da2 @ c1 + a2 @ dc1 + dc2
-    if clock.delay_free:  # d/d(older) of b2(T - older) u_a + a2 b1(older) u_b
-        df[-1, :, ua] = -a2 @ g[:, nx : nx + nu]
-        df[-1, :, ub] = a2 @ g[:, nx : nx + nu]
-    return f, df
+def _augment(g: Float[np.ndarray, "nd nx w"], nu: int, *, joined: bool) -> Float[np.ndarray, "nd m m"]:
+    """Return N of z = [x, u, 1], or of [x, u, slope, 1] where samples are joined by lines, and its derivatives."""
+    nx, m = g.shape[1], g.shape[2] + nu * joined
+    n = np.zeros((len(g), m, m))
+    n[:, :nx, : nx + nu], n[:, :nx, -1] = g[:, :, : nx + nu], g[:, :, -1]
+    if joined:
+        n[0, nx : nx + nu, nx + nu : nx + 2 * nu] = np.eye(nu)
+    return n
 
 
-def _first_order(
-    g: Float[np.ndarray, "nx w"], dg: Float[np.ndarray, "np nx w"], nu: int, period: float
-) -> tuple[Float[np.ndarray, "nx v"], Float[np.ndarray, "np nx v"]]:
-    """With z = [x, u, slope, 1]: xd = A x + B u + a, ud = slope; u_a = u, slope = (u_b - u_a) / T."""
-    nx, w = g.shape
-    m = w + nu
-    n, dn = np.zeros((m, m)), np.zeros((dg.shape[0], m, m))
-    for target, source in ((n, g), (dn, dg)):
-        target[..., :nx, : nx + nu] = source[..., : nx + nu]
-        target[..., :nx, -1] = source[..., -1]
-    n[nx : nx + nu, nx + nu : nx + 2 * nu] = np.eye(nu)
-    whole, dwhole = expm_with_derivatives(n * period, dn * period)
+def _make_lines(nx: int, nu: int, clock: Clock) -> tuple[Float[np.ndarray, "2 m v"], Float[np.ndarray, "2 m v"]]:
+    """Return L, z = L w at the start of the older and of the newer stretch, each with its derivative by the delay."""
+    joined, inputs = clock.hold == "first", len(clock.lags)
+    older = np.zeros((2, nx + nu * (1 + joined) + 1, nx + nu * inputs + 1))
+    older[0, :nx, :nx], older[0, -1, -1] = np.eye(nx), 1.0
+    newer = older.copy()
+    u, slope = slice(nx, nx + nu), slice(nx + nu, nx + 2 * nu)
+    ua, ub, uc = (slice(nx + i * nu, nx + (i + 1) * nu) for i in range(3))
+    one, rate = np.eye(nu), np.eye(nu) / clock.period
+    newer[0, u, ua] = one
+    if not joined:
+        older[0, u, ub] = one
+        return older, newer
+    newer[0, slope, ua], newer[0, slope, ub] = -rate, rate
+    if clock.split:  # the line from u_c to u_a, which it reaches where the newer one begins
+        older[0, u, ua], older[0, u, uc] = one - rate * clock.fraction_s, rate * clock.fraction_s
+        older[1, u, ua], older[1, u, uc] = -rate, rate
+        older[0, slope, ua], older[0, slope, uc] = rate, -rate
+    return older, newer
 
-    def arrange(e: Float[np.ndarray, "... m m"]) -> Float[np.ndarray, "... nx v"]:
-        slope = e[..., :nx, nx + nu : nx + 2 * nu] / period
-        start = e[..., :nx, nx : nx + nu] - slope
-        return np.concatenate([e[..., :nx, :nx], start, slope, e[..., :nx, -1:]], axis=-1)
 
-    return arrange(whole), arrange(dwhole)
+def _advance(
+    generator: Float[np.ndarray, "nd m m"], duration: float, line: Float[np.ndarray, "2 m v"], nx: int, growth: float,
+    *, free: bool,
+) -> Float[np.ndarray, "nd2 nx v"]:  # fmt: skip
+    """Return x at the end of a stretch from w, and its derivatives; the duration grows so fast with the delay."""
+    whole, slopes = expm_with_derivatives(generator[0] * duration, generator[1:] * duration)
+    steps = np.concatenate([whole[None], slopes])[:, :nx] @ line[0]
+    if not free:
+        return steps
+    late = growth * (generator[0] @ whole)[:nx] @ line[0] + whole[:nx] @ line[1]
+    return np.concatenate([steps, late[None]])

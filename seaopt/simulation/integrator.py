@@ -23,7 +23,7 @@ from seaopt.simulation.model import Model
 
 @memo
 def step_function(model: Model) -> ca.Function:
-    """Return the CasADi function (t, x, u0, u1, p, h) -> (x1, dx1/dx, dx1/d[theta, h])."""
+    """Return the CasADi function (t, x, u0, u1, p, h) -> (x1, dx1/dx, dx1/d[theta, h, u0, u1])."""
     rate = ca.Function("rate", [model.t, model.x, model.u, model.p], [model.f])
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
     x, p = ca.SX.sym("x", model.nx), ca.SX.sym("p", model.p.numel())
@@ -34,18 +34,16 @@ def step_function(model: Model) -> ca.Function:
     k3 = rate(t + h / 2, x + h / 2 * k2, middle, p)
     k4 = rate(t + h, x + h * k3, u1, p)
     x1 = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    results = [x1, ca.densify(ca.jacobian(x1, x)), ca.densify(ca.jacobian(x1, ca.vertcat(p[: model.np], h)))]
+    moved = ca.vertcat(p[: model.np], h, u0, u1)
+    results = [x1, ca.densify(ca.jacobian(x1, x)), ca.densify(ca.jacobian(x1, moved))]
     return ca.Function("seaopt_step", [t, x, u0, u1, p, h], results)
 
 
 @memo
 def output_function(model: Model) -> ca.Function:
-    """Return the CasADi function (t, x, u, p) -> (y, dy/dx, dy/dtheta)."""
-    results = [
-        ca.densify(model.h),
-        ca.densify(ca.jacobian(model.h, model.x)),
-        ca.densify(ca.jacobian(model.h, model.theta)),
-    ]
+    """Return the CasADi function (t, x, u, p) -> (y, dy/dx, dy/dtheta, dy/du)."""
+    derivatives = (ca.densify(ca.jacobian(model.h, by)) for by in (model.x, model.theta, model.u))
+    results = [ca.densify(model.h), *derivatives]
     arguments = [model.t, model.x, model.u, model.p]
     return ca.Function("seaopt_output", arguments, results)
 
@@ -59,7 +57,8 @@ class Rates:
     prepare : Function
         p -> c, once per pass.
     rate, output : Function
-        (t, x, u, c) -> f or h, and the nonzeros of its derivatives by x and by theta.
+        (t, x, u, du, c) -> f or h, and the nonzeros of its derivatives by x and by theta; where inputs move with the
+        delay, by du each second, then by the delay too.
     rate_pattern, output_pattern : tuple of lists of (row, column)
         Where those nonzeros stand.
 
@@ -73,9 +72,13 @@ class Rates:
 
 
 @memo
-def rate_functions(model: Model) -> Rates:
-    """Return the functions of compiled passes."""
-    parts = [part for e in (model.f, model.h) for part in (e, ca.jacobian(e, model.x), ca.jacobian(e, model.theta))]
+def rate_functions(model: Model, *, moving: bool = False) -> Rates:
+    """Return the functions of compiled passes; of inputs that move with a free delay, or not."""
+    du, parts = ca.SX.sym("du", model.nu), list[Any]()
+    for e in (model.f, model.h):
+        by_theta = ca.jacobian(e, model.theta)
+        along = ca.jtimes(e, model.u, du) if moving else ca.SX(e.numel(), 0)
+        parts += [e, ca.jacobian(e, model.x), ca.sparsify(ca.horzcat(by_theta, along))]
     dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)]
     sizes = [part.nnz() for part in dense]
     flat = ca.cse(ca.vertcat(*(entry for part in dense for entry in part.nonzeros())))
@@ -84,7 +87,7 @@ def rate_functions(model: Model) -> Rates:
     for size in sizes:
         columns.append(flat[:size])
         flat = flat[size:]
-    arguments, names = [model.t, model.x, model.u, c], ["seaopt_rate", "seaopt_output"]
+    arguments, names = [model.t, model.x, model.u, du, c], ["seaopt_rate", "seaopt_output"]
     rate, output = (ca.Function(names[i], arguments, columns[3 * i : 3 * i + 3]) for i in range(2))
     prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
     pattern = [_nonzeros(part) for part in dense]

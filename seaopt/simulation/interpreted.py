@@ -102,11 +102,11 @@ def _loss_and_weight(
 
 
 def _inputs_in_force(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
-    """Return [u_a, u_b, 1] of every sample."""
+    """Return [u_a, u_b, ..., 1] of every sample."""
     n, u = segment.n, np.column_stack(segment.u)
     rows = segment.lead + np.arange(n)
-    ua, ub = (u[np.clip(rows - lag, 0, len(u) - 1)] for lag in point.clock.lags)
-    return np.hstack([ua, ub, np.ones((n, 1))])
+    inputs = (u[np.clip(rows - lag, 0, len(u) - 1)] for lag in point.clock.lags)
+    return np.hstack([*inputs, np.ones((n, 1))])
 
 
 def _augment(model: Model, blocks: Float[np.ndarray, "..."]) -> tuple[Any, Any, Any, Any]:
@@ -186,14 +186,15 @@ def _toeplitz(impulse: list[Float[np.ndarray, "a w"]]) -> Float[np.ndarray, "la 
     return out
 
 
-def _split(model: Model, w: Any) -> tuple[Any, Any, Any]:
-    """Return t, u_a, u_b of a sample's data."""
-    return w[0], w[1 : 1 + model.nu], w[1 + model.nu : 1 + 2 * model.nu]
+def _split(model: Model, scheme: _Scheme, w: Any) -> tuple[Any, list[Any]]:
+    """Return t and the inputs in force of a sample's data."""
+    nu = model.nu
+    return w[0], [w[1 + i * nu : 1 + (i + 1) * nu] for i in range(scheme.inputs)]
 
 
-def _blocks(model: Model, data: Any) -> list[Any]:
+def _blocks(model: Model, scheme: _Scheme, data: Any) -> list[Any]:
     """Return the blocks of `transition` from its numbers."""
-    rows, width = model.nx + model.ny, model.nx + 2 * model.nu + 1
+    rows, width = model.nx + model.ny, model.nx + scheme.inputs * model.nu + 1
     return [ca.reshape(part, width, rows).T for part in ca.vertsplit(data, rows * width)]
 
 
@@ -203,36 +204,41 @@ class _Scheme:
 
     hold: Hold
     delay_free: bool
-    split: bool  # an older input acts for the first part of a period
+    fractional: bool  # older inputs act for the first part of a period
+    inputs: int  # in force
     substeps: int
 
     @classmethod
     def of(cls, point: Point) -> _Scheme:
         clock = point.clock
         return cls(
-            hold=clock.hold, delay_free=clock.delay_free, split=clock.fraction_s > 0.0, substeps=point.substeps
+            hold=clock.hold, delay_free=clock.delay_free, fractional=clock.fraction_s > 0.0, inputs=len(clock.lags),
+            substeps=point.substeps,
         )  # fmt: skip
 
 
 def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
     """Return the state and its derivatives one sample on."""
-    steps, nx = scheme.substeps, model.nx
-    t, ua, ub = _split(model, w)
+    steps, nx, nu = scheme.substeps, model.nx, model.nu
+    t, inputs = _split(model, scheme, w)
     x, s = z[:, 0], z[:, 1:]
     rest = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
     if model.linear:
-        blocks, v = [block[:nx, :] for block in _blocks(model, data)], ca.vertcat(x, ua, ub, 1.0)
+        blocks, v = [block[:nx, :] for block in _blocks(model, scheme, data)], ca.vertcat(x, *inputs, 1.0)
         forced = ca.horzcat(*(ca.mtimes(block, v) for block in blocks[1:]), rest)
         return ca.horzcat(ca.mtimes(blocks[0], v), ca.mtimes(blocks[0][:, :nx], s) + forced)
-    step, p = step_function(model), data[:-2]
-    for part in (0, 1) if scheme.delay_free or scheme.split else (1,):
+    step, p, period = step_function(model), data[:-2], data[-2] + data[-1]
+    joined = scheme.hold == "first"
+    for part in (0, 1) if scheme.delay_free or scheme.fractional else (1,):
         h, dh = data[data.numel() - 2 + part] / steps, (-1.0 if part else 1.0) / steps
-        for i in range(steps):
-            u0 = u1 = ua if part else ub
-            if scheme.hold == "first":
-                u0, u1 = ua + (ub - ua) * (i / steps), ua + (ub - ua) * ((i + 1) / steps)
-            x, a, b = step(t, x, u0, u1, p, h)
-            forced = [b[:, : model.np], b[:, model.np] * dh] if scheme.delay_free else [b[:, : model.np]]
+        base = inputs[0] if joined or part else inputs[1]
+        slope = (inputs[1] - inputs[0] if part else inputs[0] - inputs[-1]) / period if joined else ca.MX.zeros(nu)
+        for i in range(steps) if part else range(-steps, 0):  # the older line ends at u_a, the newer begins there
+            x, a, b = step(t, x, base + slope * h * i, base + slope * h * (i + 1), p, h)
+            forced = [b[:, : model.np]]
+            if scheme.delay_free:
+                along = ca.vertcat(dh, slope * dh * i, slope * dh * (i + 1))
+                forced.append(ca.mtimes(b[:, model.np :], along))
             s = ca.mtimes(a, s) + ca.horzcat(*forced, rest)
             t = t + h
     return ca.horzcat(x, s)
@@ -240,15 +246,19 @@ def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
 
 def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
     """Return the outputs and their derivatives."""
-    t, ua, ub = _split(model, w)
+    t, inputs = _split(model, scheme, w)
     x, s = z[:, 0], z[:, 1:]
     if model.linear:
-        blocks, v = [block[model.nx :, :] for block in _blocks(model, data)], ca.vertcat(x, ua, ub, 1.0)
+        blocks, v = [block[model.nx :, :] for block in _blocks(model, scheme, data)], ca.vertcat(x, *inputs, 1.0)
         y, c = ca.mtimes(blocks[0], v), blocks[0][:, : model.nx]
         direct = [ca.mtimes(block, v) for block in blocks[1:]]
     else:
-        y, c, d = output_function(model)(t, x, ub if scheme.split else ua, data[:-2])
-        direct = [d]
+        u, du = inputs[1] if scheme.fractional else inputs[0], ca.MX.zeros(model.nu)
+        if scheme.hold == "first":
+            du = (inputs[-1] - inputs[0]) / (data[-2] + data[-1]) if scheme.inputs == 3 else du
+            u = inputs[0] + data[-2] * du
+        y, c, d, by_input = output_function(model)(t, x, u, data[:-2])
+        direct = [d, ca.mtimes(by_input, du)] if scheme.delay_free else [d]
     count = sum(block.shape[1] for block in direct)
     return ca.horzcat(y, ca.mtimes(c, s) + ca.horzcat(*direct, ca.MX.zeros(model.ny, layout.states - 1 - count)))
 
@@ -288,7 +298,7 @@ def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, in
     y = _observe(model, scheme, layout, z, w, plant)
     after = _advance(model, scheme, layout, z, w, plant)
     if layout.corrected:
-        after = after - _correct(layout, z, y, w[1 + 2 * model.nu :], data[sizes[1] :])
+        after = after - _correct(layout, z, y, w[1 + scheme.inputs * model.nu :], data[sizes[1] :])
     sample, output = ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
     return sample.mapaccum(FOLDED_SAMPLES), output
 

@@ -19,7 +19,7 @@ typedef struct {
     const double *u[NU];
     const double *y[NY];           /* y[0] NULL: simulate only */
     const unsigned char *keep[NY]; /* NULL: all kept */
-    long lag_a, lag_b;             /* rows of u in force: u[k - lag_a], u[k - lag_b]; clamped to the log */
+    long lag_a, lag_b, lag_c;      /* rows of u in force: u[k - lag_a], and so on; clamped to the log */
     long settle;                   /* rows from `start` that are left out while the filter settles */
     long start;                    /* first row of the stretch; later than `from` is not allowed */
     long output_rows;              /* rows from `from` whose outputs are kept */
@@ -109,6 +109,10 @@ static inline void forcing(const hot *q, const seaopt_pass_args *a, long k, doub
     at(a, k, a->lag_b, u);
     for (int i = 0; i < NU; i++) w[NX + NU + i] = u[i];
 #endif
+#if DELAYED > 1
+    at(a, k, a->lag_c, u);
+    for (int i = 0; i < NU; i++) w[NX + 2 * NU + i] = u[i];
+#endif
     if (NI > NU * (1 + DELAYED)) w[NF - 1] = 1.0;
 }
 
@@ -127,16 +131,17 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
 }
 #else
 /* In front of this file stand CasADi's functions
-     seaopt_rate(t, x, u, c) -> f and the nonzeros of f_x, f_p     seaopt_output(t, x, u, c) -> the same of h
-   and seaopt_rate_chain, seaopt_output_chain, which add f_x Z + f_p to the derivatives of f, and of h.
+     seaopt_rate(t, x, u, du, c) -> f and the nonzeros of f_x, f_p     seaopt_output(t, x, u, du, c) -> the same of h
+   and seaopt_rate_chain, seaopt_output_chain, which add f_x Z + f_p to the derivatives of f, and of h. Where DELAYED
+   is 2, f_p has a column for the delay, by which the input moves by du each second.
    model: steps, period, older part of the period (fractional delay), first-order hold, then c. */
 #define SETTINGS 4
 
 /* K = [f, f_x Z + f_p] at the state Z. */
-INLINE void slope(hot *q, double t, const double *u, const double *c, const double (*restrict z)[NJP], double (*restrict k)[NJP],
-                  int wide) {
+INLINE void slope(hot *q, double t, const double *u, const double *du, const double *c, const double (*restrict z)[NJP],
+                  double (*restrict k)[NJP], int wide) {
     double x[NX], f[NX], fx[NNZ_FX + 1], fp[NNZ_FP + 1];
-    const double *arg[SZ_ARG] = {&t, x, u, c};
+    const double *arg[SZ_ARG] = {&t, x, u, du, c};
     double *res[SZ_RES] = {f, wide == ALL ? fx : 0, wide == ALL ? fp : 0};
     for (int i = 0; i < NX; i++) x[i] = z[i][0];
     seaopt_rate(arg, res, 0, q->work, 0);
@@ -147,11 +152,14 @@ INLINE void slope(hot *q, double t, const double *u, const double *c, const doub
 
 typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
 
+/* The input at the start and the end of a step, and how fast the delay moves it. */
+typedef struct { double u0[NU], u1[NU], du0[NU], du1[NU]; } line;
+
 /* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. */
-INLINE void one_step(hot *q, double t, const double *u0, const double *u1, const double *c, double h, double dh, int wide) {
+INLINE void one_step(hot *q, double t, const line *in, const double *c, double h, double dh, int wide) {
     static const double reach[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
     hot_columns k, z, sum;
-    double u[NU];
+    double u[NU], du[NU];
     memcpy(z, q->z, sizeof z);
     memcpy(sum, q->z, sizeof sum);
     for (int stage = 0; stage < 4; stage++) {
@@ -161,8 +169,11 @@ INLINE void one_step(hot *q, double t, const double *u0, const double *u1, const
                 for (int j = 0; j < wide; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
                 if (DELAYED) z[i][1 + NQ] += reach[stage] * dh * k[i][0];
             }
-        for (int i = 0; i < NU; i++) u[i] = u0[i] + reach[stage] * (u1[i] - u0[i]);
-        slope(q, t + part, u, c, (const double (*)[NJP])z, k, wide);
+        for (int i = 0; i < NU; i++) {
+            u[i] = in->u0[i] + reach[stage] * (in->u1[i] - in->u0[i]);
+            du[i] = in->du0[i] + reach[stage] * (in->du1[i] - in->du0[i]);
+        }
+        slope(q, t + part, u, du, c, (const double (*)[NJP])z, k, wide);
         for (int i = 0; i < NX; i++) {
             for (int j = 0; j < wide; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
             if (DELAYED) sum[i][1 + NQ] += weight[stage] * dh * k[i][0];
@@ -173,9 +184,15 @@ INLINE void one_step(hot *q, double t, const double *u0, const double *u1, const
 
 INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP], int wide) {
     const double *m = a->model;
-    double x[NX], u[NU], y[NY], c[NNZ_HX + 1], d[NNZ_HP + 1], t = a->t0 + k * m[1];
-    at(a, k, m[2] > 0.0 ? a->lag_b : a->lag_a, u);
-    const double *arg[SZ_ARG] = {&t, x, u, m + SETTINGS};
+    double x[NX], u[NU], du[NU], older[NU], y[NY], c[NNZ_HX + 1], d[NNZ_HP + 1], t = a->t0 + k * m[1];
+    const int foh = m[3] > 0.5;
+    at(a, k, !foh && m[2] > 0.0 ? a->lag_b : a->lag_a, u);
+    at(a, k, a->lag_c, older);
+    for (int i = 0; i < NU; i++) {
+        du[i] = foh ? (older[i] - u[i]) / m[1] : 0.0;
+        u[i] += m[2] * du[i];
+    }
+    const double *arg[SZ_ARG] = {&t, x, u, du, m + SETTINGS};
     double *res[SZ_RES] = {y, wide == ALL ? c : 0, wide == ALL ? d : 0};
     for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
     seaopt_output(arg, res, 0, q->work, 0);
@@ -183,27 +200,31 @@ INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict
     for (int o = 0; o < NY; o++) out[o][0] = y[o];
 }
 
-/* With a fractional delay the older input u_b acts first, for m[2] seconds, then u_a. */
+/* With a fractional delay the older input acts first, for m[2] seconds: u_b held, or the line from u_c to u_a; then u_a
+   held, or the line from u_a to u_b. */
 INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
-    const double *m = a->model;
+    const double *m = a->model, parts[2] = {m[2], m[1] - m[2]};
     const long steps = (long)m[0];
     const int foh = m[3] > 0.5;
-    double t = a->t0 + k * m[1], ua[NU], ub[NU];
-    double parts[2] = {m[2], m[1] - m[2]}, u0[NU], u1[NU];
+    double t = a->t0 + k * m[1], ua[NU], ub[NU], uc[NU];
     at(a, k, a->lag_a, ua);
     at(a, k, a->lag_b, ub);
+    at(a, k, a->lag_c, uc);
     for (int part = 0; part < 2; part++) {
         const double h = parts[part] / steps, dh = (part ? -1.0 : 1.0) / steps;
-        const double *from = part ? ua : ub;
         if (parts[part] <= 0.0 && !DELAYED) continue;
         for (long i = 0; i < steps; i++) {
+            line in;
             for (int c = 0; c < NU; c++) {
-                const double slope = foh ? (ub[c] - ua[c]) / steps : 0.0;
-                const double base = foh ? ua[c] : from[c];
-                u0[c] = base + slope * i;
-                u1[c] = base + slope * (i + 1);
+                /* The older line ends at u_a, the newer one begins there. */
+                const double base = foh || part ? ua[c] : ub[c], slope = foh ? (part ? ub[c] - ua[c] : ua[c] - uc[c]) / m[1] : 0.0;
+                const long from = part ? i : i - steps;
+                in.u0[c] = base + slope * h * from;
+                in.u1[c] = base + slope * h * (from + 1);
+                in.du0[c] = slope * dh * from;
+                in.du1[c] = slope * dh * (from + 1);
             }
-            one_step(q, t, u0, u1, m + SETTINGS, h, dh, wide);
+            one_step(q, t, &in, m + SETTINGS, h, dh, wide);
             t += h;
         }
     }

@@ -124,6 +124,39 @@ def test_half_a_sample_of_delay_is_the_finer_simulation(plant_name, thor):
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("name", ["stand", "swing", "swing friction"])
+@pytest.mark.parametrize("delay_s", [0.0, 0.0007, 0.0025, 0.0062])
+def test_a_late_input_of_straight_lines_is_dop853s(name, delay_s, thor):
+    """The continuous plant with the interpolated input, shifted: integrated between the corners of both clocks."""
+    plant, changes = CASES[name]
+    params = plant.complete(thor).update(**changes)
+    rng = np.random.default_rng(6)
+    n, time = 40, np.arange(40) / RATE
+    u, x0 = 3 * rng.normal(size=n), 1e-3 * rng.normal(size=len(plant.states))
+    p = plant.complete(params).vector
+    arguments = (plant.t, plant.x, plant.u, plant.p)
+    f, h = (compile_expression(arguments, expression) for expression in (plant.dynamics, plant.output))
+
+    def late(t):
+        return np.r_[np.interp(t - delay_s, time, u), np.zeros(len(plant.inputs) - 1)]
+
+    corners = np.unique(np.round(np.r_[time, (time + delay_s)[time + delay_s < time[-1]]], 12))
+    x, expected = np.array(x0), []
+    for start, end in zip(corners, [*corners[1:], corners[-1]], strict=True):
+        if np.min(np.abs(time - start)) < 1e-11:
+            expected.append(h(start, x, late(start), p))
+        if end > start:
+            x = solve_ivp(
+                lambda t, x: f(t, x, late(t), p), (start, end), x, method="DOP853", rtol=1e-10, atol=1e-13
+            ).y[:, -1]  # fmt: skip
+    log = so.Log.from_arrays(time=time, I=u)
+    start = dict(zip(plant.states, x0, strict=True))
+    run = so.simulate(plant, params, log, initial_state=start, hold="first", delay_s=delay_s)
+    for column, output in enumerate(plant.outputs):
+        wanted = np.array(expected)[:, column]
+        np.testing.assert_allclose(run[output], wanted, atol=1e-6 * np.max(np.abs(wanted)), rtol=0)
+
+
 def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "eta"), loss="square", corrected=False):
     plant, changes = CASES[case]
     params = thor.update(**changes)
@@ -162,6 +195,9 @@ SETTINGS = [
     {"clock": Clock(period=1 / RATE, delay_s=0.0033, delay_free=True)},
     {"clock": Clock(period=1 / RATE, delay_s=0.0013, delay_free=True), "corrected": True},
     {"corrected": True},
+    {"clock": Clock(period=1 / RATE, hold="first", delay_s=0.0033, delay_free=True)},
+    {"clock": Clock(period=1 / RATE, hold="first", delay_s=0.0013, delay_free=True), "corrected": True},
+    {"clock": Clock(period=1 / RATE, hold="first", delay_s=0.0038)},
 ]
 
 

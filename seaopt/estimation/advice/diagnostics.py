@@ -293,7 +293,7 @@ class _DelayTrial:
 def _try_delay(fit: Fit, experiment: FitExperiment) -> _DelayTrial | None:
     """Refit from the minimum with the delay free; None where it is free already, or cannot be."""
     minimum = fit.require_minimum("diagnose")
-    if experiment.slots.delay.index is not None or experiment.data.hold == "first" or depends_on_time(experiment.model):
+    if experiment.slots.delay.index is not None or depends_on_time(experiment.model):
         return None
     known, name = experiment.slots.delay.value, experiment.name
     span = INPUT_LAGS * experiment.period

@@ -120,8 +120,9 @@ def _response(
     blocks: Float[np.ndarray, "nd r c"], nx: int, nu: int, channel: int, clock: Clock, z: complex
 ) -> Complex[np.ndarray, "nd r"]:
     """Return the responses of states and outputs to one input at z, and their derivatives."""
-    early, late = (z ** -float(lag) for lag in clock.lags)
-    drive = blocks[:, :, nx + channel] * early + blocks[:, :, nx + nu + channel] * late
+    drive = np.zeros(blocks.shape[:2], dtype=complex)
+    for i, lag in enumerate(clock.lags):
+        drive += blocks[:, :, nx + i * nu + channel] * z ** -float(lag)
     resolvent = np.linalg.inv(z * np.eye(nx) - blocks[0, :nx, :nx])
     x = resolvent @ drive[0, :nx]
     out = np.zeros(drive.shape, dtype=complex)

@@ -329,8 +329,8 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
     """Yield a delay of the inputs, and one for each output; negative where signals can be shifted."""
     leads = [LEAD if len(e.stretches) == 1 and len(e.log) > 4 * LEAD else 0 for e in experiments]
     known = [e.delay_s.value if isinstance(e.delay_s, Parameter) else e.delay_s for e in experiments]
-    if any(e.hold == "first" or (isinstance(e.delay_s, Parameter) and e.delay_s.free) for e in experiments):
-        return  # between samples that are joined by lines no delay can be free
+    if any(isinstance(e.delay_s, Parameter) and e.delay_s.free for e in experiments):
+        return
     shifted = tuple(
         free_delay(_lead(e, lead), value + lead * e.log.period)
         for e, lead, value in zip(experiments, leads, known, strict=True)

@@ -237,7 +237,7 @@ def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
     known = {
         e.name: free_delay(e.data, e.slots.delay.value)
         for e in problem.experiments
-        if e.slots.delay.index is None and e.data.hold == "zero" and not depends_on_time(e.model)
+        if e.slots.delay.index is None and not depends_on_time(e.model)
     }
     tests = run_score_tests(minimum, fit, plain, known)
     white = all(one.whiteness_p > CHANCE for row in fit.outputs.values() for one in row.values())

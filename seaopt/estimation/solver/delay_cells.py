@@ -4,6 +4,9 @@ An output with feedthrough jumps with the input. With a held input the cost of a
 samples only, in cells (m - 1, m] in which sample k - m is in force at sample k, and least squares ends in the cell in
 which it started, or goes to and fro across an end. Each neighbouring cell is searched too, from the end that is nearer,
 until none is better.
+
+Where samples are joined by lines, such an output has a corner in the delay at whole samples in place of a jump: its
+slope there is that of the cell after, so that a cell is searched to just short of its end.
 """
 
 from __future__ import annotations
@@ -49,7 +52,8 @@ def _settle_beside(
     cell = np.ceil(z[place] / period - INSIDE) + way  # (cell - 1, cell] samples
     low, high = unknowns.low.copy(), unknowns.high.copy()
     low[place] = max(low[place], (cell - 1.0 + INSIDE) * period)
-    high[place] = min(high[place], cell * period)
+    end = cell if experiment.data.hold == "zero" else cell - INSIDE
+    high[place] = min(high[place], end * period)
     if not low[place] <= high[place]:
         return None
     z[place] = np.clip(z[place], low[place], high[place])

@@ -50,6 +50,40 @@ def test_a_delay_is_found_across_the_jumps_of_an_output_with_feedthrough(samples
     so.testing.assert_recovered(fit, truth, sigmas=4)
 
 
+def log_of_lines(samples_late: float, seed: int) -> so.Log:
+    """Return a log whose input, straight lines between its samples, is so many samples late: a tenth is exact."""
+    rng = np.random.default_rng(seed)
+    current = 3.0 * lfilter([0.3], [1.0, -0.7], rng.normal(size=1500))
+    fine = np.arange(current.size * FINE) / FINE - samples_late
+    a, c, d = np.array([[0.0, 1.0], [-K / M, -B / M]]), np.array([[K, 0.0], [0.0, -B]]), np.array([[0.0], [G]])
+    system = cont2discrete((a, np.array([[0.0], [G / M]]), c, d), 1.0 / (RATE * FINE), method="foh")
+    _, y, _ = dlsim(system, np.interp(fine, np.arange(current.size), current))
+    outputs = y[::FINE] + rng.normal(size=(current.size, 2)) * 0.05
+    return so.Log.from_arrays(time=np.arange(current.size) / RATE, I=current, F1=outputs[:, 0], F2=outputs[:, 1])
+
+
+@pytest.mark.parametrize(("samples_late", "start"), [(0.0, 1.9), (2.0, 4.0), (2.7, 0.2)])
+def test_a_delay_of_an_input_of_straight_lines_is_found(samples_late, start):
+    delay = so.Parameter(name="delay_s", value=start / RATE, unit="s", free=True, min=0.0, max=0.05)
+    experiment = so.Experiment(plant=drive(), log=log_of_lines(samples_late, 1), delay_s=delay, hold="first")
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"))
+    assert fit.status == "converged" and not fit.errors
+    own = fit.nuisance["experiment"]
+    assert own.std["delay_s"] * RATE < 2e-3
+    assert own.delay_s == pytest.approx(samples_late / RATE, abs=4 * own.std["delay_s"] + 1e-9)
+    so.testing.assert_recovered(fit, truth, sigmas=4)
+
+
+def test_a_wrong_known_delay_of_straight_lines_is_named():
+    experiment = so.Experiment(plant=drive(), log=log_of_lines(1.3, 1), delay_s=0.0, hold="first")
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"))
+    assert not fit.met
+    said = next(one.text for one in fit.findings if one.kind == "cause")
+    assert float(said.split("a delay of ")[1].split(" ms")[0]) == pytest.approx(1.3e3 / RATE, rel=0.01)
+
+
 def test_a_delay_at_its_bound_is_an_error_where_the_log_wants_it_beyond():
     delay = so.Parameter(name="delay_s", value=0.0, unit="s", free=True, min=0.0, max=1.5 / RATE)
     experiment = so.Experiment(plant=drive(), log=log_of(2.3, 1), outputs=("F1",), delay_s=delay)
