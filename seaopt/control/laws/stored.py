@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, model_validator
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
@@ -128,10 +128,17 @@ class StoredPossible(ResultTable):
 
     nearest_hz: tuple[Finite, ...]
     largest_hz: Finite | None
-    closest_hz: Finite
-    missed_by: Finite
+    closest_hz: Finite | None
+    missed_by: Finite | None
     fall: Finite | None = None
     largest_fall: Finite | None = None
+
+    @model_validator(mode="after")
+    def _require_pairs(self) -> StoredPossible:
+        for pair in (("closest_hz", "missed_by"), ("fall", "largest_fall")):
+            if len({getattr(self, name) is None for name in pair}) > 1:
+                raise ValueError(f"should have both of {' and '.join(pair)}, or neither")
+        return self
 
 
 class StoredController(ResultTable):

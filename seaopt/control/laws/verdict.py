@@ -72,27 +72,32 @@ class PossibleBandwidths:
         Next to the one asked, below and above it; empty if none was found.
     largest_hz : float or None
         The largest.
-    closest_hz, missed_by : float
-        Where the limits are missed least, and by which share; zero where they are kept.
+    closest_hz, missed_by : float or None
+        Where the limits are missed least, and by which share; zero where they are kept, None where no law was stable.
     fall, largest_fall : float or None
         By how much friction falls with speed, N s/m (N m s/rad), where that makes the sliding plant grow without
-        control, and with how much the limits can be kept at the bandwidth asked; no others are then looked for.
+        control, and with how much the limits are kept at the bandwidth asked; None where that is not what blocks.
 
     """
 
     nearest_hz: tuple[float, ...] = ()
     largest_hz: float | None = None
-    closest_hz: float
-    missed_by: float
+    closest_hz: float | None = None
+    missed_by: float | None = None
     fall: float | None = None
     largest_fall: float | None = None
 
     def __str__(self) -> str:
-        if self.fall is not None:
-            return (
-                f"friction that falls by {self.fall:.4g} N s/m with speed makes sliding unstable, "
-                f"{self.largest_fall:.4g} can be had at this bandwidth: check v_st, sample faster or cut the delay"
-            )
+        if self.fall is None:
+            return self._format_bandwidths()
+        return (
+            f"{self._format_bandwidths()}; friction that falls by {self.fall:.4g} N s/m makes sliding unstable, "
+            f"{self.largest_fall:.4g} can be had at this bandwidth: check v_st, sample faster or cut the delay"
+        )
+
+    def _format_bandwidths(self) -> str:
+        if self.largest_hz is None and self.closest_hz is None:
+            return "no stable law was found at other bandwidths"
         if self.largest_hz is None:
             return f"none is known that keeps them; {self.closest_hz:.4g} Hz misses them least, by {self.missed_by:.1%}"
         nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)

@@ -15,7 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control.loops.sampled_plant import DigitalPlant, sample_linear
+from seaopt.control.laws.verdict import list_broken_limits
+from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import (
@@ -35,30 +36,29 @@ def find_largest_fall(task: Task) -> tuple[float, float, LawNumbers] | None:
     """Return the fall of friction, the largest with which the limits are kept, N s/m (N m s/rad), and the law there.
 
     It is the steepest fall of the plants that grow as they slide; None where no friction falls, or the limits are not
-    kept without a fall either.
+    kept without a fall either. That a law keeps them is measured, as it is of the answer itself.
     """
     falling = [one for one in task.rubbing if count_growing(task.plants[one.plant]) and np.min(one.flattest) < 0.0]
     if not falling:
         return None
 
     def ease(share: float) -> Task:
-        plants = {one.plant: _sample(one, share) for one in falling}
-        return replace(task, plants=tuple(plants.get(number, plant) for number, plant in enumerate(task.plants)))
-
-    f = place_frequencies(task)
+        eased = {one.plant: _ease(one, share) for one in falling}
+        plants = tuple(eased[k].loop.plant if k in eased else plant for k, plant in enumerate(task.plants))
+        return replace(task, plants=plants, rubbing=tuple(eased.get(one.plant, one) for one in task.rubbing))
 
     def keeps(eased: Task, x: LawNumbers) -> bool:
-        return eased.is_stable(x) and eased.rank(eased.grid(f), x)[0] == 0.0
+        return not list_broken_limits(eased.spec, eased.measure(x), eased.design_states)
 
     x, _ = solve(ease(0.0))
     if not keeps(ease(0.0), x):
         return None
-    low, high = 0.0, 1.0
+    low, high, f = 0.0, 1.0, place_frequencies(task)
     while high > max(RESOLUTION * low, SMALLEST_SHARE):
         middle = float(np.sqrt(low * high)) if low else 0.25 * high
         eased = ease(middle)
         trial = refine(eased, eased.grid(f), improve(eased, eased.grid(f), x)[1]) if eased.is_stable(x) else x
-        if keeps(eased, trial):
+        if eased.is_stable(trial) and keeps(eased, trial):
             x, low = trial, middle
         else:
             high = middle
@@ -66,8 +66,8 @@ def find_largest_fall(task: Task) -> tuple[float, float, LawNumbers] | None:
     return fall, low * fall, x
 
 
-def _sample(rubbing: RubbingPlant, share: float) -> DigitalPlant:
-    """Return a sliding plant, sampled, with a share of the fall of its friction."""
+def _ease(rubbing: RubbingPlant, share: float) -> RubbingPlant:
+    """Return a sliding plant with a share of the fall of its friction."""
     loop, left = rubbing.loop, (1.0 - share) * np.minimum(rubbing.flattest, 0.0)
     a = loop.a + (loop.friction * left) @ loop.velocity
     c = loop.measured + (loop.through * left) @ loop.velocity
@@ -75,4 +75,5 @@ def _sample(rubbing: RubbingPlant, share: float) -> DigitalPlant:
     (plant,) = sample_linear(
         linear, np.array([loop.delay_s]), loop.plant.sample_time_s, loop.plant.delay_samples
     )  # fmt: skip
-    return plant
+    eased = replace(loop, a=a, measured=c, slopes=loop.slopes + left, plant=plant)
+    return replace(rubbing, loop=eased, flattest=rubbing.flattest - left)

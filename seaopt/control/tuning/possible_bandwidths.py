@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_limits
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.optimisation_problem import LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task, place_frequencies
+from seaopt.control.tuning.solution import recheck
 from seaopt.control.tuning.starts import find_starts
 
 PROBE_RATIO = 7.0 / 6.0  # of a probe to the next
@@ -43,7 +44,10 @@ def find_possible_bandwidths(task: Task, x: LawNumbers) -> tuple[PossibleBandwid
 
 
 class _Probes:
-    """What was found at the bandwidths tried: how much of a limit is used, 0 where all are kept, and the numbers."""
+    """What was found at the bandwidths tried: how much of a limit is used, and the numbers.
+
+    The usage is 0 where all limits are kept, and infinite where no law was stable.
+    """
 
     def __init__(self, task: Task, x: LawNumbers) -> None:
         self.task, self.asked = task.aim_proofs(x), task.spec.bandwidth_hz
@@ -59,9 +63,9 @@ class _Probes:
         largest = below if above is None else self._find_end([*reversed(up), above], None)
         nearest = tuple(f for f in (below, above) if f is not None)
         missed, closest = min((usage, f) for f, (usage, _) in self.tried.items())
-        possible = PossibleBandwidths(
-            nearest_hz=nearest, largest_hz=largest, closest_hz=closest, missed_by=max(missed - 1.0, 0.0)
-        )
+        possible = PossibleBandwidths(nearest_hz=nearest, largest_hz=largest)
+        if np.isfinite(missed):
+            possible = replace(possible, closest_hz=closest, missed_by=max(missed - 1.0, 0.0))
         return possible, [self.tried[f][1] for f in nearest]
 
     def _list_steps(self, end: float) -> list[float]:
@@ -83,17 +87,37 @@ class _Probes:
         return inside
 
     def _keeps(self, bandwidth_hz: float) -> bool:
-        """Tell whether a law was found that keeps the limits on the frequencies looked at."""
+        """Tell whether a law was found that keeps the limits, as measured."""
         if bandwidth_hz not in self.tried:
-            self.tried[bandwidth_hz] = self._tune(bandwidth_hz)
+            usage, x = self._tune(bandwidth_hz)
+            self.tried[bandwidth_hz] = (usage, x) if usage else self._measure(bandwidth_hz, x)
         return self.tried[bandwidth_hz][0] == 0.0
+
+    def _measure(self, bandwidth_hz: float, x: LawNumbers) -> tuple[float, LawNumbers]:
+        """Return usage and numbers, by measurement, of a law that keeps the limits on the frequencies looked at.
+
+        A friction margin is not measured again: its proof is looked at with a reserve, and takes long.
+        """
+        task = self._aim(bandwidth_hz)
+        plain = replace(task, spec=replace(task.spec, min_friction_margin=None))
+
+        def keeps(x: LawNumbers) -> bool:
+            return not list_broken_limits(plain.spec, plain.measure(x), plain.design_states)
+
+        if keeps(x):
+            return 0.0, x
+        x = recheck(task, task.grid(place_frequencies(task)), x)
+        return (0.0 if keeps(x) else NEARLY_KEPT), x
+
+    def _aim(self, bandwidth_hz: float) -> Task:
+        return replace(self.task, spec=replace(self.task.spec, bandwidth_hz=bandwidth_hz))
 
     def _tune(self, bandwidth_hz: float) -> tuple[float, LawNumbers]:
         """Return usage and numbers: from the nearest bandwidth's law first, one that keeps the limits if there is any.
 
         Close to a bandwidth that is possible, what misses clearly from there is not looked for anywhere else.
         """
-        task = replace(self.task, spec=replace(self.task.spec, bandwidth_hz=bandwidth_hz))
+        task = self._aim(bandwidth_hz)
         grid = task.grid(place_frequencies(task))
         apart, kept, start = min(
             (abs(np.log(f / bandwidth_hz)) + FAR * (usage > 0.0), usage == 0.0, f)

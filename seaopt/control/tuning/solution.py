@@ -100,14 +100,19 @@ def _least_slope(loops: Sequence[MeasuredLoop]) -> float:
 def _solve_once(task: Task, warm: Sequence[LawNumbers]) -> Solution:
     """Find the best numbers with the multipliers that are aimed at, or no proof where none is."""
     grid = task.grid(place_frequencies(task))
-    x = find_best(task, grid, warm)
+    x = recheck(task, grid, find_best(task, grid, warm))
+    return x, task.measure(x)
+
+
+def recheck(task: Task, grid: Grid, x: LawNumbers) -> LawNumbers:
+    """Refine numbers on a grid until no limit is broken between its frequencies, or no more than on them."""
     for _ in range(RECHECKS):
         missed = _find_missed(task, x, grid)
         if not missed.size:
             break
         grid = task.grid(np.unique(np.concatenate([grid.f, missed])))
         x = refine(task, grid, x)
-    return x, task.measure(x)
+    return x
 
 
 def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = ()) -> LawNumbers:

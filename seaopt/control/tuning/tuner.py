@@ -13,6 +13,7 @@ found, and the bandwidths at which they can be kept are looked for (`seaopt.cont
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex
@@ -45,7 +46,6 @@ from seaopt.control.tuning.optimisation_problem import (
     RubbingPlant,
     Task,
     count_growing,
-    place_frequencies,
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve
@@ -54,7 +54,7 @@ from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.friction import SLIDING, find_dry_friction, friction_slopes, split_friction
+from seaopt.plants.friction import SLIDING, find_dry_friction, friction_slopes, friction_states, split_friction
 from seaopt.plants.plant import require_plant
 
 
@@ -114,28 +114,28 @@ def tune(
     command = command_of(plant, values, spec.measured)
     check_current(spec, task.k_ff, command, find_dry_friction(plant, values))
     x, loops = solve(task)
-    possible = None
-    if list_broken_limits(spec, loops, task.design_states) - {
-        FRICTION
-    }:  # of a margin alone it is known what can be had
-        possible, near = _find_possible(task, x)
+    possible, broken = None, list_broken_limits(spec, loops, task.design_states)
+    if broken - {FRICTION}:  # of a margin alone it is known what can be had
+        possible, near = _find_possible(task, x, stable="stability" not in broken)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
             x, loops = solve(task, (x, *near))
     return make_controller(task, x, loops, (plant, params), possible)
 
 
-def _find_possible(task: Task, x: LawNumbers) -> tuple[PossibleBandwidths, list[LawNumbers]]:
-    """Return what is possible instead, and laws near it: with friction that falls less, or at other bandwidths."""
-    eased = find_largest_fall(task) if any(map(count_growing, task.plants)) else None
+def _find_possible(task: Task, x: LawNumbers, *, stable: bool) -> tuple[PossibleBandwidths, list[LawNumbers]]:
+    """Return what is possible instead, and laws near it: at other bandwidths, or with friction that falls less.
+
+    The fall is what to ask about where no law is `stable` at this bandwidth, or none keeps the limits at any.
+    """
+    possible, near = find_possible_bandwidths(task, x)
+    if (stable and possible.nearest_hz) or not any(map(count_growing, task.plants)):
+        return possible, near
+    eased = find_largest_fall(task)
     if eased is None:
-        return find_possible_bandwidths(task, x)
+        return possible, near
     fall, largest, law = eased
-    missed, _ = task.rank(task.grid(place_frequencies(task)), x)
-    possible = PossibleBandwidths(
-        largest_hz=None, closest_hz=task.spec.bandwidth_hz, missed_by=missed - 1.0, fall=fall, largest_fall=largest
-    )
-    return possible, [law]
+    return replace(possible, fall=fall, largest_fall=largest), [*near, law]
 
 
 def make_task(
@@ -167,7 +167,8 @@ def make_task(
         completed = model.complete(given)
         variants = split_friction({name: model}, completed, varied)
         models |= {one: (variant, variant.complete(completed)) for one, variant in variants.items()}
-        whole |= {variant: model for one, variant in variants.items() if one.endswith(SLIDING)}
+        if model not in variants.values():  # it has friction, and is there twice
+            whole[friction_states(model)[SLIDING]] = model
     pairs = [*models.items(), *_draw_plants(models, draws)]
     design_plant = pairs[0][1][0]
     plants = tuple(
@@ -209,7 +210,7 @@ def _find_rubbing(
             continue
         if slope is not None and np.any(loop.through * loop.slopes):
             raise ControlError(
-                f"{FRICTION} = {slope:g} cannot be proved on {plant.name}: friction acts on the measured output "
+                f"{FRICTION} = {slope:g} cannot be shown on {plant.name}: friction acts on the measured output "
                 "itself; leave the limit out, or measure another output"
             )
         flattest, _ = friction_slopes(plant, values)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 import seaopt as so
+from seaopt.errors import FileError
+from seaopt.files import to_json
 from tests.laws import measurement_matrices
 from tests.stick_slip import Mass, simulate
 
@@ -17,6 +22,7 @@ VALUES = {
 SPEC = so.ControllerSpec(
     bandwidth_hz=20, delay_samples=2, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=10.0
 )  # fmt: skip
+NEAR = replace(SPEC, bandwidth_range_hz=(19.0, 21.0))  # few bandwidths to look at besides
 STRIBECK_SLOPE = np.sqrt(2.0 / np.e)  # of (f_s - f_c)/v_st: the steepest fall of exp(-(v/v_st)^2)
 
 
@@ -50,6 +56,11 @@ def tuned(plant):
     return so.tune(plant, falling(plant, 35.0, 0.02), SPEC)
 
 
+@pytest.fixture(scope="module")
+def impossible(plant):
+    return so.tune(plant, falling(plant, 50.0, 0.005), NEAR)
+
+
 def test_a_plant_that_grows_as_it_slides_is_stabilised_from_its_fall_to_its_steepest_slope(plant, tuned):
     """At 429 N s/m of fall and 395 of damping it grows without control, and the law holds it at every slope between."""
     params = falling(plant, 35.0, 0.02)
@@ -72,15 +83,38 @@ def test_steps_of_the_stabilised_plant_end_without_hunting(plant, tuned):
     assert np.all(runs.overshoot(steps) < 0.3 * 1.1)
 
 
-def test_a_fall_that_cannot_be_had_is_answered_with_the_largest_that_can(plant):
+def test_a_fall_that_cannot_be_had_is_answered_with_the_largest_that_can(plant, impossible):
     """With a tenth less than the largest it is feasible, with half as much again it is not."""
-    controller = so.tune(plant, falling(plant, 50.0, 0.005), SPEC)
-    possible, fall = controller.possible, STRIBECK_SLOPE * 25.0 / 0.005
+    controller, possible, fall = impossible, impossible.possible, STRIBECK_SLOPE * 25.0 / 0.005
     assert not controller.feasible
     assert controller.active_constraints[0].startswith("stability")
     assert possible.fall == pytest.approx(fall, rel=1e-6)
     assert f"{fall:.4g} N s/m" in controller.explanation and f"{possible.largest_fall:.4g}" in controller.explanation
     assert "v_st" in controller.explanation and len(controller.explanation) < 240
     assert so.tune(plant, falling(plant, 50.0, 0.005 * fall / (0.9 * possible.largest_fall)), SPEC).feasible
-    steeper = so.tune(plant, falling(plant, 50.0, 0.005 * fall / (1.5 * possible.largest_fall)), SPEC)
+    steeper = so.tune(plant, falling(plant, 50.0, 0.005 * fall / (1.5 * possible.largest_fall)), NEAR)
     assert not steeper.feasible
+
+
+def test_where_no_law_is_stable_anywhere_it_is_said_and_can_be_read_back(plant, impossible):
+    """No bandwidth misses the limits least then, and infinity has no place in a file."""
+    params, controller = falling(plant, 50.0, 0.005), impossible
+    assert controller.possible.closest_hz is None and controller.possible.missed_by is None
+    assert "no stable law" in controller.explanation and "inf" not in controller.explanation
+    content = json.loads(to_json(controller.to_dict()))
+    assert so.Controller.from_dict(content, plant, params).explanation == controller.explanation
+    for name in ("fall", "largest_fall", "closest_hz"):
+        half = content["possible"] | {"closest_hz": 20.0, "missed_by": 0.1} | {name: None}
+        with pytest.raises(FileError, match=r"possible.* both"):
+            so.Controller.from_dict(content | {"possible": half}, plant, params)
+
+
+def test_a_bandwidth_that_a_falling_plant_allows_is_named_and_can_be_had(plant):
+    """It is droop that blocks at 15 Hz, where the plant is stabilised: friction is not to blame."""
+    params, near = falling(plant, 35.0, 0.018), replace(SPEC, bandwidth_hz=15.0, bandwidth_range_hz=(14.0, 15.5))
+    controller = so.tune(plant, params, near)
+    largest = controller.largest_bandwidth_hz
+    assert not controller.feasible and controller.achieved.stable
+    assert 14.0 <= largest < 15.0 and f"{largest:.4g} Hz" in controller.explanation
+    assert "friction" not in controller.explanation
+    assert so.tune(plant, params, replace(near, bandwidth_hz=largest)).feasible
