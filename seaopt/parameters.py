@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
-from seaopt.errors import ParameterError, require_number, require_type, suggestion
+from seaopt.errors import ParameterError, UnitError, require_number, require_type, suggestion
 from seaopt.formatting import format_table, html_table
 from seaopt.records import record
 from seaopt.units import factor, unit_after
@@ -178,14 +178,12 @@ class ParameterSet(Mapping[str, Parameter]):
         for name, given in values.items():
             old = self[name]
             value, unit = given if isinstance(given, tuple) else (given, old.unit)
-            changed.append(
-                replace(
-                    old,
-                    value=require_number(value, name, ParameterError) * factor(unit, old.unit),
-                    std=None,
-                    identified=True,
-                )
-            )
+            try:
+                scale = factor(unit, old.unit)
+            except UnitError as error:
+                raise UnitError(f"parameter {name}: {error}") from error
+            value = require_number(value, name, ParameterError) * scale
+            changed.append(replace(old, value=value, std=None, identified=True))
         return self.with_parameters(*changed)
 
     def free(self, *names: str) -> ParameterSet:

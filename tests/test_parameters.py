@@ -59,3 +59,8 @@ def test_a_set_is_a_mapping_for_unknown_names_too(thor):
     with pytest.raises(KeyError) as caught:
         thor["nope"]
     assert str(caught.value).startswith('parameter "nope" is not in this set')
+
+
+def test_a_wrong_unit_names_its_parameter():
+    with pytest.raises(so.SeaoptError, match=r"parameter J: .*kg m"):
+        so.plants.thor().update(J=(2e-6, "N m"))

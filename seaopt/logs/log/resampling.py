@@ -135,7 +135,7 @@ def _restamp_at(log: Recording, rate_hz: float) -> tuple[Float[np.ndarray, " n"]
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
             f"{max(parts) - min(parts):.3g} s and rise at {sample_rate_hz(_median_period(log)):.6g} Hz on average; "
-            "correct it, or call log.resample(rate_hz=...)"
+            "correct it, or call log.resample(rate_hz=...), in a problem file resample = { rate_hz = ... }"
         )
     gaps = int(np.count_nonzero(lost))
     between = f" with {gaps} gap{'s' * (gaps != 1)} of whole samples" if gaps else ""

@@ -93,7 +93,10 @@ def _jitter_finding(clock: ClockQuality, share: float) -> Finding:
         )
     else:
         rate = float(f"{clock.rate_hz:.3g}")
-        text = f"{what} (rms {clock.jitter_rms / clock.period:.1%}); call log.resample(rate_hz={rate:g}) to fit it"
+        text = (
+            f"{what} (rms {clock.jitter_rms / clock.period:.1%}); to fit it call log.resample(rate_hz={rate:g}) "
+            f"(resample = {{ rate_hz = {rate:g} }} in a problem file)"
+        )
     return Finding(kind="jitter", severity="error", value=100.0 * share, unit="% of the period", sentence=text)
 
 
