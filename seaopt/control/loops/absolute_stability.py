@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy.special import polygamma
 
 from seaopt.control.loops.friction_loop import FrictionLoop
@@ -60,6 +60,10 @@ Angles = Float[np.ndarray, " m"]
 Multiplier = Callable[[Complex[np.ndarray, "*n"]], Complex[np.ndarray, "*n"]]
 Places = slice | Int[np.ndarray, " a"]
 Test = Callable[[float, Places], Angles]  # of 1/kappa and which angles: positive where M (H + 1/kappa) is definite
+Terms = tuple[
+    Bool[np.ndarray, " a"], Float[np.ndarray, "a n"], Float[np.ndarray, "a n"], Complex[np.ndarray, "a n"]
+]  # where all D_k > 0, and at every alias what alpha, beta and gamma are the sums of
+TermsOf = Callable[[float, Places], Terms]
 EVERY = slice(None)
 
 
@@ -200,37 +204,44 @@ def _respond(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> _Re
 
 def _weigh(at: _Responses, multiplier: Multiplier) -> Test:
     """Return the test of one multiplier."""
-    weight = multiplier(at.s)
-    if at.mobility.shape[-1] == 1:
-        return _weigh_one(at, weight)
-    right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
+    form = _form_terms(at, multiplier(at.s))
 
     def test(inverse: float, angles: Places) -> Angles:
-        block = weight[angles, :, None, None] * (at.mobility[angles] + inverse * np.eye(at.mobility.shape[-1]))
-        block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
-        negative = np.any(np.linalg.eigvalsh(block) <= 0.0, axis=(-2, -1))
-        block = np.where(negative[:, None, None, None], np.eye(block.shape[-1]), block)
-        sums = np.conj(np.swapaxes(right[angles], -1, -2)) @ np.linalg.solve(block, right[angles])
-        alpha, beta, gamma = (sums[..., i, j] for i, j in ((0, 0), (1, 1), (1, 0)))
-        return np.where(negative, -1.0, _compare(at, angles, np.real(alpha), np.real(beta), gamma))
+        positive, alpha, beta, gamma = form(inverse, angles)
+        return np.where(positive, _compare(at, angles, alpha, beta, gamma), -1.0)
 
     return test
 
 
-def _weigh_one(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> Test:
-    """Return the test where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
+def _form_terms(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
+    """Return what gives, for 1/kappa, where all D_k are positive, and the terms of alpha, beta and gamma there."""
+    if at.mobility.shape[-1] == 1:
+        return _form_terms_of_one(at, weight)
+    right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
+
+    def form(inverse: float, angles: Places) -> Terms:
+        block = weight[angles, :, None, None] * (at.mobility[angles] + inverse * np.eye(at.mobility.shape[-1]))
+        block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
+        positive = np.all(np.linalg.eigvalsh(block) > 0.0, axis=(-2, -1))
+        block = np.where(positive[:, None, None, None], block, np.eye(block.shape[-1]))
+        sums = np.conj(np.swapaxes(right[angles], -1, -2)) @ np.linalg.solve(block, right[angles])
+        return positive, np.real(sums[..., 0, 0]), np.real(sums[..., 1, 1]), sums[..., 1, 0]
+
+    return form
+
+
+def _form_terms_of_one(at: _Responses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
+    """Return `_form_terms` where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
     mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
     command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
     own, other, both = _square(command), _square(sensed), np.conj(sensed) * command
 
-    def test(inverse: float, angles: Places) -> Angles:
+    def form(inverse: float, angles: Places) -> Terms:
         real = mobility[angles] + inverse * slope[angles]
-        negative = np.min(real, axis=-1) <= 0.0
         share = 1.0 / np.where(real > 0.0, real, 1.0)
-        terms = (product[angles] * share for product in (own, other, both))
-        return np.where(negative, -1.0, _compare(at, angles, *terms))
+        return np.min(real, axis=-1) > 0.0, own[angles] * share, other[angles] * share, both[angles] * share
 
-    return test
+    return form
 
 
 def _square(values: Complex[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
@@ -370,13 +381,7 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
     at = _respond(loop, theta, feedback=False)
     through = loop.plant.response(theta / (2 * np.pi * loop.plant.sample_time_s))
     weight = dict(_multipliers(loop))[multiplier](at.s)
-    block = weight[..., None, None] * (at.mobility + np.eye(at.mobility.shape[-1]) / factor)
-    block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
-    possible = np.all(np.linalg.eigvalsh(block) > 0.0, axis=(-2, -1))
-    block = np.where(possible[:, None, None, None], block, np.eye(block.shape[-1]))
-    right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
-    sums = np.conj(np.swapaxes(right, -1, -2)) @ np.linalg.solve(block, right)
-    (alpha, beta), gamma = (np.real(sums[..., i, i]) for i in range(2)), sums[..., 1, 0]
+    possible, alpha, beta, gamma = _form_terms(at, weight)(1.0 / factor, EVERY)
     alpha, beta = (np.sum(terms, axis=1) + _bound_rest(at, terms) for terms in (alpha, beta))
     size = np.sqrt(alpha * beta) + _bound_rest(at, gamma)
     return FeedbackLimit(plant=through + 0.5 * np.sum(gamma, axis=1), level=np.where(possible, 2.0 / size, 0.0))
