@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 import seaopt as so
-from seaopt.control import MPCSpec, PlausibilityGate, force_mpc
+from seaopt.control import MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.errors import SeaoptError
 from seaopt.logs import assess_quality
 from seaopt.plants.plant import fill_vector
+from seaopt.robustness import tune_certified
 
 ROOT = Path(__file__).parents[1]
 T = np.arange(20) / 100
@@ -100,16 +101,50 @@ CASES = {
     "tuned at no draws": lambda: so.tune(PLANT, THOR, SPEC, draws=3),
     "tuned without states": lambda: so.tune(STILL, so.ParameterSet(), SPEC),
     "tuned for a plant without states": lambda: so.tune(PLANT, THOR, SPEC, robust_to={"still": STILL}),
+    "tuned at a number": lambda: so.tune(PLANT, THOR, SPEC, draws=[3]),
+    "tuned at a text": lambda: so.tune(PLANT, THOR, SPEC, draws=[{"J": "x"}]),
+    "tuned for half a pair": lambda: so.tune(PLANT, THOR, SPEC, robust_to={"other": (PLANT,)}),
+    "swept bandwidths": lambda: so.control.sweep(PLANT, THOR, SPEC, None),
+    "swept bandwidth": lambda: so.control.sweep(PLANT, THOR, SPEC, [None]),
+    "run with no gate": lambda: runnable(tuned(), gate="x"),
+    "run with a limit": lambda: runnable(tuned(), current_limit_A="x"),
+    **{
+        f"reset at {name} = 'x'": lambda name=name: runnable(tuned(), gate=PlausibilityGate(**GATE)).reset(
+            **{name: "x"}
+        )
+        for name in ("reference", "measurement", "current_A")
+    },
     "swept plant": lambda: so.control.sweep(None, THOR, SPEC, [20.0]),
     "swept spec": lambda: so.control.sweep(PLANT, THOR, None, [20.0]),
     "predictive plant": lambda: force_mpc(None, THOR, MPCSpec(current_limit_A=9.0)),
     "predictive plant without states": lambda: force_mpc(STILL, so.ParameterSet(), MPCSpec(current_limit_A=9.0)),
     "predictive parameters": lambda: force_mpc(PLANT, None, MPCSpec(current_limit_A=9.0)),
     "predictive spec": lambda: force_mpc(PLANT, THOR, SPEC),
+    "predictive gate": lambda: force_mpc(PLANT, THOR, MPCSpec(current_limit_A=9.0), gate="x"),
+    "predictive noise": lambda: MPCSpec(current_limit_A=9.0, noise="x"),
     "certified controller": lambda: so.certify(None, {"stand": PLANT}, THOR),
     "certified plants": lambda: so.certify(tuned(), None, THOR),
     "certified plant": lambda: so.certify(tuned(), {"stand": None}, THOR),
     "certified parameters": lambda: so.certify(tuned(), {"stand": PLANT}, None),
+    **{
+        f"certified with {name} = {value!r}": lambda name=name, value=value: so.certify(
+            tuned(), {"stand": PLANT}, THOR, samples=5, **{name: value}
+        )
+        for name, value in {
+            "min_friction_margin": "5",
+            "confidence": "a",
+            "max_failure_probability": "a",
+            "others": 3,
+            "bounds": 3,
+            "ranges": 3,
+        }.items()
+    },
+    **{
+        f"tuned and certified with {name} = {value!r}": lambda name=name, value=value: tune_certified(
+            **{"plant": PLANT, "parameters": THOR, "spec": SPEC, "plants": {"stand": PLANT}, name: value}
+        )
+        for name, value in {"plant": None, "plants": None, "rounds": "a", "confidence": "a", "others": 3}.items()
+    },
     "certified without states": lambda: so.certify(tuned(), {"still": STILL}, THOR),
     "report": lambda: so.write_report(None, "report.html"),
     "report of nothing": lambda: so.write_report([None], "report.html"),

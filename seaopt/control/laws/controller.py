@@ -42,6 +42,8 @@ from seaopt.records import record
 CONTROLLER_SCHEMA = "seaopt/controller/2"
 GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_r": "N/N", "c": "", "T_q": "s"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
+SAME_POLE = 1e-3  # to which poles that are equal are computed
+NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
@@ -392,7 +394,10 @@ def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
 
 
 def count_filter_samples(law: Law) -> float:
-    """Return the time constant of a law's fastest pole in samples, T/(T + 1) from zero; infinite without a pole.
+    """Return the shortest time constant of a law, in samples, that can be a derivative's filter; infinite without one.
+
+    Such a filter is a real pole between 0 and 1, T/(T + 1) of T samples. A pole at zero is a delay, as averages over
+    samples have it, and a negative or complex one no lag at all.
 
     Examples
     --------
@@ -401,8 +406,11 @@ def count_filter_samples(law: Law) -> float:
     3.0
 
     """
-    poles = np.abs(law.poles[law.integrators :])
-    return float(np.min(poles / np.maximum(1.0 - poles, 1e-300), initial=np.inf))
+    # Poles at zero are computed apart from it, far apart where they are many; their polynomial still ends in zeros.
+    polynomial = np.atleast_1d(np.poly(law.poles[law.integrators :])).real
+    poles = np.roots(np.where(np.abs(polynomial) > NO_COEFFICIENT, polynomial, 0.0))
+    lags = poles.real[(np.abs(poles.imag) < SAME_POLE) & (poles.real > SAME_POLE) & (poles.real < 1.0)]
+    return float(np.min(lags / (1.0 - lags), initial=np.inf))
 
 
 def find_integral_rate(law: Law) -> float:

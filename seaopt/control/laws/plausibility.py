@@ -189,7 +189,7 @@ def _check_range(range_N: Any) -> None:
 def _check_positive(value: Any, name: str) -> None:
     """Refuse what is not a positive number that a target's `float` holds too."""
     if not 1.0 / LARGEST < require_number(value, name, ControlError) < LARGEST:
-        raise ControlError(f"{name} = {value:g} is not positive and finite; give a positive number")
+        raise ControlError(f"{name} = {value:g} is not between {1.0 / LARGEST:g} and {LARGEST:g}; give such a number")
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:

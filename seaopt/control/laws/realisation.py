@@ -30,6 +30,7 @@ the other poles of 1/(1 - Q), about as fast as Q, stay.
 from __future__ import annotations
 
 import math
+from types import NoneType
 
 import numpy as np
 from jaxtyping import Float
@@ -37,7 +38,7 @@ from jaxtyping import Float
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.loops.law import Law
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_number, require_type
 from seaopt.records import record
 
 Vector = Float[np.ndarray, " n"]
@@ -143,6 +144,9 @@ class RunnableLaw:
             An input is not finite, the measurement is outside the gate's range, or the current is above the limit.
 
         """
+        for name, value in (("reference", reference), ("measurement", measurement), ("current_A", current_A)):
+            if value is not None:
+                require_number(value, name, ControlError)
         seen = GateState()
         if self.gate is not None and measurement is not None:
             seen = self.gate.start(measurement)
@@ -263,13 +267,14 @@ def realise(
         A number is out of range, or the law by itself is unstable other than by integrators.
 
     """
+    require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
     for name, value in (
         ("sample_time_s", law.sample_time_s),
         ("per_effort", per_effort),
         ("current_limit_A", current_limit_A),
         ("tracking_time_s", tracking_time_s),
     ):
-        if value is not None and not value > 0.0:
+        if value is not None and not require_number(value, name, ControlError) > 0.0:
             raise ControlError(f"{name} = {value:g} is not positive; give a positive number")
     poles = law.poles[law.integrators :]
     radius = float(np.max(np.abs(poles), initial=0.0))

@@ -25,6 +25,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import field, replace
+from types import NoneType
 from typing import Any
 
 import casadi as ca
@@ -465,6 +466,7 @@ def force_mpc(
     require_plant(plant, "plant", ControlError)
     require_type(params, (ParameterSet, Fit), "params", "give a ParameterSet or a Fit", ControlError)
     require_type(spec, MPCSpec, "spec", "give an MPCSpec", ControlError)
+    require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
     if spec.measured not in plant.outputs:
         raise ControlError(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import NoneType
 
 import numpy as np
 
 from seaopt.control.laws.limits import BY_NAME, Limit
 from seaopt.control.laws.spec import Level
 from seaopt.control.mpc.noise import NoiseModel
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_type
 from seaopt.records import record
 
 MAX_HORIZON_SAMPLES = 500  # of a horizon
@@ -99,6 +100,7 @@ class MPCSpec:
         for name in ("current_slew_A_per_s", "largest_force_N"):
             if getattr(self, name) is not None:
                 self._positive(name)
+        require_type(self.noise, (NoiseModel, NoneType), "noise", "give a NoiseModel", ControlError)
         if isinstance(self.decay, bool) or not isinstance(self.decay, (int, float)) or not 0.0 <= self.decay < 1.0:
             raise ControlError(f"decay = {self.decay!r} is not from 0 to below 1, where the bandwidth ends; lower it")
         for name, least, most in (("delay_samples", 0, MAX_MPC_DELAY_SAMPLES), ("moves", 2, MAX_HORIZON_SAMPLES)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task
-from seaopt.errors import ControlError, require_type
+from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
@@ -146,12 +146,13 @@ def sweep(
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     require_plant(plant, "plant", ControlError)
+    require_type(bandwidths_hz, Collection, "bandwidths_hz", "give a sequence of frequencies in Hz", ControlError)
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
     spec = settle_delay(spec, plant, params)
     params = params.parameters if isinstance(params, Fit) else params
     # What is wrong with any row is said before the first is tuned.
-    specs = [replace(spec, bandwidth_hz=float(f)) for f in bandwidths_hz]
+    specs = [replace(spec, bandwidth_hz=require_number(f, "bandwidths_hz", ControlError)) for f in bandwidths_hz]
     robust_to = robust_to or {}
     task = make_task(plant, params, specs[0], robust_to, draws)
     sliding = _make_sliding_task(plant, params, specs[0], robust_to, draws)

@@ -49,7 +49,7 @@ from seaopt.control.tuning.optimisation_problem import (
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
 from seaopt.control.tuning.solution import solve
-from seaopt.errors import ControlError, require_type, suggestion
+from seaopt.errors import ControlError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
@@ -156,7 +156,12 @@ def make_task(
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
     require_type(draws, Sequence, "draws", "give a sequence of mappings of parameter to value", ControlError)
+    for draw in draws:
+        require_type(draw, Mapping, "one of draws", "give a mapping of parameter to value", ControlError)
     for name, other in robust_to.items():
+        count = len(other) if isinstance(other, tuple) else 2
+        if count != 2:
+            raise ControlError(f"robust_to: {name} is a tuple of {count}; give a plant, or (plant, parameters)")
         require_plant(other[0] if isinstance(other, tuple) else other, f"robust_to: {name}", ControlError)
     named = {"design plant": (plant, values)}
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in robust_to.items()}
@@ -229,7 +234,10 @@ def _draw_plants(
             if parameter not in known:
                 raise ControlError(f'draws name "{parameter}", which no plant has; {suggestion(parameter, known)}')
         for name, (model, nominal) in models.items():
-            used = {key: float(value) for key, value in values.items() if key in model.parameters}
+            used = {
+                key: require_number(value, f"draws: {key}", ControlError)
+                for key, value in values.items() if key in model.parameters
+            }  # fmt: skip
             if not used:
                 continue
             label = format_values(used, missing="") if len(used) < 3 else f"draw {number}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
+from types import NoneType
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,7 +21,7 @@ from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
-from seaopt.errors import ControlError, require_type
+from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -170,6 +171,8 @@ def certify(
     """
     _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
+    require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
+    require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
     if min_friction_margin is None:
         min_friction_margin = controller.spec.level(MIN_FRICTION_MARGIN)
     models, others = _with_design(controller, plants, others or ParameterSet())
@@ -255,6 +258,13 @@ def _check_arguments(
     for name, value, least, what in (("samples", samples, 1, "number of draws"), ("seed", seed, 0, "seed")):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ControlError(f"{name} = {value!r} is not a {what}; give a whole number, {least} or more")
+    for name, value in (
+        ("min_friction_margin", min_friction_margin),
+        ("confidence", confidence),
+        ("max_failure_probability", max_failure_probability),
+    ):
+        if value is not None:
+            require_number(value, name, ControlError)
     if min_friction_margin is not None and not min_friction_margin > 0.0:
         raise ControlError(f"min_friction_margin = {min_friction_margin:g} is not positive; give a slope in N s/m")
     if not 0.0 < confidence < 1.0:

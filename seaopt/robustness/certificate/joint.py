@@ -13,13 +13,14 @@ that the one which passes holds at `confidence`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import NoneType
 from typing import Literal
 
 import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, tune
 from seaopt.control.laws.delay import settle_delay
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
 from seaopt.parameters import ParameterSet
@@ -175,6 +176,10 @@ def tune_certified(
     ('certified', True)
 
     """
+    require_type(plants, Mapping, "plants", "give a mapping of name to plant", ControlError)
+    require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
+    require_type(rounds, int, "rounds", "give a whole number, 1 or more", ControlError)
+    require_number(confidence, "confidence", ControlError)
     if rounds < 1:
         raise ControlError(f"rounds = {rounds} is not a number of rounds; give 1 or more")
     spec = settle_delay(spec, plant, parameters)

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.laws.controller import find_integral_rate
+from seaopt.control.laws.controller import count_filter_samples, find_integral_rate
 from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
 from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken, shorten_blocked
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
 from seaopt.problem.schema import ControllerTable
 from tests import laws
@@ -167,6 +169,26 @@ def test_filter_and_integral_are_those_of_the_law(stand, thor):
     assert {"min_filter_samples", "integral_rad_s"} <= {
         row.name for row in so.certify(other, {"stand": stand}, thor).requirements if not row.met
     }
+
+
+@pytest.mark.parametrize(
+    ("poles", "samples"),
+    [([0.75], 3.0), ([0.75, 0.0, 0.0, 0.0], 3.0), ([0.75, 0.75], 3.0), ([0.4, 0.75], 2 / 3), ([0.75, -0.5], 3.0),
+     ([0.0, 0.0, 0.0], np.inf), ([-0.5], np.inf), ([0.2 + 0.3j, 0.2 - 0.3j], np.inf)],
+)  # fmt: skip
+def test_only_lags_between_zero_and_one_are_filters_of_a_derivative(poles, samples):
+    lag = TransferFunction(num=np.array([1.0, 0.3]), den=np.poly(poles).real)
+    law = Law.from_transfer_functions(lag, lag, sample_time_s=1e-3)
+    assert count_filter_samples(law) == pytest.approx(samples, rel=1e-5)
+
+
+@pytest.mark.parametrize("count", [2, 8, 16])
+def test_a_measurement_averaged_over_samples_keeps_the_filter_of_the_law(loop, count):
+    ahead, back = loop.law.transfer_functions()
+    average = TransferFunction(num=np.convolve(back.num, np.full(count, 1.0 / count)), den=back.den)
+    averaged = Law.from_transfer_functions(ahead, average, sample_time_s=1e-3)
+    assert count_filter_samples(averaged) == pytest.approx(count_filter_samples(loop.law), rel=1e-4)
+    assert count_filter_samples(averaged) > 0.99
 
 
 @pytest.mark.parametrize("structure", ["pid", "pid_dob"])
