@@ -286,19 +286,15 @@ class Controller:
     def __repr__(self) -> str:
         a, s = self.achieved, self.spec
         verdict = "every limit met" if self.feasible else "NOT FEASIBLE"
-        gain_margin, phase_margin, delay_margin, bandwidth = (
-            format_number(value, missing="none")
-            for value in (a.gain_margin_db, a.phase_margin_deg, _milliseconds(a.delay_margin_s), a.bandwidth_hz)
-        )
         return "\n".join(
             [
                 f"Controller {self.structure} on {s.measured} at {s.sample_rate_hz:g} Hz, "
                 f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
                 *self._gain_lines(),
-                f"  bandwidth {bandwidth} Hz (asked {s.bandwidth_hz:g}), "
+                f"  bandwidth {format_number(a.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}), "
                 f"tracking band {format_band(a.tracking_band_hz, 'Hz')}",
-                f"  Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak {a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}",
-                f"  gain margin {gain_margin} dB, phase margin {phase_margin} deg, delay margin {delay_margin} ms",
+                f"  {a.describe_peaks()}",
+                f"  {a.describe_margins()}",
                 *self._friction_lines(),
                 *self._force_lines(),
                 f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
@@ -323,8 +319,7 @@ class Controller:
         _, *stuck = self._measure_states().values()
         return [
             "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
-            f"{format_number(figures.bandwidth_hz, missing='none')} Hz, Ms {figures.ms:.4g}, Mt {figures.mt:.4g}, "
-            f"reference peak {figures.reference_peak:.4g}, noise gain {figures.noise_gain:.4g}"
+            f"{format_number(figures.bandwidth_hz, missing='none')} Hz, {figures.describe_peaks()}"
             for figures in stuck
         ]
 
@@ -376,7 +371,7 @@ class Controller:
             ("tracking band", format_band(a.tracking_band_hz, "Hz", MISSING), ""),
             ("gain margin", format_figure(a.gain_margin_db, "dB"), ""),
             ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
-            ("delay margin", format_figure(_milliseconds(a.delay_margin_s), "ms"), ""),
+            ("delay margin", format_figure(a.delay_margin_ms, "ms"), ""),
         ]
 
 
@@ -432,7 +427,3 @@ def find_integral_rate(law: Law) -> float:
     static = float(law.d[1] + c @ np.linalg.solve(np.eye(c.size) - a, b[:, 1]))
     last, before = -law.b[m - 1, 1], 1.0 - static if m == 1 else -law.b[m - 2, 1]
     return float(last / (law.sample_time_s * (before - 0.5 * m * last)))
-
-
-def _milliseconds(time_s: float | None) -> float | None:
-    return None if time_s is None else 1e3 * time_s

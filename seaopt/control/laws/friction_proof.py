@@ -1,4 +1,4 @@
-"""Whether a controller is proved stable on a plant for every friction curve of its sector, for the certificate."""
+"""Whether a controller is shown to be stable on a plant for every friction curve of its sector, for the certificate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, 
 def prove_friction(
     controller: Controller, plant: Plant, params: ParameterSet, first: str = "", least: float = 0.0
 ) -> FrictionMargin | None:
-    """Return how much steeper friction may be with stability proved, between the samples too; None without friction.
+    """Return how much steeper friction may be with stability shown, between the samples too; None without friction.
 
     The linear plant of the proof is the sliding one; what a curve's slope is above its flattest is in the sector.
 
@@ -37,7 +37,7 @@ def prove_friction(
     -------
     FrictionMargin or None
         With a factor of zero where the sliding loop is not stable itself, where friction acts on the measured output
-        itself (a sampled jump has no bounded gain), or where nothing was proved: that is no proof of an oscillation.
+        itself (a sampled jump has no bounded gain), or where nothing was shown: that is no proof of an oscillation.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def prove_loop(loop: FrictionLoop, first: str = "", least: float = 0.0) -> Frict
 
 
 def lack_proof(frictions: int, reason: str) -> FrictionMargin:
-    """Return the margin of a plant of which nothing can be proved, with the reason."""
+    """Return the margin of a plant of which nothing can be shown, with the reason."""
     return FrictionMargin(factor=0.0, slopes=(0.0,) * frictions, frequency_hz=0.0, multiplier=f"none: {reason}")
 
 

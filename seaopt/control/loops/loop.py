@@ -16,6 +16,7 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes, find_least
 from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.formatting import format_number
 from seaopt.records import record
 
 GRID_LOWEST_HZ = 1e-3
@@ -86,6 +87,26 @@ class LoopFigures:
     delay_margin_s: float | None
     disk_margin: float
     noise_gain: float
+
+    @property
+    def delay_margin_ms(self) -> float | None:
+        """The delay margin in milliseconds."""
+        return None if self.delay_margin_s is None else 1e3 * self.delay_margin_s
+
+    def describe_peaks(self) -> str:
+        """Return the peaks, for print."""
+        return (
+            f"Ms {self.ms:.4g}, Mt {self.mt:.4g}, reference peak {self.reference_peak:.4g}, "
+            f"noise gain {self.noise_gain:.4g}"
+        )
+
+    def describe_margins(self) -> str:
+        """Return the classical margins, for print."""
+        gain, phase, delay = (
+            format_number(value, missing="none")
+            for value in (self.gain_margin_db, self.phase_margin_deg, self.delay_margin_ms)
+        )
+        return f"gain margin {gain} dB, phase margin {phase} deg, delay margin {delay} ms"
 
 
 @record(eq=False)

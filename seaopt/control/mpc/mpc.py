@@ -21,7 +21,6 @@ and the step says so.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import field, replace
@@ -48,6 +47,7 @@ from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
 from seaopt.control.mpc.quadratic_program import make_solver, solve_program
 from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
+from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_number, html_text
@@ -58,7 +58,7 @@ from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
-STEP_DOWN, STEPS_DOWN, BISECTIONS = 0.85, 12, 4  # of the search for a bandwidth that is possible: down to a seventh
+LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
 
 
@@ -148,9 +148,10 @@ class ForceMPC:
         Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
         current goes to zero.
     possible_hz : float or None
-        Where a limit is broken: the largest bandwidth that keeps them all; None where none is known.
+        Where a limit is broken: the first bandwidth that keeps them all on the way down from the one asked, in steps
+        of a sixth, moved up by bisection to a hundredth; None where none does down to a seventh.
     friction : FrictionMargin or None
-        How much steeper friction may be with stability proved while no limit is active; None without friction.
+        How much steeper friction may be with stability shown while no limit is active; None without friction.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
     loops : mapping of name to Loop
@@ -396,16 +397,8 @@ class ForceMPC:
         lines: list[str] = []
         for name, loop in self.loops.items():
             a = loop.figures()
-            late = None if a.delay_margin_s is None else 1e3 * a.delay_margin_s
-            bandwidth, gain, phase, delay = (
-                format_number(value, missing="none")
-                for value in (a.bandwidth_hz, a.gain_margin_db, a.phase_margin_deg, late)
-            )
-            lines.append(
-                f"{name}: bandwidth {bandwidth} Hz, Ms {a.ms:.4g}, Mt {a.mt:.4g}, reference peak "
-                f"{a.reference_peak:.4g}, noise gain {a.noise_gain:.4g}; gain margin {gain} dB, phase margin {phase} "
-                f"deg, delay margin {delay} ms"
-            )
+            bandwidth = format_number(a.bandwidth_hz, missing="none")
+            lines.append(f"{name}: bandwidth {bandwidth} Hz, {a.describe_peaks()}; {a.describe_margins()}")
         return lines
 
     def __repr__(self) -> str:
@@ -480,30 +473,20 @@ def force_mpc(
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:
-    """Return the largest bandwidth below the one asked that keeps every limit; None where none is found."""
-    high = mpc.spec.bandwidth_hz
-    for _ in range(STEPS_DOWN):
-        low = STEP_DOWN * high
-        if _is_possible(mpc, low):
-            break
-        high = low
-    else:
-        return None
-    for _ in range(BISECTIONS):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if _is_possible(mpc, middle) else (low, middle)
-    return low
+    """Return the first bandwidth below the one asked that keeps every limit; None where none is found."""
 
+    def keeps(bandwidth_hz: float) -> bool:
+        try:
+            return _design(*mpc.design, replace(mpc.spec, bandwidth_hz=bandwidth_hz), None).feasible
+        except ControlError:  # slower than any weight makes it
+            return False
 
-def _is_possible(mpc: ForceMPC, bandwidth_hz: float) -> bool:
-    try:
-        return _design(*mpc.design, replace(mpc.spec, bandwidth_hz=bandwidth_hz), None).feasible
-    except ControlError:  # slower than any weight makes it
-        return False
+    asked = mpc.spec.bandwidth_hz
+    return find_end(keeps, list_steps(asked, asked / LOWEST_SHARE), asked)
 
 
 def _prove(mpc: ForceMPC) -> FrictionMargin | None:
-    """Return the friction margin of the design plant; where more than friction is not linear, nothing is proved."""
+    """Return the friction margin of the design plant; where more than friction is not linear, nothing is shown."""
     plant, values = mpc.design
     (loop,) = make_friction_loops(plant, [values], mpc.measured, mpc.per_effort, mpc.delay_samples, mpc.law)
     if loop is None:

@@ -7,7 +7,7 @@ what is possible next to it are found by bisection, and the largest of all from 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +43,26 @@ def find_possible_bandwidths(task: Task, x: LawNumbers) -> tuple[PossibleBandwid
     return _Probes(task, x).find()
 
 
+def list_steps(asked: float, end: float) -> list[float]:
+    """Return the bandwidths to probe from the one asked, which is not among them, to an end of the range."""
+    count = int(np.ceil(abs(np.log(end / asked)) / np.log(PROBE_RATIO)))
+    return [float(f) for f in np.geomspace(asked, end, count + 1)[1:]]
+
+
+def find_end(keeps: Callable[[float], bool], steps: Sequence[float], outside: float | None) -> float | None:
+    """Return the first bandwidth that keeps the limits, moved towards the one before, which does not."""
+    for inside in steps:
+        if keeps(inside):
+            break
+        outside = inside
+    else:
+        return None
+    while outside is not None and abs(np.log(outside / inside)) > RESOLUTION:
+        middle = float(np.sqrt(inside * outside))
+        inside, outside = (middle, outside) if keeps(middle) else (inside, middle)
+    return inside
+
+
 class _Probes:
     """What was found at the bandwidths tried: how much of a limit is used, and the numbers.
 
@@ -58,33 +78,15 @@ class _Probes:
         spec = self.task.spec
         lowest = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
         highest = min(spec.bandwidth_range_hz[1], HIGHEST_BANDWIDTH * spec.sample_rate_hz)
-        up = self._list_steps(highest)
-        below, above = (self._find_end(steps, self.asked) for steps in (self._list_steps(lowest), up))
-        largest = below if above is None else self._find_end([*reversed(up), above], None)
+        down, up = (list_steps(self.asked, end) for end in (lowest, highest))
+        below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
+        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], None)
         nearest = tuple(f for f in (below, above) if f is not None)
         missed, closest = min((usage, f) for f, (usage, _) in self.tried.items())
         possible = PossibleBandwidths(nearest_hz=nearest, largest_hz=largest)
         if np.isfinite(missed):
             possible = replace(possible, closest_hz=closest, missed_by=max(missed - 1.0, 0.0))
         return possible, [self.tried[f][1] for f in nearest]
-
-    def _list_steps(self, end: float) -> list[float]:
-        """Return the bandwidths to probe from the one asked, which is not among them, to an end of the range."""
-        count = int(np.ceil(abs(np.log(end / self.asked)) / np.log(PROBE_RATIO)))
-        return [float(f) for f in np.geomspace(self.asked, end, count + 1)[1:]]
-
-    def _find_end(self, steps: Sequence[float], outside: float | None) -> float | None:
-        """Return the first bandwidth that keeps the limits, moved towards the one before, which does not."""
-        for inside in steps:
-            if self._keeps(inside):
-                break
-            outside = inside
-        else:
-            return None
-        while outside is not None and abs(np.log(outside / inside)) > RESOLUTION:
-            middle = float(np.sqrt(inside * outside))
-            inside, outside = (middle, outside) if self._keeps(middle) else (inside, middle)
-        return inside
 
     def _keeps(self, bandwidth_hz: float) -> bool:
         """Tell whether a law was found that keeps the limits, as measured."""
