@@ -366,8 +366,9 @@ def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     fields = table.controller.model_dump(exclude={"plant", "robust_to", "draws", "notch"})
     notch = table.controller.notch
     tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
-    if fields["min_friction_margin"] is None and table.robustness is not None:  # what is certified is designed for
-        fields["min_friction_margin"] = table.robustness.min_friction_margin
+    if table.robustness is not None and table.robustness.min_friction_margin is not None:
+        designed, certified = fields["min_friction_margin"], table.robustness.min_friction_margin
+        fields["min_friction_margin"] = max(designed or 0.0, certified)  # what is certified is designed for
     return ControllerSpec(**fields, notch=tuned)
 
 

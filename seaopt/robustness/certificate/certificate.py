@@ -201,7 +201,7 @@ class Certificate:
     friction : mapping of name to FrictionMargin
         Of each model with friction: for how steep a friction stability is shown, between sliding and stuck.
     friction_draws : mapping of name to FrictionDraws
-        The same over draws, of those models for which it is shown at the nominal parameters.
+        The same over draws, of those models for which it is shown at the nominal parameters, or that have none there.
     remarks : tuple of str
         What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
         the bandwidth at amplitudes of use.
@@ -404,7 +404,7 @@ class Certificate:
                 | {"worst": self._worst_dict(name)}
                 for name, figures in self.plants.items()
             },
-            "friction": {name: self._friction_dict(name) for name in dict.fromkeys((*self.friction, *self.cycles))},
+            "friction": {name: self._friction_dict(name) for name in self._rubbing},
             "monte_carlo": _list_fields(self.monte_carlo),
             "varied": [_list_fields(varied) for varied in self.varied],
             "remarks": list(self.remarks),
@@ -431,10 +431,7 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        friction = [
-            f"{name}: {self.friction.get(name, 'play')}{self._describe_proof(name)}"
-            for name in dict.fromkeys((*self.friction, *self.cycles))
-        ]
+        friction = [f"{name}: {self._describe_margin(name)}{self._describe_proof(name)}" for name in self._rubbing]
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = self.controller.lifted_notes
         lifted += () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
@@ -450,6 +447,16 @@ class Certificate:
         bounds = self.brackets[name].to_dict() if name in self.brackets else {}
         return _list_fields(worst.witness) | {"largest": largest} | bounds
 
+    @property
+    def _rubbing(self) -> tuple[str, ...]:
+        """The plants with friction, at the nominal parameters or at draws, and those with limit cycles."""
+        return tuple(dict.fromkeys((*self.friction, *self.friction_draws, *self.cycles)))
+
+    def _describe_margin(self, name: str) -> str:
+        if name in self.friction:
+            return str(self.friction[name])
+        return "friction: none at the nominal parameters" if name in self.friction_draws else "play"
+
     def _describe_proof(self, name: str) -> str:
         """Return what draws and predicted limit cycles add to a plant's proof, or to that there is none."""
         drawn = f"; {self.friction_draws[name]}" if name in self.friction_draws else ""
@@ -461,8 +468,9 @@ class Certificate:
         stable = True if margin is not None and margin.proved and not cycles else None
         proof: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
         if margin is not None:
-            draws = _list_fields(self.friction_draws[name]) if name in self.friction_draws else None
-            proof |= _list_fields(margin) | {"draws": draws}
+            proof |= _list_fields(margin) | {"draws": None}
+        if name in self.friction_draws:
+            proof["draws"] = _list_fields(self.friction_draws[name])
         return proof
 
     def _describe_cycles(self, name: str) -> str:

@@ -140,7 +140,8 @@ def certify(
         Required of that bound, so that too few draws do not pass; if left out, the bound is stated, not required.
     min_friction_margin : float, optional
         Required of every plant with friction, N s/m (N m s/rad): stability is shown for friction curves of this slope,
-        counted from the flattest, at the nominal parameters and at up to 100 draws; the specification's if left out.
+        counted from the flattest, at the nominal parameters and at up to 100 draws. The larger of this and the
+        specification's counts.
     bounds : Budget, optional
         Also bound the worst case from above, with this much work on each plant; not at all if left out. The bounds
         are not a requirement; a plant that this meets and that is worse than the worst case found replaces it.
@@ -173,8 +174,8 @@ def certify(
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
-    if min_friction_margin is None:
-        min_friction_margin = controller.spec.level(MIN_FRICTION_MARGIN)
+    asked = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
+    min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     models, others = _with_design(controller, plants, others or ParameterSet())
     unknown = combine_uncertainty(parameters, others, ranges or {}, models)
     _check_delay(controller, unknown.ranges)

@@ -16,6 +16,7 @@ from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import has_friction
 from seaopt.records import record
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.worst import place_values
@@ -27,6 +28,8 @@ PROVED_DRAWS = 100  # at most so many are looked at
 @record
 class FrictionDraws:
     """For how many draws stability is proved for every friction curve of their sector, and the least margin.
+
+    A draw without friction counts as proved.
 
     Parameters
     ----------
@@ -75,11 +78,14 @@ def prove_friction_draws(
     controller: Controller, models: Mapping[str, Plant], unknown: Uncertainty, nominal: Mapping[str, FrictionMargin],
     samples: int, rng: np.random.Generator, required: float | None = None,
 ) -> dict[str, FrictionDraws]:  # fmt: skip
-    """Prove stability at draws, of the plants with a proof, or the slope required, at the nominal parameters."""
-    count = min(samples, PROVED_DRAWS)
+    """Prove stability at draws, of the plants with a proof, or the slope required, at the nominal parameters.
+
+    Those that have friction at draws alone are among them.
+    """
+    count, varied = min(samples, PROVED_DRAWS), [row.name for row in unknown.varied()]
     enough = {
-        name: margin for name, margin in nominal.items()
-        if margin.proved or (required is not None and min(margin.slopes) >= required)
+        name: nominal.get(name) for name, model in models.items()
+        if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }  # fmt: skip
     if not count or not enough:
         return {}
@@ -90,21 +96,27 @@ def prove_friction_draws(
     }
 
 
+def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool:
+    """Tell whether the nominal parameters leave something to look for at draws; without friction there they do."""
+    return margin is None or margin.proved or (required is not None and margin.least_slope >= required)
+
+
 def _prove_draws(
-    controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]], known: FrictionMargin
-) -> FrictionDraws:
+    controller: Controller, plant: Plant, nominal: ParameterSet, draws: list[dict[str, float]],
+    known: FrictionMargin | None,
+) -> FrictionDraws:  # fmt: skip
     """Return how many draws of one plant have a proof, and the least margin."""
     placed = [place_values(plant, nominal, draw) for draw in draws]
     keys = [tuple((name, each[name].value) for name in each) for each in placed]
     distinct = dict(zip(keys, placed, strict=True))  # draws that vary what this plant does not have are one loop
-    least = 1.0 if known.proved else 0.0
-    found = prove_friction_sets(controller, plant, list(distinct.values()), known.multiplier, least)
+    first, least = ("", 0.0) if known is None else (known.multiplier, 1.0 if known.proved else 0.0)
+    found = prove_friction_sets(controller, plant, list(distinct.values()), first, least)
     margins = dict(zip(distinct, found, strict=True))
     proved, slope, factor, place = 0, np.inf, np.inf, 0
     for k, key in enumerate(keys):
         margin = margins[key]
         proved += margin is None or margin.proved  # without friction there is nothing to prove
-        if margin is not None and min(margin.slopes) < slope:
-            slope, factor, place = min(margin.slopes), margin.factor, k
+        if margin is not None and margin.least_slope < slope:
+            slope, factor, place = margin.least_slope, margin.factor, k
     used = {name: value for name, value in draws[place].items() if name in placed[place]}
     return FrictionDraws(samples=len(draws), proved=proved, least_slope=slope, factor=factor, parameters=used)

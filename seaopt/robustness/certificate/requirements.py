@@ -21,6 +21,7 @@ from seaopt.robustness.certificate.friction import FrictionDraws
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 
+NO_FRICTION = "no friction: any margin holds"
 WITNESS_REMEDY = "; tune with that plant in robust_to, a larger reserve or a lower bandwidth"
 
 
@@ -95,13 +96,21 @@ def draw_requirements(
 def friction_requirements(
     margins: Mapping[str, FrictionMargin], draws: Mapping[str, FrictionDraws], least: float | None
 ) -> list[Requirement]:
-    """Return that stability is shown for friction as steep as asked, N s/m, at the nominal values and over draws."""
+    """Return that stability is shown for friction as steep as asked, at the nominal values and over draws.
+
+    Without friction there is nothing to show: the row says so, with an infinite value.
+    """
     if least is None:
         return []
+    if not margins and not draws:
+        return [Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=np.inf, met=True, where=NO_FRICTION)]
     rows: list[Requirement] = []
-    for name, margin in margins.items():
-        value, where = margin.least_slope, f"{name}: {margin.multiplier} at {margin.frequency_hz:.4g} Hz"
-        drawn = draws.get(name)
+    for name in dict.fromkeys((*margins, *draws)):
+        margin, drawn = margins.get(name), draws.get(name)
+        if margin is None:
+            value, where = np.inf, f"{name}: {NO_FRICTION}"
+        else:
+            value, where = margin.least_slope, f"{name}: {margin.multiplier} at {margin.frequency_hz:.4g} Hz"
         if drawn is not None and drawn.least_slope < value:
             value, where = drawn.least_slope, f"{name} at {format_values(drawn.parameters)}"
         met = bool(value >= least * (1.0 - LIMIT_ROUNDING))

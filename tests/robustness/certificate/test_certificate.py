@@ -12,11 +12,13 @@ import pytest
 from scipy.stats import beta, binomtest
 
 import seaopt as so
+from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.certify import _digest
+from seaopt.robustness.certificate.requirements import friction_requirements
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges
 from tests.laws import scaled
 
@@ -385,6 +387,50 @@ def test_friction_is_proved_over_draws_and_may_be_required(stand, thor):
     asked = so.certify(controller, {"stand": stand}, rubbing, samples=5, min_friction_margin=1e9)
     (broken,) = [row for row in asked.requirements if row.name == "min_friction_margin"]
     assert not broken.met and not asked.passed
+
+
+def margin_rows(certificate):
+    return [row for row in certificate.requirements if row.name == "min_friction_margin"]
+
+
+@pytest.fixture(scope="module")
+def smooth(stand, thor):
+    """Return a law tuned without friction, and its parameters."""
+    values = thor.update(v_s=4e-3)
+    return so.tune(stand, values, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6)), values
+
+
+def test_friction_at_draws_alone_is_proved_too(stand, smooth):
+    """The draws' proof is that of the same law at the worst draw's parameters, with friction nominal there."""
+    controller, values = smooth
+    ranges = {"f_c": (0.0, 50.0)}
+    certificate = so.certify(controller, {"stand": stand}, values, ranges=ranges, samples=10, min_friction_margin=1e6)
+    (row,) = margin_rows(certificate)
+    drawn = certificate.friction_draws["stand"]
+    assert not row.met and not certificate.passed
+    assert drawn.samples == 10 and row.value == drawn.least_slope
+    there = prove_friction(controller, stand, values.update(**drawn.parameters))
+    assert there.least_slope == pytest.approx(row.value, rel=1e-3)
+    (lower,) = friction_requirements({}, certificate.friction_draws, 1e4)
+    assert lower.met
+    assert "friction: none" in repr(certificate)
+    assert certificate.to_dict()["friction"]["stand"]["draws"]["least_slope"] == row.value
+
+
+def test_without_friction_a_margin_that_is_asked_says_so(stand, smooth):
+    controller, values = smooth
+    certificate = so.certify(controller, {"stand": stand}, values, min_friction_margin=1e6)
+    (row,) = margin_rows(certificate)
+    assert row.met and np.isinf(row.value) and "no friction" in row.where
+
+
+def test_the_larger_of_two_friction_margins_is_required(stand, smooth):
+    controller, values = smooth
+    rubbing = values.update(f_c=50.0)
+    asking = replace(controller, spec=replace(controller.spec, min_friction_margin=1e9))
+    certificate = so.certify(asking, {"stand": stand}, rubbing, min_friction_margin=10.0)
+    (row,) = margin_rows(certificate)
+    assert row.limit == 1e9 and not row.met and not certificate.passed
 
 
 def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
