@@ -277,13 +277,14 @@ def _least_inverse(test: Test, bar: float) -> float | None:
     angles that fail at the lower end are looked at in between. What is returned is tested at all of them.
     """
 
-    def fail(inverse: float, angles: Int[np.ndarray, " n"]) -> Int[np.ndarray, " lost"]:
-        return angles[test(inverse, angles) <= 0.0]
+    def fail(inverse: float, angles: Places = EVERY) -> Int[np.ndarray, " lost"]:
+        lost = np.flatnonzero(~(test(inverse, angles) > 0.0))  # what is not a number fails
+        return lost if isinstance(angles, slice) else angles[lost]
 
     high = top = min(bar, LARGEST_INVERSE)
-    if np.any(test(high, EVERY) <= 0.0):
+    if fail(high).size:
         return None
-    failing = np.flatnonzero(test(0.0, EVERY) <= 0.0)
+    failing = fail(0.0)
     if not failing.size:
         return 0.0
     low = SMALLEST_INVERSE
@@ -295,7 +296,7 @@ def _least_inverse(test: Test, bar: float) -> float | None:
             middle = float(np.sqrt(low * high))
             still = fail(middle, failing)
             low, high, failing = (middle, high, still) if still.size else (low, middle, failing)
-        failing = np.flatnonzero(test(high, EVERY) <= 0.0)
+        failing = fail(high)
         if not failing.size:
             return high
         low, high = high, top  # the bound on what is beyond the aliases need not fall as the rest does

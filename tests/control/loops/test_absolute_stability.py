@@ -228,6 +228,10 @@ def test_what_a_proof_asks_of_the_feedback_is_the_circle_criterion(factor):
     assert 0.0 < np.mean(agreed) < 1.0
 
 
+def test_what_is_not_a_number_is_no_proof():
+    assert proof._least_inverse(lambda inverse, angles: np.full(5, np.nan)[angles], 1.0) is None
+
+
 def test_many_sets_of_parameters_are_tested_as_one_is():
     """One linearisation of all, with delays of their own, against one at a time; without friction there is nothing."""
     stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=4e-3)
