@@ -239,18 +239,18 @@ class Limit:
         return self.default if self.bandwidth_divisor is None else bandwidth_hz / self.bandwidth_divisor
 
     def check(self, level: Any, bandwidth_hz: float) -> None:
-        """Refuse a level that is no number, or that no loop can keep.
+        """Refuse a level that is not a finite number, None or False, or that no loop can keep.
 
         Raises
         ------
         ControlError
-            It is one.
+            The level is refused.
 
         """
         if level is None or level is False:
             return
-        if isinstance(level, bool) or not isinstance(level, (int, float)) or math.isnan(level):
-            raise ControlError(f"{self.name} = {level!r} is not a number; give one")
+        if isinstance(level, bool) or not isinstance(level, (int, float)) or not math.isfinite(level):
+            raise ControlError(f"{self.name} = {level!r} is not a finite number; give one, or false to lift the limit")
         if self.above is not None and not self.in_range(level):
             upper = "" if self.below is None else f" and less than {self.below:g}"
             raise ControlError(f"{self.name} = {level:g} can be met by no loop; give more than {self.above:g}{upper}")

@@ -14,7 +14,7 @@ from seaopt.records import record
 Level = float | Literal[False] | None  # of a limit: None is its default, False lifts it
 LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
 LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
-OPTIONAL = (*LIFTABLE, "current_limit_A", "step_N")
+OPTIONAL = ("current_limit_A", "step_N")
 MAX_DELAY_SAMPLES = 1000
 LOWEST_HZ = 1e-3  # limits are kept from here
 
@@ -126,7 +126,7 @@ class ControllerSpec:
             raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
         if not 0 <= self.loop_delay_samples <= MAX_DELAY_SAMPLES:
             raise ControlError(f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}")
-        if not 4.0 * self.bandwidth_hz < self.sample_rate_hz < math.inf:
+        if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
             raise ControlError(
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
                 "sample more than four times as fast"
@@ -140,10 +140,10 @@ class ControllerSpec:
             )
         for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *OPTIONAL):
             value = getattr(self, name)
-            if (value is None and name in OPTIONAL) or (value is False and name in LIFTABLE):
+            if value is None and name in OPTIONAL:
                 continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-                raise ControlError(f"{name} = {value!r} is not a number; give one")
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise ControlError(f"{name} = {value!r} is not a finite number; give one")
 
     def _check_limits(self) -> None:
         for name in LIFTABLE:

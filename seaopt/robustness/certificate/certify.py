@@ -266,8 +266,8 @@ def _check_arguments(
     ):
         if value is not None:
             require_number(value, name, ControlError)
-    if min_friction_margin is not None and not min_friction_margin > 0.0:
-        raise ControlError(f"min_friction_margin = {min_friction_margin:g} is not positive; give a slope in N s/m")
+    if min_friction_margin is not None and not 0.0 < min_friction_margin < np.inf:
+        raise ControlError(f"min_friction_margin = {min_friction_margin:g} is not a slope; give one above zero")
     if not 0.0 < confidence < 1.0:
         raise ControlError(f"confidence = {confidence:g} is not between 0 and 1")
     if max_failure_probability is not None and not 0.0 < max_failure_probability <= 1.0:

@@ -13,10 +13,12 @@ import pytest
 import seaopt as so
 from seaopt.control.laws.controller import count_filter_samples, find_integral_rate
 from seaopt.control.laws.limits import BY_NAME, FIELDS, LIMITS, MeasuredLoop, PortFigures
+from seaopt.control.laws.spec import LIFTABLE
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, Nominal
 from seaopt.control.laws.verdict import explain_broken, judge_all, list_active, list_broken, shorten_blocked
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
 from seaopt.errors import ControlError
 from seaopt.problem.schema import ControllerTable
 from tests import laws
@@ -232,3 +234,13 @@ def test_a_message_has_room_for_the_worst_limits_and_counts_the_rest():
     assert text.startswith(blocked[0]) and blocked[3] not in text and "more limits" in text
     assert len(text) < 180
     assert shorten_blocked(blocked[:1]) == blocked[0]
+
+
+@pytest.mark.parametrize("level", [np.inf, -np.inf, np.nan, True])
+def test_a_level_that_is_not_a_finite_number_is_refused_and_the_way_to_lift_it_named(level):
+    for name in LIFTABLE:
+        with pytest.raises(ControlError, match=rf"{name} = .*false"):
+            so.ControllerSpec(bandwidth_hz=20, **{name: level})
+    for name in {limit.name for limit in MPC_LIMITS if limit.has_field} - {"bandwidth_hz"}:
+        with pytest.raises(ControlError, match=rf"{name} = .*false"):
+            MPCSpec(bandwidth_hz=20, current_limit_A=9.0, **{name: level})
