@@ -35,12 +35,14 @@ margin*; divided by the curve's own steepest slope it is a factor, above 1 where
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.special import polygamma
 
 from seaopt.control.loops.friction_loop import FrictionLoop
+from seaopt.control.loops.loop import STABLE, Loop
 from seaopt.records import record
 
 ALIASES = 30  # on either side; what is beyond is bounded
@@ -84,6 +86,8 @@ class FrictionMargin:
         With which it holds.
     angles : int
         At how many angles it was looked at, those about the worst of them included; between them nothing is enclosed.
+    linearised : bool
+        A link turns, for which the plant is linearised at rest.
 
     """
 
@@ -92,6 +96,7 @@ class FrictionMargin:
     frequency_hz: float
     multiplier: str
     angles: int = 0
+    linearised: bool = False
 
     @property
     def proved(self) -> bool:
@@ -109,14 +114,16 @@ class FrictionMargin:
         steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as its own"
         missing = "" if self.proved else "; for its own it is not"
         where = f"by a test at {self.angles} angles, between the samples too"
+        where += ", linearised at rest" if self.linearised else ""
         return f"friction: stability is shown for every curve {steep}, {where}{missing}"
 
 
 def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> FrictionMargin:
     """Return the steepest friction for which the test of stability holds, the best over all multipliers tried.
 
-    The loop without friction must be stable, by its eigenvalues; the caller sees to that. Sums over aliases are
-    truncated with a bound on the rest; rounding is not enclosed, nor is what lies between the angles looked at.
+    The loop without friction must be stable, by its eigenvalues, and have no `FrictionLoop.obstacle`; else the margin
+    is zero, and its `multiplier` says why. Sums over aliases are truncated with a bound on the rest; rounding is not
+    enclosed, nor is what lies between the angles looked at.
 
     Parameters
     ----------
@@ -128,9 +135,15 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         A smaller factor is not looked for, which is quicker: the margin is then zero.
 
     """
+    none = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
+    obstacle = loop.obstacle
+    if not obstacle and np.max(np.abs(Loop(plant=loop.plant, law=loop.law).eigenvalues())) >= STABLE:
+        obstacle = "unstable without friction"
+    if obstacle:
+        return replace(none, multiplier=f"none: {obstacle}")
     responses = _respond(loop, _angles(loop))
     bar = 1.0 / least if least else np.inf
-    best = FrictionMargin(factor=0.0, slopes=(0.0,) * loop.slopes.size, frequency_hz=0.0, multiplier="none")
+    best = none
     for name, multiplier in sorted(_multipliers(loop), key=lambda named: named[0] != first):
         test = _weigh(responses, multiplier)
         inverse = _least_inverse(test, WORTHWHILE / best.factor if best.factor else bar)
@@ -144,7 +157,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
         best = FrictionMargin(
             factor=float(factor), slopes=tuple(float(slope) for slope in factor * loop.slopes),
             frequency_hz=float(theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
-            angles=count,
+            angles=count, linearised=loop.linearised,
         )  # fmt: skip
         if name == first and best.proved:
             break

@@ -6,11 +6,18 @@ functions at the fundamental alone (`seaopt.control.laws.limit_cycles`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.sampled_plant import DigitalPlant, find_rest, linearise_sets, sample_linear
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states
+from seaopt.plants.memo import memo
 from seaopt.records import record
 
 FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
@@ -38,6 +45,10 @@ class FrictionLoop:
         Its C_y closes the loop.
     delay_s : float
         Of the motor effort, besides the whole samples of `plant`.
+    linear : bool
+        Besides its friction the plant is linear, once links that turn are linearised at rest.
+    linearised : bool
+        Some link is.
 
     """
 
@@ -51,6 +62,17 @@ class FrictionLoop:
     plant: DigitalPlant
     law: Law
     delay_s: float = 0.0
+    linear: bool = True
+    linearised: bool = False
+
+    @property
+    def obstacle(self) -> str:
+        """Why no test of absolute stability is for this loop, whatever its law; empty where one is."""
+        if not self.linear:
+            return "the plant is not linear besides its friction"
+        if np.any(self.through * self.slopes):  # a sampled jump has no bounded gain
+            return "friction acts on the measured output itself"
+        return ""
 
     @property
     def only_port(self) -> int | None:
@@ -128,3 +150,71 @@ def transfer(
         for weight, state in zip(weights, x, strict=True):
             row += weight * state
     return np.moveaxis(out, -1, 0).reshape(*s.shape, *out.shape[:2])
+
+
+def make_friction_loops(
+    plant: Plant, sets: Sequence[ParameterSet], measured: str, per_effort: float, delay_samples: int, law: Law
+) -> list[FrictionLoop | None]:
+    """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
+
+    Parameters
+    ----------
+    plant : Plant
+        With its friction.
+    sets : sequence of ParameterSet
+        All with the same conditions among them.
+    measured : str
+        The output that is fed back.
+    per_effort : float
+        The command that the law's effort becomes, per unit.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    law : Law
+        Its sample time is the loop's.
+
+    Returns
+    -------
+    list of FrictionLoop or None
+        None where there is no friction.
+
+    """
+    values = [plant.complete(params) for params in sets]
+    spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
+    if not np.any(spans):
+        return [None] * len(sets)
+    sliding = friction_states(plant)[SLIDING]
+    blocks, delays = linearise_sets(sliding, values, measured, per_effort)
+    sampled = sample_linear(blocks, delays, law.sample_time_s, delay_samples)
+    loops: list[FrictionLoop | None] = []
+    for k, (each, span) in enumerate(zip(values, spans, strict=True)):
+        x, u = find_rest(plant, each)
+        on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, each.vector))
+        linear, linearised = _check_linear(sliding, x, each.vector)
+        loops.append(None if not np.any(span) else FrictionLoop(
+            a=blocks[0][k], motor=blocks[1][k], measured=blocks[2][k], friction=on_states, velocity=velocity,
+            through=on_outputs[list(plant.outputs).index(measured)], slopes=span, plant=sampled[k],
+            law=law, delay_s=float(delays[k]), linear=linear, linearised=linearised,
+        ))  # fmt: skip
+    return loops
+
+
+@memo
+def _differentiate(plant: Plant) -> tuple[ca.SX, tuple[int, ...]]:
+    """Return the equations' slopes by states and inputs, and which states are those of a link that turns."""
+    angles = {port.coordinate: port.rate for port in plant.ports if plant.states.get(port.coordinate or "") == "rad"}
+    turning = tuple(i for i, name in enumerate(plant.states) if name in angles or name in angles.values())
+    return ca.jacobian(ca.vertcat(plant.dynamics, plant.output), ca.vertcat(plant.x, plant.u)), turning
+
+
+def _check_linear(plant: Plant, rest: Float[np.ndarray, " n"], values: Float[np.ndarray, " p"]) -> tuple[bool, bool]:
+    """Tell whether a plant is linear once links that turn stay about their rest; and whether some link then does."""
+    slopes, turning = _differentiate(plant)
+    variables = ca.vertcat(plant.x, plant.u)
+    if not ca.depends_on(slopes, variables):
+        return True, False
+    slopes = ca.substitute(slopes, plant.p, ca.DM(values))
+    kept = [column for column in range(slopes.shape[1]) if column not in turning]
+    held = ca.vertcat(*(float(rest[i]) if i in turning else plant.x[i] for i in range(len(plant.states))))
+    others = ca.substitute(slopes[:, kept], plant.x, held)
+    linear = not ca.depends_on(ca.vec(others), variables)
+    return linear, linear and bool(ca.depends_on(ca.vec(slopes), variables))

@@ -27,18 +27,17 @@ from dataclasses import field, replace
 from types import NoneType
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
-from seaopt.control.laws.friction_proof import lack_proof, make_friction_loops, prove_loop
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.spec import describe_lifted
 from seaopt.control.laws.verdict import Verdict, explain_broken, join_labels, judge_all, list_broken, shorten_blocked
-from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -467,7 +466,7 @@ def force_mpc(
     spec = settle_delay(spec, plant, params)
     mpc = _design(plant, params.parameters if isinstance(params, Fit) else params, spec, gate)
     return replace(
-        mpc, possible_hz=None if mpc.feasible else _find_possible(mpc), friction=_prove(mpc),
+        mpc, possible_hz=None if mpc.feasible else _find_possible(mpc), friction=_find_friction_margin(mpc),
         warnings=warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, plant, params),
     )  # fmt: skip
 
@@ -485,17 +484,11 @@ def _find_possible(mpc: ForceMPC) -> float | None:
     return find_end(keeps, list_steps(asked, asked / LOWEST_SHARE), asked)
 
 
-def _prove(mpc: ForceMPC) -> FrictionMargin | None:
-    """Return the friction margin of the design plant; where more than friction is not linear, nothing is shown."""
+def _find_friction_margin(mpc: ForceMPC) -> FrictionMargin | None:
+    """Return the friction margin of the design plant; None without friction."""
     plant, values = mpc.design
     (loop,) = make_friction_loops(plant, [values], mpc.measured, mpc.per_effort, mpc.delay_samples, mpc.law)
-    if loop is None:
-        return None
-    sliding = take_sliding(plant, values)
-    slopes = [ca.vec(ca.jacobian(curve, sliding.x)) for curve in (sliding.dynamics, sliding.output)]
-    if ca.depends_on(ca.vertcat(*slopes), sliding.x):
-        return lack_proof(loop.slopes.size, "the plant is not linear besides its friction")
-    return prove_loop(loop)
+    return None if loop is None else friction_margin(loop)
 
 
 def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, gate: PlausibilityGate | None) -> ForceMPC:

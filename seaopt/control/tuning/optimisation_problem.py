@@ -33,12 +33,17 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.friction_proof import prove_loop
 from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
-from seaopt.control.loops.absolute_stability import LOWEST_ANGLE, SIMPLEST, FrictionMargin, limit_feedback
+from seaopt.control.loops.absolute_stability import (
+    LOWEST_ANGLE,
+    SIMPLEST,
+    FrictionMargin,
+    friction_margin,
+    limit_feedback,
+)
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, STABLE, Loop
@@ -383,7 +388,7 @@ class Task:
     def prove(self, x: LawNumbers) -> list[FrictionMargin]:
         """Return the friction margin of every rubbing plant."""
         law = self.law_of(x)
-        return [prove_loop(replace(one.loop, law=law)) for one in self.rubbing]
+        return [friction_margin(replace(one.loop, law=law)) for one in self.rubbing]
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""

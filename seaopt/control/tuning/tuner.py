@@ -21,7 +21,6 @@ from jaxtyping import Complex
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
-from seaopt.control.laws.friction_proof import make_friction_loops
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Nominal
@@ -33,6 +32,7 @@ from seaopt.control.laws.verdict import (
     list_broken,
     list_broken_limits,
 )
+from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import make_static_law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.port import port_of
@@ -93,7 +93,7 @@ def tune(
         The measured output does not respond to the motor at 0 Hz, a draw names a parameter that no plant has, delay or
         current limit make the request impossible for every controller, a passive band is required of a plant without
         a port at link 2, or with an elastic screw before it, or a friction margin where friction acts on the measured
-        output itself.
+        output itself or the plant is not linear besides it.
 
     Examples
     --------
@@ -213,10 +213,10 @@ def _find_rubbing(
         (loop,) = make_friction_loops(plant, [values], spec.measured, gain, spec.loop_delay_samples, open_law)
         if loop is None:
             continue
-        if slope is not None and np.any(loop.through * loop.slopes):
+        if slope is not None and loop.obstacle:
             raise ControlError(
-                f"{FRICTION} = {slope:g} cannot be shown on {plant.name}: friction acts on the measured output "
-                "itself; leave the limit out, or measure another output"
+                f"{FRICTION} = {slope:g} cannot be shown on {plant.name}: {loop.obstacle}; leave the limit out, or "
+                "change the plant or the measured output"
             )
         flattest, _ = friction_slopes(plant, values)
         rubbing.append(RubbingPlant(plant=number, loop=loop, flattest=flattest))

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.control.laws.friction_proof import lack_proof, prove_friction, prove_friction_sets
+from seaopt.control.laws.friction_proof import prove_friction, prove_friction_sets
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
@@ -20,7 +20,6 @@ from seaopt.plants.friction import has_friction
 from seaopt.records import record
 from seaopt.robustness.uncertainty.draws import Uncertainty
 from seaopt.robustness.uncertainty.worst import place_values
-from seaopt.robustness.verification.play_cycles import has_play
 
 PROVED_DRAWS = 100  # at most so many are looked at
 
@@ -64,14 +63,9 @@ class FrictionDraws:
 def prove_frictions(
     controller: Controller, models: Mapping[str, Plant], params: ParameterSet
 ) -> dict[str, FrictionMargin]:
-    """Return the friction margin of every plant that has friction; with play nothing is proved, as it is not linear."""
-    margins: dict[str, FrictionMargin] = {}
-    for name, model in models.items():
-        margin = prove_friction(controller, model, params)
-        if margin is not None:
-            play = bool(margin.factor) and has_play(controller, model, params)
-            margins[name] = lack_proof(len(margin.slopes), "the spring has play") if play else margin
-    return margins
+    """Return the friction margin of every plant that has friction."""
+    margins = {name: prove_friction(controller, model, params) for name, model in models.items()}
+    return {name: margin for name, margin in margins.items() if margin is not None}
 
 
 def prove_friction_draws(

@@ -73,12 +73,6 @@ def predict_play_cycles(controller: Controller, plant: Plant, params: ParameterS
     )
 
 
-def has_play(controller: Controller, plant: Plant, params: ParameterSet) -> bool:
-    """Tell whether a plant has play, so that its loop about rest is not the loop in motion."""
-    values = plant.complete(params).drop_conditions()
-    return bool(_find_plays(controller, take_sliding(plant, values), values))
-
-
 def _find_plays(controller: Controller, plant: Plant, params: CompletedParameters) -> list[_Play]:
     row, gain = list(plant.outputs).index(controller.spec.measured), controller.command.per_effort
 

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import control
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 import seaopt as so
+from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.laws.friction_proof import prove_friction, prove_friction_sets
 from seaopt.control.loops import absolute_stability as proof
 from seaopt.control.loops.friction_loop import FrictionLoop, transfer
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.errors import ControlError
 from tests.laws import law_of, measurement_matrices
 
 STIFFNESS, MASS, DAMPING, PERIOD, DELAY = 120e3, 18.9, 395.0, 1e-3, 2
 A = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
 B = np.array([0.0, 1.0 / MASS])
 C = np.array([STIFFNESS, 0.0])
+
+
+@pytest.fixture(scope="module")
+def controller(stand, thor):
+    """Return a law for the stand with friction, and for the swing."""
+    spec, others = so.ControllerSpec(bandwidth_hz=15, max_sensitivity=1.6), {"swing": so.plants.moving_output()}
+    return so.tune(stand, thor.update(f_c=50.0, v_s=4e-3), spec, others)
 
 
 def discretise(period):
@@ -246,3 +256,33 @@ def test_many_sets_of_parameters_are_tested_as_one_is():
         alone = prove_friction(controller, stand, each)
         if found is not None:
             assert (found.factor, *found.slopes) == pytest.approx((alone.factor, *alone.slopes), rel=1e-9)
+
+
+def test_with_a_link_that_turns_the_margin_is_that_of_the_plant_linearised_at_rest(controller, stand, thor):
+    """With every viscous friction up to the margin python-control's loop of the plant is stable."""
+    rubbing, swing = thor.update(f_c=50.0, v_s=4e-3), so.plants.moving_output()
+    margin = prove_friction(controller, swing, rubbing)
+    assert margin.factor > 1.0 and margin.linearised and "linearised" in str(margin)
+    assert not prove_friction(controller, stand, rubbing).linearised
+    law, radius = controller.law, rubbing["l"].value / (2 * np.pi * rubbing["N_p"].value)
+    back = control.ss(law.a, -law.b[:, 1:], law.c[None], -law.d[1], PERIOD)
+    late = control.ss(control.tf([1.0], [1.0, *[0.0] * controller.delay_samples], PERIOD))
+    for slope in np.geomspace(1.0, margin.slopes[0], 20):
+        viscous = thor.update(b_r=thor["b_r"].value + slope * radius**2)
+        plant = control.c2d(swing.linearize(viscous)["F1", "I"] * controller.command.per_effort, PERIOD)
+        assert np.max(np.abs(control.feedback(plant * late * back, 1).poles())) < 1.0, slope
+
+
+@pytest.mark.parametrize(("part", "values"), [("hardening", {"k_3": 1e10}), ("backlash", {})])
+def test_nothing_is_shown_of_a_plant_that_is_not_linear_besides_its_friction(controller, stand, part, values):
+    """Whatever the law; with a cubic part of nothing it is the stand."""
+    plant, (_, rubbing) = so.plants.high_impedance(parts=[part]), controller.design
+    bent = plant.complete(rubbing).update(**values)
+    planned = force_mpc(plant, bent, MPCSpec(bandwidth_hz=15, current_limit_A=9.0)).friction
+    for margin in (prove_friction(controller, plant, bent), planned):
+        assert margin.factor == 0.0 and not margin.proved and "not linear" in margin.multiplier
+    with pytest.raises(ControlError, match="not linear"):
+        so.tune(stand, rubbing, replace(controller.spec, min_friction_margin=1e4), {"bent": (plant, bent)})
+    if "k_3" in values:
+        straight = prove_friction(controller, plant, bent.update(k_3=0.0))
+        assert straight.factor == pytest.approx(prove_friction(controller, stand, rubbing).factor)

@@ -97,12 +97,6 @@ def test_it_comes_to_its_reference_against_friction(mpc, stand, rubbing):
     assert run.overshoot < 0.1
 
 
-def test_what_is_not_linear_besides_friction_is_not_proved(rubbing):
-    plant = so.plants.high_impedance(parts=["hardening"])
-    found = made(plant, plant.complete(rubbing))
-    assert not found.friction.proved and "not linear" in found.friction.multiplier
-
-
 def test_a_broken_limit_is_named_with_the_bandwidth_that_keeps_it(stand, thor):
     fast = made(stand, thor, bandwidth_hz=40.0)
     assert not fast.feasible

@@ -156,7 +156,7 @@ def test_with_play_nothing_is_proved_and_no_step_is_absurd(stand, thor):
     certificate = so.certify(controller, {"stand": loose}, rubbing)
     assert not certificate.passed
     assert certificate.to_dict()["friction"]["stand"]["sector_stable"] is None
-    assert certificate.friction["stand"].multiplier == "none: the spring has play"
+    assert "not linear" in certificate.friction["stand"].multiplier
     assert min(step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]) > 1.0
 
 
