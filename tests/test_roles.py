@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 from functools import partial
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import MPCSpec, command_of, export, force_mpc, passivity
+from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.control.loops.loop import LoopFigures
 from seaopt.errors import ControlError, PlantError
 from seaopt.plants import Actuation, Friction, Port, Sensing, wrapped
@@ -123,6 +125,17 @@ def test_the_tuned_controller_is_the_same(pair):
     assert "V/(N m)" in repr(strange)
     again = so.Controller.from_dict(strange.to_dict(), *strange.design)
     assert again.command == strange.command and again.notes == strange.notes == built_in.notes
+
+
+def test_a_friction_margin_has_the_unit_of_the_plants_friction(pair):
+    """A torque's is in N m s/rad; the figure is the built-in plant's."""
+    shown = []
+    for (controller, plant, _, params), f_c in zip(pair, ("f_c", WORDS["f_c"]), strict=True):
+        rubbing = params.update(**{f_c: 20.0})
+        margin = prove_friction(controller, plant, rubbing)
+        shown += [repr(replace(controller, design=(plant, rubbing), friction=margin))]
+    built_in, strange = (re.search(r"friction margin (\S+) (N.*?)(?=[:(])", text).groups() for text in shown)
+    assert built_in == (strange[0], "N s/m") and strange[1] == "N m s/rad"
 
 
 def test_the_certificate_is_the_same(pair):

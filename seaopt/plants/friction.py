@@ -60,6 +60,11 @@ def friction_slopes(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarra
     return flattest, steepest
 
 
+def name_slope_unit(plant: Plant) -> str:
+    """Return the unit of the slopes of a plant's friction; empty where it has none."""
+    return " or ".join(dict.fromkeys(friction.slope_unit for friction in plant.friction.values()))
+
+
 def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, float]:
     """Return the effort at the spring that each dry friction takes, by name; what is linear in its velocity is not dry.
 
@@ -129,9 +134,34 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
 @memo
 def _friction_parameters(plant: Plant) -> frozenset[str]:
     """Return the parameters on which the difference of the slopes depends."""
-    p = SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
-    spans = [ca.SX(steepest - flattest) for flattest, steepest in (bound_slopes(f, p) for f in plant.friction.values())]
-    return frozenset(name for name in plant.parameters if ca.depends_on(ca.vertcat(*spans), getattr(p, name)))
+    bounds = [bound_slopes(friction, _name_parameters(plant)) for friction in plant.friction.values()]
+    spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
+    return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
+
+
+def list_fall_parameters(plant: Plant, friction: Friction) -> tuple[str, ...]:
+    """Return the parameters of a plant on which the flattest slope of one of its frictions depends.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> plant = so.plants.high_impedance(parts=["stribeck"])
+    >>> list_fall_parameters(plant, plant.friction["F_f"])
+    ('f_c', 'f_s', 'v_st')
+
+    """
+    flattest, _ = bound_slopes(friction, _name_parameters(plant))
+    return _list_parameters(plant, ca.SX(flattest))
+
+
+def _name_parameters(plant: Plant) -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
+
+
+def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:
+    """Return the parameters on which an expression depends."""
+    symbols = zip(plant.parameters, ca.vertsplit(plant.p), strict=True)
+    return tuple(name for name, symbol in symbols if ca.depends_on(expression, symbol))
 
 
 def _with_slope(plant: Plant, state: str) -> Plant:

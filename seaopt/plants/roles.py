@@ -114,6 +114,11 @@ class Friction:
     effort: Expression = _one
     slopes: Callable[[Any], tuple[Any, Any]] | None = None
 
+    @property
+    def slope_unit(self) -> str:
+        """The unit of the curve's slope: N s/m, or N m s/rad of a torque."""
+        return f"{self.unit} s/{'rad' if self.unit.endswith(' m') else 'm'}"
+
 
 @record(eq=False)
 class Port:

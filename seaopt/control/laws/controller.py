@@ -9,16 +9,19 @@ from typing import Any
 import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes
-from seaopt.control.laws.limits import Limit, MeasuredLoop, PortFigures
+from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
 from seaopt.control.laws.verdict import (
+    DesignFigure,
     PossibleBandwidths,
     join_labels,
     list_broken_figures,
     list_design_figures,
     shorten_blocked,
 )
+from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -36,7 +39,7 @@ from seaopt.formatting import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction, take_sliding
+from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
 from seaopt.records import record
 
 CONTROLLER_SCHEMA = "seaopt/controller/2"
@@ -84,6 +87,8 @@ class Controller:
         The limits that are broken, each once with its worst figure and its plants, the worst first.
     possible : PossibleBandwidths or None
         Where it is not feasible: the bandwidths that keep the limits; None where none were looked for.
+    friction : FrictionMargin or None
+        Of the design plant; None where it has no friction.
 
     """
 
@@ -102,11 +107,12 @@ class Controller:
     observer: DisturbanceObserver | None = None
     blocked_by: tuple[str, ...] = ()
     possible: PossibleBandwidths | None = None
+    friction: FrictionMargin | None = None
 
     @property
     def design_loop(self) -> MeasuredLoop:
         """The design plant's loop, as limits are judged on it."""
-        return self.measure("design plant", self.achieved)
+        return self._add_friction(self.measure("design plant", self.achieved))
 
     def measure(self, name: str, figures: LoopFigures, port: PortFigures | None = None) -> MeasuredLoop:
         """Return a design plant's loop, as limits are judged on it.
@@ -122,6 +128,12 @@ class Controller:
         return MeasuredLoop(
             name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral
         )
+
+    def _add_friction(self, loop: MeasuredLoop) -> MeasuredLoop:
+        """Return the design plant's loop with its friction margin, where it has friction."""
+        if self.friction is None or self.design is None:
+            return loop
+        return replace(loop, friction_slope=self.friction.least_slope, slope_unit=name_slope_unit(self.design[0]))
 
     @property
     def largest_bandwidth_hz(self) -> float | None:
@@ -161,7 +173,13 @@ class Controller:
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
         vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
-        return (*lifted, *vague, *actuation_notes(plant, self.command), *self._noise_notes())
+        return (*lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command), *self._noise_notes())
+
+    def _friction_notes(self) -> tuple[str, ...]:
+        """Say that a friction margin was asked where there is no friction."""
+        if self.friction is not None or self.spec.level("min_friction_margin") is None:
+            return ()
+        return ("the design plant has no friction at these values: any min_friction_margin holds on it",)
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
@@ -228,7 +246,7 @@ class Controller:
             "measurement": {"num": measurement.num, "den": measurement.den},
             "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
             "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
-            "achieved": _list_achieved(self.achieved),
+            "achieved": _list_achieved(self.achieved, self.friction),
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
@@ -273,11 +291,16 @@ class Controller:
         sliding = take_sliding(plant, params)
         sampled = sample(sliding, params, spec.measured, gain, stored["sample_time_s"], stored["delay_samples"])
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
-        check_achieved(content.get("achieved"), _list_achieved(achieved))
-        controller = cls(**stored, achieved=achieved, design=(plant, params))
+        (loop,) = make_friction_loops(
+            plant, [params], spec.measured, gain, stored["delay_samples"], stored["law"]
+        )  # fmt: skip
+        friction = None if loop is None else friction_margin(loop)
+        check_achieved(content.get("achieved"), _list_achieved(achieved, friction))
+        controller = cls(**stored, achieved=achieved, design=(plant, params), friction=friction)
         loops = [
             controller.measure(f"design plant{name}", figures) for name, figures in controller._measure_states().items()
         ]
+        loops[0] = controller._add_friction(loops[0])
         broken = tuple(list_broken_figures(controller.spec, loops) if controller.feasible else ())
         if not broken:
             return controller
@@ -313,15 +336,22 @@ class Controller:
         return {" sliding" if stuck else "": self.achieved} | stuck
 
     def _friction_lines(self) -> list[str]:
-        """Say of which state the figures are where the design plant has friction, and give the other's."""
+        """Give the friction margin, of which state the figures are, and the other's; nothing without friction."""
         if self.design is None:
             return []
         _, *stuck = self._measure_states().values()
-        return [
+        margin = [] if self.friction is None else [self._describe_friction_margin(self.friction)]
+        return margin + [
             "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
             f"{format_number(figures.bandwidth_hz, missing='none')} Hz, {figures.describe_peaks()}"
             for figures in stuck
         ]
+
+    def _describe_friction_margin(self, friction: FrictionMargin) -> str:
+        """Return the slope up to which friction is shown to be stable, in the design plant's unit, and how."""
+        loop, asked = self.design_loop, self.spec.level("min_friction_margin")
+        given = "" if asked is None else f" (asked {asked:g})"
+        return f"  friction margin {format_number(loop.friction_slope)} {loop.slope_unit}{given}: {friction.describe()}"
 
     def _gain_lines(self) -> list[str]:
         law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
@@ -363,8 +393,8 @@ class Controller:
     def _achieved_rows(self) -> list[tuple[str, str, str]]:
         a = self.achieved
         limited = [
-            (limit.label, format_figure(value, limit.unit), _format_allowed(limit, allowed))
-            for limit, value, allowed in list_design_figures(self.spec, self.design_loop)
+            (row.limit.label, format_figure(row.value, row.unit), _format_allowed(row))
+            for row in list_design_figures(self.spec, self.design_loop)
         ]
         return [
             *limited,
@@ -375,17 +405,18 @@ class Controller:
         ]
 
 
-def _format_allowed(limit: Limit, allowed: float | None) -> str:
-    if allowed is None:
+def _format_allowed(row: DesignFigure) -> str:
+    if row.allowed is None:
         return ""
-    sense = "" if limit.sense == "equal to" else f"{limit.sense} "
-    return f"{sense}{allowed:g} {limit.unit}".rstrip()
+    sense = "" if row.limit.sense == "equal to" else f"{row.limit.sense} "
+    return f"{sense}{row.allowed:g} {row.unit}".rstrip()
 
 
-def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
+def _list_achieved(figures: LoopFigures, friction: FrictionMargin | None) -> dict[str, Any]:
     """Return the figures that controller.json states."""
     values = {field.name: getattr(figures, field.name) for field in fields(LoopFigures)}
-    return {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
+    values = {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
+    return values | {"friction_margin": None if friction is None else friction.least_slope}
 
 
 def count_filter_samples(law: Law) -> float:

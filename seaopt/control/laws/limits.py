@@ -69,7 +69,9 @@ class MeasuredLoop:
     integral_rad_s : float
         How fast the integral takes an error away, k_i/(1 + k_p); infinite without one.
     friction_slope : float
-        The steepest friction for which stability is shown, N s/m (N m s/rad); infinite where none is to be proved.
+        The steepest friction for which stability is shown; infinite where there is none, or none is asked about.
+    slope_unit : str
+        Its unit; empty without friction.
 
     """
 
@@ -79,6 +81,11 @@ class MeasuredLoop:
     filter_samples: float = math.inf
     integral_rad_s: float = math.inf
     friction_slope: float = math.inf
+    slope_unit: str = ""
+
+    def unit(self, limit: Limit) -> str:
+        """Return the unit of a limit's figure: that of a friction's slope is the plant's."""
+        return self.slope_unit if self.slope_unit and limit.name == "min_friction_margin" else limit.unit
 
 
 @record(eq=False)
@@ -374,7 +381,7 @@ LIMITS = (
     ),
     Limit(
         name="min_friction_margin", label="friction margin", figure=lambda loop: loop.friction_slope, sense="at least",
-        scope="every plant", unit="N s/m",
+        scope="every plant", unit="N s/m or N m s/rad",
         meaning="steepest friction, counted from its flattest slope, for which stability is shown",
         remedy="ask for the largest that the result names, lower the bandwidth, or allow more noise gain",
     ),

@@ -132,6 +132,8 @@ class StoredPossible(ResultTable):
     missed_by: Finite | None
     fall: Finite | None = None
     largest_fall: Finite | None = None
+    fall_unit: str = ""
+    fall_parameters: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _require_pairs(self) -> StoredPossible:

@@ -75,8 +75,12 @@ class PossibleBandwidths:
     closest_hz, missed_by : float or None
         Where the limits are missed least, and by which share; zero where they are kept, None where no law was stable.
     fall, largest_fall : float or None
-        By how much friction falls with speed, N s/m (N m s/rad), where that makes the sliding plant grow without
-        control, and with how much the limits are kept at the bandwidth asked; None where that is not what blocks.
+        By how much friction falls with speed, where that makes the sliding plant grow without control, and with how
+        much the limits are kept at the bandwidth asked; None where that is not what blocks.
+    fall_unit : str
+        Of the two.
+    fall_parameters : tuple of str
+        The parameters that the fall depends on.
 
     """
 
@@ -86,13 +90,16 @@ class PossibleBandwidths:
     missed_by: float | None = None
     fall: float | None = None
     largest_fall: float | None = None
+    fall_unit: str = ""
+    fall_parameters: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         if self.fall is None:
             return self._format_bandwidths()
+        values = f"check {join_words(self.fall_parameters)}, " if self.fall_parameters else ""
         return (
-            f"{self._format_bandwidths()}; friction that falls by {self.fall:.4g} N s/m makes sliding unstable, "
-            f"{self.largest_fall:.4g} can be had at this bandwidth: check v_st, sample faster or cut the delay"
+            f"{self._format_bandwidths()}; friction that falls by {self.fall:.4g} {self.fall_unit} makes sliding "
+            f"unstable, {self.largest_fall:.4g} can be had here: {values}sample faster or cut the delay"
         )
 
     def _format_bandwidths(self) -> str:
@@ -147,7 +154,7 @@ def list_broken_limits(spec: ControllerSpec, loops: Sequence[MeasuredLoop], desi
 
 def list_broken_figures(spec: ControllerSpec, states: Sequence[MeasuredLoop]) -> list[str]:
     """Return the limits that the design plant's figures break, sliding and stuck if it has friction."""
-    figures_only = replace(spec, passive_band_hz=None, min_friction_margin=None)
+    figures_only = replace(spec, passive_band_hz=None)
     return list_broken(judge_all(figures_only, states, len(states)))
 
 
@@ -213,14 +220,27 @@ def _format_plants(plants: Sequence[str]) -> str:
     return f" ({' and '.join(plants)})"
 
 
-def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[tuple[Limit, float | None, float | None]]:
-    """Return for tables each limit of one loop's figures, the figure, and what is allowed; None where there is none."""
-    rows: list[tuple[Limit, float | None, float | None]] = []
+@record(eq=False)
+class DesignFigure:
+    """One limit's figure of the design plant for tables, what is allowed, and their unit; None where there is none."""
+
+    limit: Limit
+    value: float | None
+    allowed: float | None
+    unit: str
+
+
+def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
+    """Return each limit of one loop's figures; a friction margin only where there is friction, or one is asked for."""
+    rows: list[DesignFigure] = []
     for limit in FIELDS:
         if limit.condition is None:  # a figure of the loop alone
-            value = limit.figure(design)
-            reached = limit.sense == "at most" or np.isfinite(value)
-            rows.append((limit, value if reached else None, spec.allowed(limit)))
+            value, allowed, unit = limit.figure(design), spec.allowed(limit), design.unit(limit)
+            margin = limit.name == "min_friction_margin"
+            if margin and not design.slope_unit and allowed is None:
+                continue
+            reached = limit.sense == "at most" or np.isfinite(value) or (margin and design.slope_unit)
+            rows.append(DesignFigure(limit=limit, value=value if reached else None, allowed=allowed, unit=unit))
     return rows
 
 

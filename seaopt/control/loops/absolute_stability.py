@@ -108,14 +108,18 @@ class FrictionMargin:
         """The least of the slopes that are proved, N s/m (N m s/rad), of what is not viscous."""
         return min((slope for slope in self.slopes if slope > 0.0), default=0.0)
 
-    def __str__(self) -> str:
+    def describe(self) -> str:
+        """Return up to how steep a friction stability is shown, and how, or why it is not."""
         if not self.factor:
-            return f"friction: stability between sliding and stuck is not shown ({self.multiplier})"
+            return f"stability between sliding and stuck is not shown ({self.multiplier})"
         steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as its own"
         missing = "" if self.proved else "; for its own it is not"
         where = f"by a test at {self.angles} angles, between the samples too"
         where += ", linearised at rest" if self.linearised else ""
-        return f"friction: stability is shown for every curve {steep}, {where}{missing}"
+        return f"stability is shown for every curve {steep}, {where}{missing}"
+
+    def __str__(self) -> str:
+        return f"friction: {self.describe()}"
 
 
 def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> FrictionMargin:

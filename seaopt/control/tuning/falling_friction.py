@@ -32,11 +32,11 @@ RESOLUTION = 1.03  # ratio to which the share is found
 SMALLEST_SHARE = 1e-3
 
 
-def find_largest_fall(task: Task) -> tuple[float, float, LawNumbers] | None:
-    """Return the fall of friction, the largest with which the limits are kept, N s/m (N m s/rad), and the law there.
+def find_largest_fall(task: Task) -> tuple[RubbingPlant, float, LawNumbers] | None:
+    """Return the plant whose friction falls most, the largest share of it with which the limits are kept, and the law.
 
-    It is the steepest fall of the plants that grow as they slide; None where no friction falls, or the limits are not
-    kept without a fall either. That a law keeps them is measured, as it is of the answer itself.
+    It is one of the plants that grow as they slide; None where no friction falls, or the limits are not kept without a
+    fall either. That a law keeps them is measured, as it is of the answer itself.
     """
     falling = [one for one in task.rubbing if count_growing(task.plants[one.plant]) and np.min(one.flattest) < 0.0]
     if not falling:
@@ -62,8 +62,7 @@ def find_largest_fall(task: Task) -> tuple[float, float, LawNumbers] | None:
             x, low = trial, middle
         else:
             high = middle
-    fall = max(float(-np.min(one.flattest)) for one in falling)
-    return fall, low * fall, x
+    return max(falling, key=lambda one: one.find_fall()[1]), low, x
 
 
 def _ease(rubbing: RubbingPlant, share: float) -> RubbingPlant:
@@ -72,8 +71,7 @@ def _ease(rubbing: RubbingPlant, share: float) -> RubbingPlant:
     a = loop.a + (loop.friction * left) @ loop.velocity
     c = loop.measured + (loop.through * left) @ loop.velocity
     linear = (a[None], loop.motor[None], c[None], np.array([loop.plant.d]))
-    (plant,) = sample_linear(
-        linear, np.array([loop.delay_s]), loop.plant.sample_time_s, loop.plant.delay_samples
-    )  # fmt: skip
+    delay_s = np.array([loop.delay_s])
+    (plant,) = sample_linear(linear, delay_s, loop.plant.sample_time_s, loop.plant.delay_samples)
     eased = replace(loop, a=a, measured=c, slopes=loop.slopes + left, plant=plant)
     return replace(rubbing, loop=eased, flattest=rubbing.flattest - left)

@@ -49,6 +49,8 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, STABLE, Loop
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.plants import Plant
+from seaopt.plants.roles import Friction
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here
@@ -123,6 +125,8 @@ class RubbingPlant:
     ----------
     plant : int
         Which of the task's plants slides as it does.
+    model : Plant
+        The plant with its friction.
     loop : FrictionLoop
         The loop with its friction taken out; its own law does not matter.
     flattest : array, shape (p,)
@@ -133,9 +137,15 @@ class RubbingPlant:
     """
 
     plant: int
+    model: Plant
     loop: FrictionLoop
     flattest: Float[np.ndarray, " p"]
     multiplier: str = ""
+
+    def find_fall(self) -> tuple[Friction, float]:
+        """Return the friction that falls most with speed, and how steeply."""
+        steepest = int(np.argmin(self.flattest))
+        return list(self.model.friction.values())[steepest], -float(self.flattest[steepest])
 
 
 @record(eq=False)

@@ -21,6 +21,7 @@ from jaxtyping import Complex
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.friction_proof import prove_friction
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Nominal
@@ -54,7 +55,14 @@ from seaopt.estimation import Fit
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.friction import SLIDING, find_dry_friction, friction_slopes, friction_states, split_friction
+from seaopt.plants.friction import (
+    SLIDING,
+    find_dry_friction,
+    friction_slopes,
+    friction_states,
+    list_fall_parameters,
+    split_friction,
+)
 from seaopt.plants.plant import require_plant
 
 
@@ -134,8 +142,13 @@ def _find_possible(task: Task, x: LawNumbers, *, stable: bool) -> tuple[Possible
     eased = find_largest_fall(task)
     if eased is None:
         return possible, near
-    fall, largest, law = eased
-    return replace(possible, fall=fall, largest_fall=largest), [*near, law]
+    steepest, largest, law = eased
+    friction, fall = steepest.find_fall()
+    possible = replace(
+        possible, fall=fall, largest_fall=largest * fall, fall_unit=friction.slope_unit,
+        fall_parameters=list_fall_parameters(steepest.model, friction),
+    )  # fmt: skip
+    return possible, [*near, law]
 
 
 def make_task(
@@ -219,7 +232,7 @@ def _find_rubbing(
                 "change the plant or the measured output"
             )
         flattest, _ = friction_slopes(plant, values)
-        rubbing.append(RubbingPlant(plant=number, loop=loop, flattest=flattest))
+        rubbing.append(RubbingPlant(plant=number, model=plant, loop=loop, flattest=flattest))
     return tuple(rubbing)
 
 
@@ -256,7 +269,7 @@ def make_controller(
     spec, gains = task.spec, task.gains(x)
     verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
-    return Controller(
+    controller = Controller(
         structure=spec.structure,
         gains=gains.by_name(),
         sample_time_s=spec.sample_time_s,
@@ -273,6 +286,7 @@ def make_controller(
         blocked_by=tuple(explain_broken(spec, verdicts, loops[0], task.loop(x))),
         possible=None if not broken else possible,
     )
+    return replace(controller, friction=prove_friction(controller, *design))
 
 
 def disturbance(loop: Loop, bandwidth_hz: float) -> float:

@@ -90,7 +90,7 @@ def test_a_fall_that_cannot_be_had_is_answered_with_the_largest_that_can(plant, 
     assert controller.active_constraints[0].startswith("stability")
     assert possible.fall == pytest.approx(fall, rel=1e-6)
     assert f"{fall:.4g} N s/m" in controller.explanation and f"{possible.largest_fall:.4g}" in controller.explanation
-    assert "v_st" in controller.explanation and len(controller.explanation) < 240
+    assert "f_c, f_s and v_st" in controller.explanation and len(controller.explanation) < 240
     assert so.tune(plant, falling(plant, 50.0, 0.005 * fall / (0.9 * possible.largest_fall)), SPEC).feasible
     steeper = so.tune(plant, falling(plant, 50.0, 0.005 * fall / (1.5 * possible.largest_fall)), NEAR)
     assert not steeper.feasible

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 import seaopt as so
 from seaopt.control.laws.friction_proof import prove_friction
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, FileError
+from seaopt.files import to_json
 from tests.control.loops import test_absolute_stability as lifted
 
 # The actuator of the lifted discretisation: 18.9 kg in all, 395 N s/m.
@@ -88,3 +90,34 @@ def test_friction_on_the_measured_output_itself_is_refused(rubbing):
     lumped = so.plants.high_impedance(drive="lumped")
     with pytest.raises(ControlError, match="min_friction_margin"):
         so.tune(lumped, rubbing, replace(SPEC, measured="F2", min_friction_margin=1e4))
+
+
+def test_the_margin_is_shown_and_a_file_cannot_claim_another(stand, rubbing, designed):
+    """In the text, the table and the JSON it is what the certificate's test finds; one that is edited is refused."""
+    margin = prove_friction(designed, stand, rubbing)
+    assert designed.friction == margin
+    assert f"friction margin {margin.least_slope:.4g} N s/m (asked {ASKED:g})" in repr(designed)
+    assert f"{margin.least_slope:.4g} N s/m" in designed._repr_html_()
+    content = json.loads(to_json(designed.to_dict()))
+    assert content["achieved"]["friction_margin"] == pytest.approx(margin.least_slope, rel=1e-12)
+    assert so.Controller.from_dict(content, stand, rubbing).friction == margin
+    for claim in (1.1 * margin.least_slope, None):
+        content["achieved"]["friction_margin"] = claim
+        with pytest.raises(FileError, match=r"achieved\.friction_margin"):
+            so.Controller.from_dict(content, stand, rubbing)
+
+
+def test_a_file_that_asks_for_more_margin_than_its_law_has_is_not_feasible(stand, rubbing, designed):
+    content = json.loads(to_json(designed.to_dict()))
+    content["spec"]["min_friction_margin"] = 1e9
+    read = so.Controller.from_dict(content, stand, rubbing)
+    assert designed.feasible and not read.feasible
+    assert read.active_constraints == ("min_friction_margin (design plant sliding)",)
+
+
+def test_without_friction_a_note_says_that_any_margin_holds(stand, thor, designed):
+    smooth = so.tune(stand, thor, replace(SPEC, min_friction_margin=ASKED))
+    assert smooth.friction is None and "friction_margin" in smooth.to_dict()["achieved"]
+    assert any("no friction" in note for note in smooth.notes)
+    assert not any("no friction" in note for note in designed.notes)
+    assert "friction margin" not in so.tune(stand, thor, SPEC)._repr_html_()
