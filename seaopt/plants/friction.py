@@ -22,6 +22,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import CompletedParameters, Plant
 from seaopt.plants.roles import Friction, PlantMaker, Port
+from seaopt.records import record
 
 SLIDING, STUCK = "sliding", "stuck"
 STATES = (SLIDING, STUCK)
@@ -173,6 +174,7 @@ def _with_slope(plant: Plant, state: str) -> Plant:
             friction,
             force=lambda v, p: bound_slopes(friction, p)[which] * v,
             slopes=lambda p: (bound_slopes(friction, p)[which],) * 2,
+            jump=None,
         )
 
     def follow(maker: PlantMaker | None) -> PlantMaker | None:
@@ -191,13 +193,19 @@ def _make_with_slope(maker: PlantMaker, state: str) -> Plant:
     return friction_states(maker())[state]
 
 
-@memo
-def friction_matrices(plant: Plant) -> Any:
-    """Return the CasADi function (x, u, p) -> (effect of each friction force on f, on h; velocities' rows), at t = 0.
+@record(eq=False)
+class SeparatedFriction:
+    """A plant's equations with its friction forces as symbols: f, h, the forces, the velocities that they oppose."""
 
-    The effects are those of a force in the direction of its velocity, shapes (nx, p) and (ny, p); the rows are
-    derivatives of the velocities by the states, shape (p, nx).
-    """
+    f: Any
+    h: Any
+    forces: Any
+    velocities: Any
+
+
+@memo
+def separate_friction(plant: Plant) -> SeparatedFriction:
+    """Return the equations in the plant's own symbols t, x, u and p, and one symbol for each friction force."""
     forces = {name: ca.SX.sym(name) for name in plant.friction}
     x, u, p = (
         SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
@@ -205,11 +213,25 @@ def friction_matrices(plant: Plant) -> Any:
     )
     for name, symbol in forces.items():
         setattr(u, name, symbol)
-    stacked = ca.vertcat(*forces.values())
     f, h = plant.f(plant.t, x, u, p), plant.h(plant.t, x, u, p)
-    on_states = -ca.jacobian(ca.vertcat(*(ca.SX(f[name]) for name in plant.states)), stacked)
-    on_outputs = -ca.jacobian(ca.vertcat(*(ca.SX(h[name]) for name in plant.outputs)), stacked)
-    velocities = ca.vertcat(*(ca.SX(friction.velocity(x, p)) for friction in plant.friction.values()))
-    at_rest = [ca.substitute(block, plant.t, 0.0) for block in (on_states, on_outputs)]
-    blocks = [ca.densify(block) for block in (*at_rest, ca.jacobian(velocities, plant.x))]
+    return SeparatedFriction(
+        f=ca.vertcat(*(ca.SX(f[name]) for name in plant.states)),
+        h=ca.vertcat(*(ca.SX(h[name]) for name in plant.outputs)),
+        forces=ca.vertcat(*forces.values()),
+        velocities=ca.vertcat(*(ca.SX(friction.velocity(x, p)) for friction in plant.friction.values())),
+    )
+
+
+@memo
+def friction_matrices(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p) -> (effect of each friction force on f, on h; velocities' rows), at t = 0.
+
+    The effects are those of a force in the direction of its velocity, shapes (nx, p) and (ny, p); the rows are
+    derivatives of the velocities by the states, shape (p, nx).
+    """
+    equations = separate_friction(plant)
+    effects = [
+        -ca.jacobian(ca.substitute(block, plant.t, 0.0), equations.forces) for block in (equations.f, equations.h)
+    ]
+    blocks = [ca.densify(block) for block in (*effects, ca.jacobian(equations.velocities, plant.x))]
     return ca.Function("friction", [plant.x, plant.u, plant.p], blocks)

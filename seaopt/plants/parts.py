@@ -146,11 +146,15 @@ def spring_energy(parts: Sequence[str], compression: Any, p: Any) -> Any:
 
 
 def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
-    """Return Coulomb's and, with the part, Stribeck's friction at the screw, N."""
-    level = p.f_c
-    if "stribeck" in parts:
-        level = level + (p.f_s - p.f_c) * ca.exp(-((speed / p.v_st) ** 2))
-    return level * ca.tanh(speed / p.v_s)
+    """Return Coulomb's and, with the part, Stribeck's friction at the screw, N, smoothed through zero."""
+    return friction_level(parts, speed, p) * ca.tanh(speed / p.v_s)
+
+
+def friction_level(parts: Sequence[str], speed: Any, p: Any) -> Any:
+    """Return what dry friction is without its smoothing, N; at zero speed what holds the screw at rest."""
+    if "stribeck" not in parts:
+        return p.f_c
+    return p.f_c + (p.f_s - p.f_c) * ca.exp(-((speed / p.v_st) ** 2))
 
 
 def bound_friction_slopes(parts: Sequence[str], p: Any) -> tuple[Any, Any]:

@@ -105,6 +105,10 @@ class Friction:
         The effort at the spring that one unit of the force takes; 1 if left out.
     slopes : callable ``p -> (flattest, steepest)``, optional
         Bounds of the curve's slope over all velocities, negative where it falls; sampled if left out.
+    jump : callable ``(speed, p) -> expression``, optional
+        The curve without its smoothing, for speeds from zero up: what it is at zero is what holds the joint at rest.
+        A simulation in which the joint sticks, and stands still, takes it in the curve's place; a friction without one
+        is what its curve says.
 
     """
 
@@ -113,6 +117,7 @@ class Friction:
     unit: str = "N"
     effort: Expression = _one
     slopes: Callable[[Any], tuple[Any, Any]] | None = None
+    jump: Callable[[Any, Any], Any] | None = None
 
     @property
     def slope_unit(self) -> str:

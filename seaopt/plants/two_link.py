@@ -289,6 +289,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
                 force=lambda v, p: part_laws.dry_friction(build.parts, v, p),
                 unit="N",
                 slopes=lambda p: part_laws.bound_friction_slopes(build.parts, p),
+                jump=lambda speed, p: part_laws.friction_level(build.parts, speed, p),
             )
         },
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in build.parts else None,

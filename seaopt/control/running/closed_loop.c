@@ -2,7 +2,7 @@
 
    Built with constants and CasADi's functions in front (see seaopt/control/running/loop_kernel.py):
    seaopt_sample: (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y), sensor, law and delay at one sample;
-   seaopt_advance: (t, x, peak, u, p, h) -> (x+, peak+), one Runge-Kutta step. */
+   seaopt_advance: (t, x, peak, u, p, h) -> (x+, peak+), one integration step. */
 #include <math.h>
 #include <string.h>
 

@@ -14,6 +14,9 @@ a quantiser would turn any difference into a whole step, so that two whole runs 
 leaves what floats can hold has no error to look at: it is taken for the loop's doing, and not for that of steps too
 long for the plant, where half as long ones lose it in the same sample or the next, after states as large.
 
+With friction that sticks the steps are those of `seaopt.simulation.sticking`, whose error where a joint stops is of a
+lower order: the difference itself is the estimate, and the steps are halved until it is below `STICKING_RTOL`.
+
 Peaks are of every fine step, not of the samples alone: a mode at 160 Hz has six samples a period at 1 kHz, whose
 largest can be 13 % below the top.
 
@@ -38,14 +41,15 @@ from seaopt.errors import SimulationError, suggestion
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
-from seaopt.plants.plant import ENERGY
+from seaopt.plants.friction import SLIDING, friction_states
+from seaopt.plants.plant import ENERGY, Matrices
 from seaopt.records import record
 
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
 MAX_LOOP_SUBSTEPS = 512
 FASTEST_GUESSED = 1e6  # of a mode, radians a sample: beyond, the guess is the largest, and a power may overflow
-RTOL = 1e-6
+RTOL, STICKING_RTOL = 1e-6, 1e-4
 RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
 
 
@@ -116,7 +120,7 @@ def run_loop(
     external: Mapping[str, Float[np.ndarray, " n"]] | None = None,
     seed: int = 0,
     start_s: float = 0.0,
-    rtol: float = RTOL,
+    rtol: float | None = None,
 ) -> LoopRun:
     """Run a loop, once for each set of parameters.
 
@@ -136,7 +140,7 @@ def run_loop(
         Of the sensor noise, the same in every run: what differs between runs is the parameters.
     start_s : float
         Time of the first sample.
-    rtol : float
+    rtol : float, optional
         Of the integration, see the module's docstring.
 
     Returns
@@ -179,14 +183,18 @@ def run_loop(
     )
     if job.start.x.shape != (runs, len(loop.plant.states)):
         raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state per run")
-    substeps, before, wall_s = _first_guess(loop, values, rtol), None, 0.0
+    if rtol is None:
+        rtol = STICKING_RTOL if loop.sticks else RTOL
+    matrices = _linearise_at_rest(loop, values[0])
+    substeps, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
+    motion = _bound_motion(matrices, loop.law.sample_time_s)
     execute = make_kernel(loop)
     while True:
         begin = time.perf_counter()
         arrays = execute(job, substeps)
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
-        error = float(np.max(_errors(arrays)[kept], initial=0.0))
+        error = float(np.max(_errors(arrays, motion)[kept], initial=0.0)) / (1.0 if loop.sticks else 15.0)
         decided = bool(np.all(kept)) or (before is not None and bool(np.all(kept | _lose_alike(before, arrays))))
         if error <= rtol and decided:
             return _result(loop, job, arrays, error, substeps, wall_s)
@@ -201,15 +209,17 @@ def run_loop(
         substeps, before = 2 * substeps, arrays
 
 
-def _errors(arrays: LoopArrays) -> Float[np.ndarray, " runs"]:
-    """Return the largest error of a sample, over the state's largest value.
+def _errors(arrays: LoopArrays, motion: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " runs"]:
+    """Return the largest difference of two numbers of steps in a sample, over the state's largest value.
 
-    A state that rests has rounding for a value: it is measured by the largest of the others.
+    A state that rests, or that friction holds, has rounding for a value: it is measured by the largest of the others
+    and by `motion`, what an ampere would make of it in a sample without friction.
     """
-    size = np.maximum(arrays.size, RESTS * np.max(arrays.size, axis=1, keepdims=True))
-    scale = np.where(size > 0.0, size, 1.0)
+    free = motion * np.max(np.abs(arrays.applied), axis=1, keepdims=True, initial=0.0)
     with np.errstate(invalid="ignore"):
-        return np.nan_to_num(np.max(arrays.error / scale, axis=1) / 15.0, nan=np.inf)
+        size = np.maximum(arrays.size, RESTS * np.maximum(free, np.max(arrays.size, axis=1, keepdims=True)))
+        scale = np.where(size > 0.0, size, 1.0)
+        return np.nan_to_num(np.max(arrays.error / scale, axis=1), nan=np.inf)
 
 
 def _first_lost_sample(arrays: LoopArrays) -> Int[np.ndarray, " runs"]:
@@ -281,8 +291,22 @@ def _lags(loop: SampledLoop, params: Sequence[CompletedParameters]) -> dict[str,
     return {"lag": lag.reshape(len(params), -1), "late_s": late_s}
 
 
-def _first_guess(loop: SampledLoop, params: Sequence[CompletedParameters], rtol: float) -> int:
-    """Return half the steps that a mode of the first plant, at rest, needs: n (|s| T/n)^5 / 120 = rtol for the 2n."""
-    fastest = float(np.max(np.abs(np.linalg.eigvals(state_space(loop.plant, params[0])[0])), initial=0.0))
-    steps = min(fastest * loop.law.sample_time_s, FASTEST_GUESSED) ** 1.25 / (120.0 * rtol) ** 0.25
+def _linearise_at_rest(loop: SampledLoop, params: CompletedParameters) -> Matrices:
+    """Return (A, B, C, D) at rest, of the sliding plant where friction sticks by no slope."""
+    if not loop.sticks:
+        return state_space(loop.plant, params)
+    return state_space(friction_states(loop.plant)[SLIDING], params)
+
+
+def _first_guess(a: Float[np.ndarray, "nx nx"], period: float, rtol: float) -> int:
+    """Return half the steps that the fastest mode at rest needs: n (|s| T/n)^5 / 120 = rtol for the 2n."""
+    fastest = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
+    steps = min(fastest * period, FASTEST_GUESSED) ** 1.25 / (120.0 * rtol) ** 0.25
     return int(np.clip(math.ceil(0.5 * steps), 1, 64))
+
+
+def _bound_motion(matrices: Matrices, period: float) -> Float[np.ndarray, " nx"]:
+    """Return about how far the command moves each state in a sample, per unit: three terms of its Taylor series."""
+    a, b = matrices[0], matrices[1][:, 0]
+    terms = [np.abs(np.linalg.matrix_power(a, k) @ b) * period ** (k + 1) / math.factorial(k + 1) for k in range(3)]
+    return np.sum(terms, axis=0)

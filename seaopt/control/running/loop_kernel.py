@@ -1,6 +1,6 @@
 """Kernels of sampled loops, for `closed_loop`: two CasADi functions, run compiled or by CasADi's virtual machine.
 
-`seaopt_sample` is sensor, law and delay at one sample; `seaopt_advance` is one Runge-Kutta step of the plant.
+`seaopt_sample` is sensor, law and delay at one sample; `seaopt_advance` is one step of the plant.
 Parameters and the law's matrices are data, so that one compilation serves every draw and every controller of a
 structure. The two ways give the same numbers to rounding, of which a quantiser can make a step.
 """
@@ -20,7 +20,9 @@ from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
+from seaopt.simulation.integrator import runge_kutta_step
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
+from seaopt.simulation.sticking import sticking_output, sticking_step
 
 CHAINED_SAMPLES = 250  # samples that the virtual machine chains in one call
 MAX_EXPANDED_STEPS = 8  # coarse steps per sample up to which its operations are one flat list there
@@ -71,6 +73,7 @@ class _Structure:
     saturates: bool
     quantises: bool
     limits_current: bool
+    sticks: bool
 
 
 def _structure_of(loop: SampledLoop) -> _Structure:
@@ -78,7 +81,7 @@ def _structure_of(loop: SampledLoop) -> _Structure:
     return _Structure(
         measured=name, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
         saturates=sensors.saturation.get(name) is not None, quantises=bool(sensors.quantisation.get(name)),
-        limits_current=math.isfinite(loop.law.current_limit_A),
+        limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
     )  # fmt: skip
 
 
@@ -90,7 +93,7 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     n, queue = structure.law_states, structure.waiting
     z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
     e, c = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("c", n * n + 4 * n + 9)
-    observe = _observe(plant)
+    observe = _observe(plant, structure.sticks)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
     waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
@@ -133,8 +136,9 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
 
 
-def _observe(plant: Plant) -> Any:
-    rows = [plant.output] + ([plant.stored_energy()] if plant.energy is not None else [])
+def _observe(plant: Plant, sticks: bool) -> Any:
+    output = sticking_output(plant)(plant.t, plant.x, plant.u, plant.p) if sticks else plant.output
+    rows = [output] + ([plant.stored_energy()] if plant.energy is not None else [])
     return ca.Function("observe", [plant.t, plant.x, plant.u, plant.p], [ca.densify(ca.vertcat(*rows))])
 
 
@@ -142,26 +146,24 @@ def runge_kutta(plant: Plant) -> Any:
     """Return the CasADi function (t, x, u, p, h) -> x+: a step of Runge's and Kutta's fourth order, u held."""
     rate = ca.Function("rate", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
     t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
-    k1 = rate(t, x, u, p)
-    k2 = rate(t + h / 2, x + h / 2 * k1, u, p)
-    k3 = rate(t + h / 2, x + h / 2 * k2, u, p)
-    k4 = rate(t + h, x + h * k3, u, p)
-    return ca.Function("step", [t, x, u, p, h], [ca.densify(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))])
+    after = runge_kutta_step(lambda t, x: rate(t, x, u, p), t, x, h)
+    return ca.Function("step", [t, x, u, p, h], [ca.densify(after)])
 
 
-def _advance_function(plant: Plant) -> Any:
-    """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one Runge-Kutta step, and the largest |y|."""
+def _advance_function(plant: Plant, sticks: bool) -> Any:
+    """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one integration step, and the largest |y|."""
     t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
     peak = ca.SX.sym("peak", len(channel_names(plant)))
-    after = runge_kutta(plant)(t, x, u, p, h)
-    top = ca.fmax(peak, ca.fabs(_observe(plant)(t + h, after, u, p)))
+    step = sticking_step(plant) if sticks else runge_kutta(plant)
+    after = step(t, x, u, p, h)
+    top = ca.fmax(peak, ca.fabs(_observe(plant, sticks)(t + h, after, u, p)))
     return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
 
 
 @memo
 def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | None]:
     """Return the functions of one sample and of one step, and their library where there is a compiler."""
-    sample, advance = _sample_function(plant, structure), _advance_function(plant)
+    sample, advance = _sample_function(plant, structure), _advance_function(plant, structure.sticks)
     return sample, advance, load_kernel(_source(plant, structure, sample, advance), "seaopt_loops")
 
 

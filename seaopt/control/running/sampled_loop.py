@@ -15,6 +15,7 @@ from seaopt.errors import SimulationError, suggestion
 from seaopt.plants import Plant
 from seaopt.plants.plant import ENERGY
 from seaopt.records import record
+from seaopt.simulation.sticking import can_stick
 
 
 @record(eq=False)
@@ -37,11 +38,14 @@ class SampledLoop:
         What the current is rounded to; 0 for not at all. The largest is the last whole step within the law's limit.
     longest_delay_s : float
         The longest `delay_s` of any run's parameters: delay besides `delay_samples`, of any length.
+    sticks : bool
+        Dry friction jumps at rest, so that what sticks stands still (`seaopt.simulation.sticking`), in place of the
+        smoothed curve.
 
     Raises
     ------
     SimulationError
-        The plant has no such output, a number is out of range, or the loop is algebraic.
+        The plant has no such output, or no friction that sticks, a number is out of range, or the loop is algebraic.
 
     """
 
@@ -52,6 +56,7 @@ class SampledLoop:
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
     longest_delay_s: float = 0.0
+    sticks: bool = False
 
     def __post_init__(self) -> None:
         plant = self.plant
@@ -62,6 +67,10 @@ class SampledLoop:
             )
         if self.law.gate is not None:
             raise SimulationError("law has a plausibility gate, which this simulation leaves out; use close_loop")
+        if self.sticks and not can_stick(plant):
+            raise SimulationError(
+                f"sticks = True, but {plant.name} has no friction that jumps at rest; give its Friction a jump"
+            )
         for what in ("current_step_A", "longest_delay_s"):
             if not getattr(self, what) >= 0.0:
                 raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")

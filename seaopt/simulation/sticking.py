@@ -1,0 +1,147 @@
+r"""Simulation of dry friction that jumps at rest, so that what sticks stands still.
+
+A friction whose role declares its `jump` F is here the set-valued
+
+.. math:: \lambda \in F(|v|)\,\mathrm{Sgn}(v), \qquad \mathrm{Sgn}(0) = [-1, 1],
+
+in place of its smoothed curve. A step first slides on, with the sign that the velocity has, by Runge's and Kutta's
+method of order four. If the velocity changes its sign in it, the step goes to where a straight line between both
+velocities passes zero, and for the rest of it the force is the constant that leaves no velocity at its end: the joint
+sticks. Where that takes more than F(0), the force is F(0), and the joint is off in the other direction. To step with
+such a constant is Moreau's and Jean's method (Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical Systems,
+2008); here it decides no more than the rest of a step in which a joint stops.
+
+An output that contains accelerations contains the friction: at a joint that stands still the force that keeps it so.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+
+from seaopt.plants import Plant
+from seaopt.plants.friction import separate_friction
+from seaopt.plants.memo import memo
+from seaopt.simulation.integrator import runge_kutta_step
+
+LATEST_STOP = 0.999  # of a step: the rest of it has to tell which force stops the joint
+TINY = 1e-300  # beside a difference that may be zero
+STILL_S = 1e-13  # a velocity that friction alone takes away in this time is rounding
+SWEEPS = 30  # over the forces of several joints that stop at once
+
+
+def can_stick(plant: Plant) -> bool:
+    """Tell whether a plant has a friction that declares its jump."""
+    return any(friction.jump is not None for friction in plant.friction.values())
+
+
+@memo
+def sticking_step(plant: Plant) -> ca.Function:
+    """Return the CasADi function (t, x, u, p, h) -> x+ of one step with friction that jumps, u held."""
+    joints = _Joints(plant)
+    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    before = joints.speeds(x, p)
+    signs = ca.if_else(before >= 0.0, 1.0, -1.0)
+
+    def slide(t: Any, x: Any) -> Any:
+        return joints.rate(t, x, u, p, joints.slide(x, p, signs))
+
+    end = runge_kutta_step(slide, t, x, h)
+    after = joints.speeds(end, p)
+    stops = signs * after <= 0.0
+    shares = ca.if_else(stops, ca.fmin(ca.fabs(before) / (ca.fabs(before - after) + TINY), LATEST_STOP), 1.0)
+    share = ca.mmin(shares)
+    first = stops * (shares <= share)  # another joint that stops later in the step is found by the next one
+    middle, rest = runge_kutta_step(slide, t, x, share * h), (1.0 - share) * h
+
+    def hold(forces: Any) -> Any:
+        def rate(t: Any, x: Any) -> Any:
+            return joints.rate(t, x, u, p, ca.if_else(first, forces, joints.slide(x, p, signs)))
+
+        return runge_kutta_step(rate, t + share * h, middle, rest)
+
+    levels = joints.levels(p)
+    free, pushed = hold(0.0 * levels), [hold(force) for force in joints.units(p)]
+    speeds = joints.speeds(free, p)
+    effects = ca.horzcat(*(speeds - joints.speeds(each, p) for each in pushed))
+    forces = _find_holding(speeds, effects, first, ca.if_else(levels > 0.0, 1.0, 0.0))
+    stopped = free + ca.mtimes(ca.horzcat(*(each - free for each in pushed)), forces)
+    return ca.Function("step", [t, x, u, p, h], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
+
+
+@memo
+def sticking_output(plant: Plant) -> ca.Function:
+    """Return the CasADi function (t, x, u, p) -> y of a plant with friction that jumps."""
+    joints = _Joints(plant)
+    t, x, u, p = plant.t, plant.x, plant.u, plant.p
+    speeds, levels = joints.speeds(x, p), joints.levels(p)
+    slide = joints.slide(x, p, ca.if_else(speeds >= 0.0, 1.0, -1.0))
+    push = joints.accelerate(t, x, u, p, 0.0 * levels)
+    effects = ca.horzcat(*(push - joints.accelerate(t, x, u, p, force) for force in joints.units(p)))
+    still = ca.fabs(speeds) <= STILL_S * ca.fabs(ca.diag(effects))
+    free = joints.accelerate(t, x, u, p, ca.if_else(still, 0.0, slide))
+    limits = ca.if_else(levels > 0.0, 1.0, 0.0)
+    holding = _find_holding(free, effects, still, limits) * ca.if_else(levels > 0.0, levels, 1.0)
+    y = joints.read(t, x, u, p, ca.if_else(still, holding, slide))
+    return ca.Function("output", [t, x, u, p], [ca.densify(y)])
+
+
+class _Joints:
+    """The frictions of a plant that declare their jump, and its equations with their forces as an argument."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.jumps = [friction.jump for friction in plant.friction.values() if friction.jump is not None]
+        equations, parameters = separate_friction(plant), self._attributes(plant.p)
+        chosen: list[Any] = []
+        velocities: list[Any] = []
+        forces, every = ca.vertsplit(equations.forces), ca.vertsplit(equations.velocities)
+        f, h = equations.f, equations.h
+        for force, velocity, friction in zip(forces, every, plant.friction.values(), strict=True):
+            if friction.jump is not None:
+                chosen.append(force)
+                velocities.append(velocity)
+            else:  # its curve is all there is
+                curve = friction.force(velocity, parameters)
+                f, h = ca.substitute(f, force, curve), ca.substitute(h, force, curve)
+        state, arguments = [plant.x, plant.p], [plant.t, plant.x, plant.u, plant.p, ca.vertcat(*chosen)]
+        speeds = ca.vertcat(*velocities)
+        self.speeds = ca.Function("speeds", state, [speeds])
+        self.rate = ca.Function("rate", arguments, [f])
+        self.read = ca.Function("read", arguments, [h])
+        self.accelerate = ca.Function("accelerate", arguments, [ca.jtimes(speeds, plant.x, f)])
+
+    def slide(self, x: Any, p: Any, signs: Any) -> Any:
+        """Return the forces of joints that slide in the directions `signs`."""
+        speeds, values = ca.vertsplit(ca.fmax(signs * self.speeds(x, p), 0.0)), self._attributes(p)
+        return signs * ca.vertcat(*(jump(speed, values) for jump, speed in zip(self.jumps, speeds, strict=True)))
+
+    def levels(self, p: Any) -> Any:
+        """Return what holds each joint at rest."""
+        return ca.vertcat(*(ca.SX(jump(0.0, self._attributes(p))) for jump in self.jumps))
+
+    def units(self, p: Any) -> list[Any]:
+        """Return the forces of which each pushes one joint, by its level or, where that is zero, by one."""
+        levels = self.levels(p)
+        return ca.horzsplit(ca.diag(ca.if_else(levels > 0.0, levels, 1.0)))
+
+    def _attributes(self, p: Any) -> SimpleNamespace:
+        return SimpleNamespace(**dict(zip(self.plant.parameters, ca.vertsplit(p), strict=True)))
+
+
+def _find_holding(speeds: Any, effects: Any, held: Any, limits: Any) -> Any:
+    """Return the forces (in their units) that stop the joints in `held`, or their limits; the others' are zero.
+
+    `speeds` are those without them, `effects` [i, j] what a unit of force j takes from speed i. Of several joints each
+    is solved in turn, by Gauss' and Seidel's projected sweeps.
+    """
+    count = speeds.numel()
+    forces: list[Any] = [ca.SX(0.0)] * count
+    for _ in range(SWEEPS if count > 1 else 1):
+        for i in range(count):
+            left = speeds[i] - sum(effects[i, j] * forces[j] for j in range(count) if j != i)
+            own = ca.if_else(held[i], effects[i, i], 1.0)
+            forces[i] = ca.if_else(held[i], ca.fmin(ca.fmax(left / own, -limits[i]), limits[i]), 0.0)
+    return ca.vertcat(*forces)
