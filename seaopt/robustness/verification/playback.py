@@ -49,8 +49,8 @@ class Stage:
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
 
-    def loop(self, held: bool, longest_delay_s: float = 0.0) -> SampledLoop:
-        """Return the loop with the link held or not."""
+    def loop(self, held: bool, longest_delay_s: float = 0.0, *, sticks: bool = False) -> SampledLoop:
+        """Return the loop with the link held or not, with friction as its curve says or one that sticks."""
         plant = self.partner if held else self.plant
         if plant is None:
             raise ControlError(
@@ -64,6 +64,7 @@ class Stage:
             sensors=self.sensors,
             current_step_A=self.current_step_A,
             longest_delay_s=longest_delay_s,
+            sticks=sticks,
         )
 
     @property
@@ -197,7 +198,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             link = _port(stage.plant).motion or ""
             blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
-        loop = stage.loop(phase.held, longest)
+        loop = stage.loop(phase.held, longest, sticks=scenario.friction == "sticking")
         reference = offset + _build_reference(phase, loop.law.sample_time_s, np.random.default_rng([seed, number]))
         run = run_loop(loop, values, reference, start=now, seed=seed + 7919 * number, start_s=begin_s)
         now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import field
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
+from seaopt.simulation.sticking import can_stick
 
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
@@ -27,8 +28,10 @@ STEP_SHARES = (0.02, 0.1, 0.5)  # of the force that the current limit can hold a
 LEAST_STEP = 1e-4  # of the force that the current limit can hold at rest: a smaller one is of a run that diverges
 UNSATURATED = 0.9  # of the step that just reaches the current limit
 FRICTION_STEPS = (0.2, 1.0, 5.0, 25.0)  # times the dry friction, where there is no limit
+STUCK_STEP = 0.1  # times the dry friction: of smaller steps the response, once friction lets go, is the same
 PEAK_GRACE = 1.1  # of the reference peak allowed, for the overshoot of a step
 SETTLING_PERIODS = 40.0  # of the bandwidth, until a step is within `SETTLED`
+WAITING_PERIODS = 20.0  # of the bandwidth, until friction that sticks lets go of a step of its own size
 SETTLED = 0.1  # of a step: how far the force may be off once it has settled
 SWINGS = 3.3  # periods of the loop's slowest oscillation that a last phase lasts
 LONGEST_S = 20.0
@@ -104,6 +107,9 @@ class Scenario:
         Values that an output must cross, which shows that the scenario happened.
     on : {"any", "held", "free"}
         Plants that it applies to: every one, those without a link that moves at a port, or those with one.
+    friction : {"smooth", "sticking"}
+        How dry friction is simulated: as its smoothed curve, or as one that jumps at rest, so that what sticks stands
+        still (`seaopt.simulation.sticking`).
 
     """
 
@@ -119,12 +125,17 @@ class Scenario:
     max_angle_rad: float | None = None
     passes: Mapping[str, float] = field(default_factory=dict[str, float])
     on: str = "any"
+    friction: str = "smooth"
 
     def __post_init__(self) -> None:
         if not self.phases:
             raise ControlError(f'scenario "{self.name}" has no phases; give at least one')
         if self.on not in ("any", "held", "free"):
             raise ControlError(f'scenario "{self.name}": on = "{self.on}" is not known; use "any", "held" or "free"')
+        if self.friction not in ("smooth", "sticking"):
+            raise ControlError(
+                f'scenario "{self.name}": friction = "{self.friction}" is not known; use "smooth" or "sticking"'
+            )
 
     @property
     def size(self) -> str:
@@ -152,6 +163,8 @@ class Scenario:
             return f"it applies to plants whose link is {self.on}"
         if any(phase.held for phase in self.phases) and partner is None:
             return "there is no plant with the same actuator and its link fixed"
+        if self.friction == "sticking" and not can_stick(plant):
+            return "the plant has no friction that jumps at rest"
         for name in (name for phase in self.phases for name in phase.scale):
             if name not in plant.parameters:
                 return f"the plant has no parameter {name}"
@@ -168,7 +181,9 @@ def _struck(plant: Plant) -> str | None:
     return plant.port.motion if plant.port is not None else None
 
 
-def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]:
+def default_scenarios(
+    controller: Controller, plant: Plant, sets: Sequence[ParameterSet] = ()
+) -> tuple[Scenario, ...]:  # fmt: skip
     """Return the scenarios for a plant, sized by the controller's own limits.
 
     Forces are multiples of two: that of the step that just reaches the current limit (at its first samples, where the
@@ -181,6 +196,8 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
         A controller that knows its design plant.
     plant : Plant
         The plant to verify it on.
+    sets : sequence of ParameterSet
+        As in `step_scenarios`.
 
     Raises
     ------
@@ -200,7 +217,7 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     band = controller.spec.bandwidth_hz
     small = 0.5 * step if step is not None else NOMINAL_FORCE_N
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
-    scenarios = list(step_scenarios(controller, plant))
+    scenarios = list(step_scenarios(controller, plant, sets))
     if step is not None and rest is not None:
         scenarios += [_doublet(4.0 * step, 1.5 / band, tail), _hold(rest, lasting, tail)]
     scenarios.append(_chirp(controller, small, tail))
@@ -215,7 +232,7 @@ def default_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, .
     return tuple(scenario for scenario in scenarios if scenario.obstacle(plant, plant) is None)
 
 
-def step_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]:
+def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[ParameterSet] = ()) -> tuple[Scenario, ...]:
     """Return the steps by which a plant is judged as its user sees it: small, middling and large.
 
     With a current limit they are 2, 10 and 50 % of the force that it can hold at rest, and the largest step that does
@@ -224,28 +241,70 @@ def step_scenarios(controller: Controller, plant: Plant) -> tuple[Scenario, ...]
     its reference; a moving link gives way, so that there the force goes back to zero and only what every scenario
     requires is required.
 
+    Dry friction that can stick is simulated in both ways: each step comes again with friction that sticks, and a step
+    of a tenth of the friction besides, in which the integral has to grow until friction lets go. The time to settle is
+    then longer, by `WAITING_PERIODS` for each time that the friction is the step, and the force may end a tenth off.
+
+    Parameters
+    ----------
+    controller : Controller
+        A controller that knows its design plant.
+    plant : Plant
+        The plant to verify it on.
+    sets : sequence of ParameterSet
+        The parameters that are played, nominal first; the design's if left out.
+
     Raises
     ------
     ControlError
         The controller does not know its design plant.
 
     """
-    spec = controller.spec
-    tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / spec.bandwidth_hz)
-    peak = spec.allowed(BY_NAME["max_reference_peak"])
-    steps: list[Scenario] = []
-    for name, force in _size_steps(controller).items():
-        if plant.moves:
-            phases = (Phase(duration_s=lasting, force_N=force), Phase(duration_s=tail))
-            steps.append(Scenario(name=name, phases=phases))
-            continue
-        settling_s = SETTLING_PERIODS / spec.bandwidth_hz
-        phases = (Phase(duration_s=lasting), Phase(duration_s=max(tail, 2.0 * settling_s), force_N=force))
-        steps.append(Scenario(
-            name=name, phases=phases, final_error=0.02 * force, settling_s=settling_s,
-            max_overshoot=PEAK_GRACE * peak if peak else None,
-        ))  # fmt: skip
+    sizes, stuck = _size_steps(controller), _find_sticking_friction(plant, sets or (_require_design(controller)[1],))
+    tail = _size_last_phase(controller, plant)
+    steps = [_step(controller, plant, name, force, tail) for name, force in sizes.items()]
+    if stuck:
+        steps += [_stick(controller, step, stuck) for step in steps]
+        if not plant.moves:
+            small = _step(controller, plant, f"step of {STUCK_STEP:g} times the friction", STUCK_STEP * stuck, tail)
+            steps.append(_stick(controller, small, stuck))
     return tuple(steps)
+
+
+def _find_sticking_friction(plant: Plant, sets: Sequence[ParameterSet]) -> float:
+    """Return the dry friction (N) of the first set that has any, where it can stick; 0 for none."""
+    if not can_stick(plant):
+        return 0.0
+    levels = (sum(find_dry_friction(plant, plant.complete(each)).values()) for each in sets)
+    return next((level for level in levels if level > 0.0), 0.0)
+
+
+def _step(controller: Controller, plant: Plant, name: str, force: float, tail: float) -> Scenario:
+    spec = controller.spec
+    lasting = max(0.2, 6.0 / spec.bandwidth_hz)
+    if plant.moves:
+        return Scenario(name=name, phases=(Phase(duration_s=lasting, force_N=force), Phase(duration_s=tail)))
+    settling_s, peak = SETTLING_PERIODS / spec.bandwidth_hz, spec.allowed(BY_NAME["max_reference_peak"])
+    return Scenario(
+        name=name,
+        phases=(Phase(duration_s=lasting), Phase(duration_s=max(tail, 2.0 * settling_s), force_N=force)),
+        final_error=0.02 * force,
+        settling_s=settling_s,
+        max_overshoot=PEAK_GRACE * peak if peak else None,
+    )
+
+
+def _stick(controller: Controller, step: Scenario, friction: float) -> Scenario:
+    """Return a step with friction that sticks."""
+    sticking = replace(step, name=f"{step.name}, sticking", friction="sticking")
+    if step.settling_s is None:
+        return sticking
+    force = step.phases[-1].force_N
+    settling_s = step.settling_s + WAITING_PERIODS / controller.spec.bandwidth_hz * friction / force
+    last = replace(step.phases[-1], duration_s=max(step.phases[-1].duration_s, 1.25 * settling_s))
+    return replace(
+        sticking, phases=(*step.phases[:-1], last), settling_s=settling_s, final_error=SETTLED * force
+    )  # fmt: skip
 
 
 def _size_steps(controller: Controller) -> dict[str, float]:

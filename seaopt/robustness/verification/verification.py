@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller
-from seaopt.errors import ControlError, suggestion
+from seaopt.errors import ControlError, SimulationError, suggestion
 from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -19,6 +19,7 @@ from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out
+from seaopt.simulation.sticking import can_stick
 
 
 @record(eq=False)
@@ -171,7 +172,7 @@ def verify(
     plants: Mapping[str, Plant],
     parameters: ParameterSet,
     *,
-    scenarios: Sequence[Scenario] | Callable[[Controller, Plant], Sequence[Scenario]] | None = None,
+    scenarios: Sequence[Scenario] | Callable[..., Sequence[Scenario]] | None = None,
     draws: Mapping[str, Sequence[ParameterSet]] | None = None,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
@@ -189,9 +190,9 @@ def verify(
         Plants to simulate it on.
     parameters : ParameterSet
         Nominal values; parameters that are left out have the plants' defaults.
-    scenarios : sequence of Scenario, or callable (controller, plant) -> sequence of Scenario, optional
-        The same for every plant, or what the callable returns, such as `step_scenarios`; `default_scenarios` of each if
-        left out.
+    scenarios : sequence of Scenario, or callable (controller, plant, sets) -> sequence of Scenario, optional
+        The same for every plant, or what the callable returns for a plant and the sets of parameters that it is played
+        with, such as `step_scenarios`; `default_scenarios` of each if left out.
     draws : mapping of plant name to sequence of ParameterSet, optional
         Simulated besides the nominal values, such as a certificate's worst draws; conditions among them (phi, delay_s)
         set where those runs start, and how late the loop is (`seaopt.robustness.verification.playback.play`).
@@ -245,7 +246,7 @@ def verify(
     speeds: dict[str, float] = {}
     error = 0.0
     for name, stage in stages.items():
-        chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant))
+        chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant, sets[name]))
         obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
         played[name] = tuple(scenario for scenario, obstacle in obstacles if obstacle is None)
         if scenarios is None:
@@ -258,11 +259,11 @@ def verify(
             if before:
                 rows, error = rows + before, max(error, known.error if known is not None else 0.0)
                 continue
-            trace = play(stage, scenario, sets[name], seed=seed)
-            ideal = trace if stage.is_ideal else play(stage.ideal, scenario, sets[name], seed=seed)
+            trace = _play(stage, scenario, sets[name], seed)
+            ideal = trace if stage.is_ideal else _play(stage.ideal, scenario, sets[name], seed)
             unlimited = None
             if overshoots_at_limit(stage, scenario, ideal):
-                unlimited = play(stage.ideal.unlimited, scenario, sets[name], seed=seed)
+                unlimited = _play(stage.ideal.unlimited, scenario, sets[name], seed)
             rows += [
                 judge_run(stage, name, scenario, trace, k, sets[name], ideal, unlimited) for k in range(len(sets[name]))
             ]
@@ -278,6 +279,16 @@ def verify(
             for name, plant in plants.items()
         },
     )  # fmt: skip
+
+
+def _play(stage: Stage, scenario: Scenario, sets: Sequence[ParameterSet], seed: int) -> Playback:
+    """Play a scenario; where friction is too sharp for the steps of its smoothed curve, with friction that sticks."""
+    try:
+        return play(stage, scenario, sets, seed=seed)
+    except SimulationError:
+        if scenario.friction == "sticking" or not can_stick(stage.plant):
+            raise
+    return play(stage, replace(scenario, friction="sticking"), sets, seed=seed)
 
 
 def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:
