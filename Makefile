@@ -5,6 +5,8 @@ READY  := $(VENV)/.ready
 CACHE  := $(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(CACHE)/matplotlib
 export SEAOPT_CACHE_DIR := $(CURDIR)/$(CACHE)
+# Where bytecode is not kept, every process of the tests compiles all of seaopt again: as long as it takes to collect them.
+unexport PYTHONDONTWRITEBYTECODE
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 

@@ -187,7 +187,8 @@ def test_simulate_writes_csv(folder, seaopt):
 
 
 def test_a_requirement_not_met_exits_1(copied, seaopt, short):
-    (copied / "hard.toml").write_text(short.replace("max_noise_gain = 25", "max_noise_gain = 3"), encoding="utf-8")
+    hard = short.replace("max_noise_gain = 25", "max_noise_gain = 3\nbandwidth_range_hz = [28, 32]")
+    (copied / "hard.toml").write_text(hard, encoding="utf-8")
     (copied / "all" / "controller.json").unlink()
     out = seaopt("tune", "hard.toml", "-o", "all")
     assert out.returncode == 1
