@@ -14,14 +14,16 @@ closed-loop poles are outside the circle: Nyquist's count, :math:`s_j = 1` where
 where it rises. One eigenvalue problem for every r, of the loop without w, is enough for any number of samples.
 
 Between neighbouring r a term can step and another step back: an unstable window narrower than the grid. Every crossover
-is therefore followed from r to r, and wherever one of the terms steps the delay at which it does is bisected. Where
-crossovers come or go from one r to the next, the grid is halved.
+is therefore followed from r to r, and wherever one of the terms steps the delay at which it does is solved for: what
+is under the floor is smooth. Where crossovers come or go from one r to the next, the grid is halved.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -38,6 +40,7 @@ from seaopt.records import record
 CELLS = 16  # of a sample
 NARROWEST_CELL = 1e-4  # of a sample: a crossover that comes and goes within less is not looked for
 DELAY_BISECTIONS = 40
+PART_TOLERANCE = 1e-13  # of a sample
 LONGEST_DELAY = 20_000  # samples: beyond, a delay is no longer one of the loop that was modelled
 FULL_TURN = 2.0 * np.pi
 
@@ -79,9 +82,13 @@ class _DelayedLoop:
         """Return the number of closed-loop poles outside the circle with so many further samples."""
         return self.outside + 2 * (self.count_passes(samples, self.phases) + 1) @ self.falling + samples * self.loud
 
+    def turn(self, samples: Int[np.ndarray, " w"], phases: Float[np.ndarray, " k"]) -> Float[np.ndarray, "w k"]:
+        """Return by how many turns each crossover is beyond -1."""
+        return (samples[:, None] * self.angles - phases) / FULL_TURN
+
     def count_passes(self, samples: Int[np.ndarray, " w"], phases: Float[np.ndarray, " k"]) -> Int[np.ndarray, "w k"]:
         """Return how often each crossover has passed -1."""
-        return np.floor((samples[:, None] * self.angles - phases) / FULL_TURN).astype(int)
+        return np.floor(self.turn(samples, phases)).astype(int)
 
     def follow_phases(self, start: _DelayedLoop) -> Float[np.ndarray, " k"]:
         """Return the phases continued from those of another loop, by less than half a turn."""
@@ -117,6 +124,7 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     sliding, effort = take_sliding(plant, params), controller.command.per_effort
     linear, before = linearise_sets(sliding, [sliding.complete(params)], controller.spec.measured, effort)
 
+    @cache
     def delay_loop(part: float) -> _DelayedLoop:
         (sampled,) = sample_linear(linear, before + part * period, period, controller.delay_samples)
         return _measure_delayed(Loop(plant=sampled, law=controller.law), part)
@@ -171,6 +179,8 @@ def _find_first(
     delay_loop: Callable[[float], _DelayedLoop], low: _DelayedLoop, high: _DelayedLoop, w: int
 ) -> float | None:
     """Return where between two neighbours the loop with w further samples becomes unstable; None if it does not."""
+    from scipy.optimize import brentq
+
     samples = np.array([w])
     if low.count_unstable(samples)[0]:
         return low.part
@@ -187,11 +197,18 @@ def _find_first(
         before = low.count_passes(samples, low.phases)[0]
         after = high.count_passes(samples, high.follow_phases(low))[0]
 
-        def has_passed(loop: _DelayedLoop, j: int) -> bool:
-            return loop.matches(low) and bool(loop.count_passes(samples, loop.follow_phases(low))[0, j] != before[j])
+        def find_pass(j: int) -> float:
+            level = before[j] + (after[j] > before[j])
+            nearest = low.turn(samples, low.phases)[0, j] - level
 
-        ends = [bisect(lambda loop, j=j: has_passed(loop, j)) for j in map(int, np.flatnonzero(before != after))]
-        ends = [*sorted(ends), high.part]
+            def beyond(part: float) -> float:
+                loop = delay_loop(part)  # one with other crossovers counts as not beyond
+                return loop.turn(samples, loop.follow_phases(low))[0, j] - level if loop.matches(low) else nearest
+
+            part: Any = brentq(beyond, low.part, high.part, xtol=PART_TOLERANCE)
+            return float(part)
+
+        ends = [*sorted(map(find_pass, map(int, np.flatnonzero(before != after)))), high.part]
     for end, following in pairwise(ends):
         if delay_loop(0.5 * (end + following)).count_unstable(samples)[0]:
             return end
