@@ -17,7 +17,7 @@ from bench_tune_friction import ISSUE, LEAST_RATE, Case, Judge
 from scipy.optimize import differential_evolution
 
 import seaopt as so
-from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.laws.friction_margin import find_friction_margin
 
 ALIASES = np.arange(-150, 151)
 MULTIPLIERS = {
@@ -98,7 +98,7 @@ def main() -> None:
     for asked in (None, 1e7):
         started = time.process_time()
         controller = so.tune(plant, params, replace(case.spec, min_friction_margin=asked))
-        margin = prove_friction(controller, plant, params)
+        margin = find_friction_margin(controller, plant, params)
         print(
             f"asked {asked}: {margin.least_slope:.4g} N s/m by {margin.multiplier}, "
             f"{time.process_time() - started:.1f} s {controller.explanation}"

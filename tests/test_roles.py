@@ -13,7 +13,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import MPCSpec, command_of, export, force_mpc, passivity
-from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.loops.loop import LoopFigures
 from seaopt.errors import ControlError, PlantError
 from seaopt.plants import Actuation, Friction, Port, Sensing, wrapped
@@ -132,7 +132,7 @@ def test_a_friction_margin_has_the_unit_of_the_plants_friction(pair):
     shown = []
     for (controller, plant, _, params), f_c in zip(pair, ("f_c", WORDS["f_c"]), strict=True):
         rubbing = params.update(**{f_c: 20.0})
-        margin = prove_friction(controller, plant, rubbing)
+        margin = find_friction_margin(controller, plant, rubbing)
         shown += [repr(replace(controller, design=(plant, rubbing), friction=margin))]
     built_in, strange = (re.search(r"friction margin (\S+) (N.*?)(?=[:(])", text).groups() for text in shown)
     assert built_in == (strange[0], "N s/m") and strange[1] == "N m s/rad"

@@ -42,6 +42,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
 from seaopt.records import record
 
+FRICTION_MARGIN = "friction_margin"  # among what controller.json says is achieved
 CONTROLLER_SCHEMA = "seaopt/controller/2"
 GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_r": "N/N", "c": "", "T_q": "s"}
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
@@ -120,7 +121,7 @@ class Controller:
         Filter and integral are those of the gains where they make the law; of another law they are read off the law.
         """
         gains, law, ts = self.gains, self.law, self.sample_time_s
-        if set(LAW_GAINS) <= set(gains) and Gains.from_names(gains, self.observer).make(law, self.spec.structure):
+        if set(LAW_GAINS) <= set(gains) and Gains.from_names(gains, self.observer).makes(law, self.spec.structure):
             filter_samples = gains["T_f"] / ts if gains["k_d"] else np.inf
             integral = gains["k_i"] / (1.0 + gains["k_p"]) if self.structure != "pd" and gains["k_i"] else np.inf
         else:
@@ -246,7 +247,8 @@ class Controller:
             "measurement": {"num": measurement.num, "den": measurement.den},
             "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
             "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
-            "achieved": _list_achieved(self.achieved, self.friction),
+            "achieved": _list_achieved(self.achieved)
+            | {FRICTION_MARGIN: None if self.friction is None else self.friction.least_slope},
             "feasible": self.feasible,
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
@@ -284,7 +286,8 @@ class Controller:
             A field is missing or malformed, or one contradicts the law: gains, reference, measurement, achieved.
 
         """
-        from seaopt.control.laws.stored import check_achieved, read_controller  # deferred: pydantic
+        # Deferred, as pydantic takes long to import.
+        from seaopt.control.laws.stored import check_achieved, check_friction_margin, read_controller
 
         stored = read_controller(content)
         gain, spec = stored["command"].per_effort, stored["spec"]
@@ -295,7 +298,8 @@ class Controller:
             plant, [params], spec.measured, gain, stored["delay_samples"], stored["law"]
         )  # fmt: skip
         friction = None if loop is None else friction_margin(loop)
-        check_achieved(content.get("achieved"), _list_achieved(achieved, friction))
+        check_achieved(content.get("achieved"), _list_achieved(achieved))
+        check_friction_margin(content["achieved"].get(FRICTION_MARGIN), friction)
         controller = cls(**stored, achieved=achieved, design=(plant, params), friction=friction)
         loops = [
             controller.measure(f"design plant{name}", figures) for name, figures in controller._measure_states().items()
@@ -412,11 +416,10 @@ def _format_allowed(row: DesignFigure) -> str:
     return f"{sense}{row.allowed:g} {row.unit}".rstrip()
 
 
-def _list_achieved(figures: LoopFigures, friction: FrictionMargin | None) -> dict[str, Any]:
-    """Return the figures that controller.json states."""
+def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
+    """Return the figures of the loop that controller.json states."""
     values = {field.name: getattr(figures, field.name) for field in fields(LoopFigures)}
-    values = {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
-    return values | {"friction_margin": None if friction is None else friction.least_slope}
+    return {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
 
 
 def count_filter_samples(law: Law) -> float:

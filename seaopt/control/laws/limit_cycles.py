@@ -1,4 +1,4 @@
-r"""Limit cycles of dry friction, predicted by its describing function, where stability is not proved.
+r"""Limit cycles of dry friction, predicted by its describing function, where stability is not shown.
 
 Friction is what its curve :math:`\varphi` has above its flattest slope (the rest is in the plant). A velocity
 :math:`V \sin \omega t` meets a force whose fundamental is :math:`N(V) V \sin \omega t`,
@@ -24,7 +24,7 @@ from jaxtyping import Complex, Float
 from scipy.optimize import brentq
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.friction_proof import take_friction_out
+from seaopt.control.laws.friction_margin import take_friction_out
 from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -70,9 +70,9 @@ def describe_friction(
     Examples
     --------
     >>> import seaopt as so
-    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=1e-4)
+    >>> stand, params = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0, v_s=1e-4)
     >>> v = np.array([1e-6, 0.1])
-    >>> n = describe_friction(stand, rubbing, "F_f", v)
+    >>> n = describe_friction(stand, params, "F_f", v)
     >>> n.round(0), 4 * 50 / (np.pi * 0.1)  # stuck f_c/v_s; sliding like Coulomb's 4 f_c/(pi V)
     (array([499988.,    637.]), 636.6197723675814)
 

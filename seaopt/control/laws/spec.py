@@ -56,7 +56,7 @@ class ControllerSpec:
     min_filter_samples : float, optional
         T_f in samples.
     min_friction_margin : float, optional
-        Steepest friction, N s/m (N m s/rad), for which stability is to be proved on every plant that has friction
+        Steepest friction, N s/m (N m s/rad), for which stability is to be shown on every plant that has friction
         (`seaopt.control.loops.absolute_stability`).
     min_sensitivity_bandwidth_hz : float, optional
         abs(S) stays below -3 dB up to here on the design plant; bandwidth_hz/5 if left out.

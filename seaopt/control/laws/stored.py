@@ -12,6 +12,7 @@ from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import AGREES, COMPARED, LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
 from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
@@ -223,7 +224,7 @@ def _check_gains(
         observer is not None and gains["T_q"] != observer.T_q
     ):
         raise _contradict("observer", "is not that of structure and gains")
-    if not Gains.from_names(gains, observer).make(law, spec.structure):
+    if not Gains.from_names(gains, observer).makes(law, spec.structure):
         raise _contradict("law", "is not what gains, observer and spec give")
 
 
@@ -259,14 +260,30 @@ def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
             raise _contradict(f"achieved.{name}", f"is {value!r}, and the law has {figure!r} on the design plant")
 
 
-def _agree(stated: Any, figure: Any) -> bool:
+def check_friction_margin(stated: Any, margin: FrictionMargin | None) -> None:
+    """Refuse a friction margin that the law does not have; a file that states none claims none.
+
+    Raises
+    ------
+    FileError
+        It is another than the margin found, which is known to `MARGIN_PRECISION`; without friction any one holds.
+
+    """
+    if stated is None or margin is None:
+        return
+    if not _agree(stated, margin.least_slope, 2.0 * MARGIN_PRECISION):
+        found = f"{margin.least_slope:.6g}"
+        raise _contradict("achieved.friction_margin", f"is {stated!r}, and the law has {found} on the design plant")
+
+
+def _agree(stated: Any, figure: Any, tolerance: float = FIGURES_AGREE) -> bool:
     """Tell whether a figure is as stated; what is not finite stands in JSON as nothing."""
     try:
         one, other = (np.array(np.nan if value is None else value, dtype=float) for value in (stated, figure))
     except (TypeError, ValueError):
         return False
     one, other = (np.where(np.isfinite(values), values, np.nan) for values in (one, other))
-    return one.shape == other.shape and np.allclose(one, other, rtol=FIGURES_AGREE, atol=0.0, equal_nan=True)
+    return one.shape == other.shape and np.allclose(one, other, rtol=tolerance, atol=0.0, equal_nan=True)
 
 
 def _contradict(name: str, what: str) -> FileError:

@@ -257,7 +257,7 @@ class Gains:
             notch = Notch(**{field.name: numbers[f"notch_{field.name}"] for field in fields(Notch)})
         return cls(**{name: numbers[name] for name in LAW_GAINS}, observer=observer, notch=notch)
 
-    def make(self, law: Law, structure: Structure) -> bool:
+    def makes(self, law: Law, structure: Structure) -> bool:
         """Tell whether these gains make a law: its responses, to a millionth, and its integrators."""
         made, f = self.law(structure, law.sample_time_s), COMPARED / law.sample_time_s
         expected = made.responses(f)

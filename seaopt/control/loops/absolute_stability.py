@@ -29,7 +29,8 @@ Appl. 1, 1968). The sums converge like :math:`1/k^2`; what is beyond the last al
 counted against the test.
 
 The largest :math:`\kappa` for which the test holds, at the same proportion for every friction, is the *friction
-margin*; divided by the curve's own steepest slope it is a factor, above 1 where stability is proved.
+margin*; divided by the curve's own steepest slope it is a factor, above 1 where stability is shown: by a test at
+several hundred angles, between which nothing is enclosed.
 """
 
 from __future__ import annotations
@@ -99,13 +100,13 @@ class FrictionMargin:
     linearised: bool = False
 
     @property
-    def proved(self) -> bool:
+    def shown(self) -> bool:
         """Whether the test of stability holds, at every angle looked at, for the curves as they are."""
         return self.factor >= 1.0
 
     @property
     def least_slope(self) -> float:
-        """The least of the slopes that are proved, N s/m (N m s/rad), of what is not viscous."""
+        """The least of the slopes for which stability is shown, N s/m (N m s/rad), of what is not viscous."""
         return min((slope for slope in self.slopes if slope > 0.0), default=0.0)
 
     def describe(self) -> str:
@@ -113,7 +114,7 @@ class FrictionMargin:
         if not self.factor:
             return f"stability between sliding and stuck is not shown ({self.multiplier})"
         steep = "however steep" if np.isinf(self.factor) else f"up to {self.factor:.3g} times as steep as its own"
-        missing = "" if self.proved else "; for its own it is not"
+        missing = "" if self.shown else "; for its own it is not"
         where = f"by a test at {self.angles} angles, between the samples too"
         where += ", linearised at rest" if self.linearised else ""
         return f"stability is shown for every curve {steep}, {where}{missing}"
@@ -134,7 +135,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
     loop : FrictionLoop
         The loop with its friction taken out.
     first : str, optional
-        The name of a multiplier that is tried first, and alone where it proves stability for the curves as they are.
+        The name of a multiplier that is tried first, and alone where it shows stability for the curves as they are.
     least : float
         A smaller factor is not looked for, which is quicker: the margin is then zero.
 
@@ -163,7 +164,7 @@ def friction_margin(loop: FrictionLoop, first: str = "", least: float = 0.0) -> 
             frequency_hz=float(theta[worst] / (2 * np.pi * loop.plant.sample_time_s)), multiplier=name,
             angles=count, linearised=loop.linearised,
         )  # fmt: skip
-        if name == first and best.proved:
+        if name == first and best.shown:
             break
     return best
 
@@ -361,7 +362,7 @@ def _multipliers(loop: FrictionLoop) -> Iterator[tuple[str, Multiplier]]:
 
 @record(eq=False)
 class FeedbackLimit:
-    r"""What a proof asks of the feedback, at m angles: abs(C_y) < level abs(1 + plant C_y).
+    r"""What a multiplier asks of the feedback, at m angles: abs(C_y) < level abs(1 + plant C_y).
 
     K, to which a is proportional, is :math:`C_y/(1 + P C_y)`. So :math:`\alpha = |K|^2 \alpha_1`,
     :math:`\gamma = K \gamma_1`, and :math:`|2 + \gamma|^2 > \alpha\beta` reads
@@ -382,7 +383,7 @@ class FeedbackLimit:
 
 
 def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: float) -> FeedbackLimit:
-    """Return what is asked of C_y so that a multiplier proves stability for curves `factor` times as steep as they are.
+    """Return what is asked of C_y so that a multiplier shows stability for curves `factor` times as steep as they are.
 
     Parameters
     ----------

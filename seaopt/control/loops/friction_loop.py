@@ -1,6 +1,6 @@
 """A sampled loop with its friction taken out, as a port from friction efforts to what they move.
 
-The proof of stability looks at it at all aliases of an angle (`seaopt.control.loops.absolute_stability`), describing
+The test of stability looks at it at all aliases of an angle (`seaopt.control.loops.absolute_stability`), describing
 functions at the fundamental alone (`seaopt.control.laws.limit_cycles`).
 """
 

@@ -181,7 +181,7 @@ def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _L
         turned, size = np.conj(grid.unit[column]) * grid.port[column], np.abs(1.0 + grid.port[column] * law.c_y[column])
         rows.add(used, -np.real(turned * law.by_y[:, column]).T / ((1.0 - task.spec.reserve) * size[:, None]))
     if FRICTION in usage:
-        used, p, column, one = chosen(FRICTION, grid.rubbing)
+        used, p, column, one = chosen(FRICTION, grid.friction_plant)
         c_y, by_y = law.c_y[column], law.by_y[:, column]
         near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
         rows.add(used, used[:, None] * (_differentiate_size(c_y, by_y) / np.abs(c_y)[:, None] - near))

@@ -21,7 +21,7 @@ from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import (
     LawNumbers,
-    RubbingPlant,
+    PlantWithFriction,
     Task,
     count_growing,
     place_frequencies,
@@ -32,20 +32,20 @@ RESOLUTION = 1.03  # ratio to which the share is found
 SMALLEST_SHARE = 1e-3
 
 
-def find_largest_fall(task: Task) -> tuple[RubbingPlant, float, LawNumbers] | None:
+def find_largest_fall(task: Task) -> tuple[PlantWithFriction, float, LawNumbers] | None:
     """Return the plant whose friction falls most, the largest share of it with which the limits are kept, and the law.
 
     It is one of the plants that grow as they slide; None where no friction falls, or the limits are not kept without a
     fall either. That a law keeps them is measured, as it is of the answer itself.
     """
-    falling = [one for one in task.rubbing if count_growing(task.plants[one.plant]) and np.min(one.flattest) < 0.0]
+    falling = [one for one in task.frictions if count_growing(task.plants[one.plant]) and np.min(one.flattest) < 0.0]
     if not falling:
         return None
 
     def ease(share: float) -> Task:
         eased = {one.plant: _ease(one, share) for one in falling}
         plants = tuple(eased[k].loop.plant if k in eased else plant for k, plant in enumerate(task.plants))
-        return replace(task, plants=plants, rubbing=tuple(eased.get(one.plant, one) for one in task.rubbing))
+        return replace(task, plants=plants, frictions=tuple(eased.get(one.plant, one) for one in task.frictions))
 
     def keeps(eased: Task, x: LawNumbers) -> bool:
         return not list_broken_limits(eased.spec, eased.measure(x), eased.design_states)
@@ -65,13 +65,13 @@ def find_largest_fall(task: Task) -> tuple[RubbingPlant, float, LawNumbers] | No
     return max(falling, key=lambda one: one.find_fall()[1]), low, x
 
 
-def _ease(rubbing: RubbingPlant, share: float) -> RubbingPlant:
+def _ease(sliding: PlantWithFriction, share: float) -> PlantWithFriction:
     """Return a sliding plant with a share of the fall of its friction."""
-    loop, left = rubbing.loop, (1.0 - share) * np.minimum(rubbing.flattest, 0.0)
+    loop, left = sliding.loop, (1.0 - share) * np.minimum(sliding.flattest, 0.0)
     a = loop.a + (loop.friction * left) @ loop.velocity
     c = loop.measured + (loop.through * left) @ loop.velocity
     linear = (a[None], loop.motor[None], c[None], np.array([loop.plant.d]))
     delay_s = np.array([loop.delay_s])
     (plant,) = sample_linear(linear, delay_s, loop.plant.sample_time_s, loop.plant.delay_samples)
     eased = replace(loop, a=a, measured=c, slopes=loop.slopes + left, plant=plant)
-    return replace(rubbing, loop=eased, flattest=rubbing.flattest - left)
+    return replace(sliding, loop=eased, flattest=sliding.flattest - left)

@@ -163,10 +163,10 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
 
 @lru_cache(maxsize=32)
 def _build_program(
-    quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool, proof: bool
+    quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool, friction: bool
 ) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
-    kinds = (*CURVES, *([PASSIVE] * passive), *([FRICTION] * proof))
+    kinds = (*CURVES, *([PASSIVE] * passive), *([FRICTION] * friction))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
     shapes = {
@@ -240,7 +240,7 @@ def _build_program(
 def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
-    m, kinds, passive, proof = grid.f.size, (*CURVES,), task.port is not None, grid.rubbing.size > 0
+    m, kinds, passive, friction = grid.f.size, (*CURVES,), task.port is not None, grid.friction_plant.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
     levels = [task.level(kind, grid.f[chosen[kind] % m]) for kind in kinds]
@@ -249,10 +249,10 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         levels.append(np.full(at_port.size, 1.0 - spec.reserve))
         columns, p = np.concatenate([columns, at_port]), np.concatenate([p, grid.port[at_port]])
         unit = np.where(grid.unit[at_port] == 0.0, 1.0, grid.unit[at_port])  # outside the band nothing is asked
-    if proof:
-        at_proof = chosen[FRICTION]
-        levels.append(grid.rubbing_level.ravel()[at_proof])
-        columns, p = np.concatenate([columns, at_proof % m]), np.concatenate([p, grid.rubbing.ravel()[at_proof]])
+    if friction:
+        last = chosen[FRICTION]
+        levels.append(grid.friction_level.ravel()[last])
+        columns, p = np.concatenate([columns, last % m]), np.concatenate([p, grid.friction_plant.ravel()[last]])
     weights = np.zeros(0)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
@@ -287,7 +287,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         spec.notch is not None,
         noise,
         passive,
-        proof,
+        friction,
     )
     used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
     value = task.objective(grid, start)

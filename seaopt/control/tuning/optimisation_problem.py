@@ -13,7 +13,7 @@ reserve, these are for the rows of today
 
 with :math:`\alpha` the disk margin. The last is equal to 1 at :math:`f_b`. In the passive band there is a further one,
 1 - Re Z/abs(Z) of the design plant's port impedance (`seaopt.control.laws.passivity`), the gap that the reserve leaves
-taken off; and where a friction margin is asked for, one of each plant with friction, the proof with one multiplier
+taken off; and where a friction margin is asked for, one of each plant with friction, the test with one multiplier
 (`seaopt.control.loops.absolute_stability.FeedbackLimit`): a noise gain, on another plant and below a level of its own.
 
 The reference's weights are counted from feedforward and feedback of the error: with :math:`w_r = 1/P(0) + k_p - k_r`
@@ -69,7 +69,7 @@ SCOPES: dict[Scope, tuple[str, ...]] = {
 }
 TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
 PASSIVE, FRICTION = "passive_band_hz", "min_friction_margin"
-PROOF_RESERVE = 0.02  # of the slope to be proved: the proof gives its margin to a hundredth, and looks between angles
+MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 
 LawNumbers = Float[np.ndarray, " 10"]  # k_p, k_i, k_d, w_r, w_c, T_f, T_q, notch_w, notch_width, notch_depth
 K_P, K_I, K_D, W_R, W_C, T_F, T_Q, NOTCH_W, NOTCH_WIDTH, NOTCH_DEPTH = range(10)
@@ -92,8 +92,8 @@ class Grid:
         The nominal plant's parts at q; zeros without an observer.
     port, unit
         The loop with link 2 held but for C_y, and G_22/abs(G_22), in the passive band; zeros elsewhere.
-    rubbing, rubbing_level : arrays, shape (frictions, m)
-        Plant and level of a `FeedbackLimit` for each friction that is to be proved harmless.
+    friction_plant, friction_level : arrays, shape (frictions, m)
+        Plant and level of a `FeedbackLimit` for each plant with friction of which a margin is aimed at.
 
     """
 
@@ -105,21 +105,22 @@ class Grid:
     inverse: Complex[np.ndarray, " m"]
     port: Complex[np.ndarray, " m"]
     unit: Complex[np.ndarray, " m"]
-    rubbing: Complex[np.ndarray, "k m"]
-    rubbing_level: Float[np.ndarray, "k m"]
+    friction_plant: Complex[np.ndarray, "k m"]
+    friction_level: Float[np.ndarray, "k m"]
 
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
             f=self.f[index], q=self.q[index], p=self.p[:, index], rows=self.rows, kept=self.kept[index],
-            inverse=self.inverse[index], port=self.port[index], unit=self.unit[index], rubbing=self.rubbing[:, index],
-            rubbing_level=self.rubbing_level[:, index],
+            inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
+            friction_plant=self.friction_plant[:, index],
+            friction_level=self.friction_level[:, index],
         )  # fmt: skip
 
 
 @record(eq=False)
-class RubbingPlant:
-    """A plant with friction: of which stability is to be proved, or that grows as it slides.
+class PlantWithFriction:
+    """A plant with friction of which a margin is asked, or that grows as it slides.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ class RubbingPlant:
     flattest : array, shape (p,)
         The flattest slope of each friction, N s/m (N m s/rad), which the loop has in it.
     multiplier : str
-        That of the proof aimed at; empty where none is chosen yet, and nothing asked while the law is looked for.
+        That of the margin aimed at; empty where none is chosen yet, and nothing asked while the law is looked for.
 
     """
 
@@ -153,7 +154,7 @@ class Task:
     """A specification with the plants it is to hold for.
 
     The first is the design plant, whose port must be passive; of two `design_states` it is the sliding one, and the
-    second plant is the same one stuck by its friction. `rubbing` are those of which a friction margin is asked, and
+    second plant is the same one stuck by its friction. `frictions` are those of which a friction margin is asked, and
     those that friction which falls with speed makes grow.
     """
 
@@ -164,12 +165,12 @@ class Task:
     nominal: Nominal | None
     port: PortModel | None = None
     design_states: int = 1
-    rubbing: tuple[RubbingPlant, ...] = ()
+    frictions: tuple[PlantWithFriction, ...] = ()
 
     @property
-    def asks_proof(self) -> bool:
+    def asks_margin(self) -> bool:
         """Whether a friction margin is asked of some plant."""
-        return bool(self.rubbing) and self.spec.level(FRICTION) is not None
+        return bool(self.frictions) and self.spec.level(FRICTION) is not None
 
     def integrates(self, x: LawNumbers) -> bool:
         """Tell whether the law integrates the error: not a pd, nor a disturbance observer that is alone at it."""
@@ -283,25 +284,25 @@ class Task:
             port[inside], unit[inside] = weigh_passivity(
                 self.port, self.spec.sample_time_s, self.spec.loop_delay_samples, f[inside]
             )  # fmt: skip
-        asked = [one for one in self.rubbing if one.multiplier and one.plant in rows]
-        rubbing, level = np.zeros((len(asked), f.size), dtype=complex), np.zeros((len(asked), f.size))
+        asked = [one for one in self.frictions if one.multiplier and one.plant in rows]
+        plants, levels = np.zeros((len(asked), f.size), dtype=complex), np.zeros((len(asked), f.size))
         for k, one in enumerate(asked):
-            rubbing[k], level[k] = self._limit_feedback(one, f)
+            plants[k], levels[k] = self._limit_feedback(one, f)
         return Grid(
-            f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit, rubbing=rubbing,
-            rubbing_level=level,
+            f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit, friction_plant=plants,
+            friction_level=levels,
         )  # fmt: skip
 
     def _limit_feedback(
-        self, rubbing: RubbingPlant, f: Float[np.ndarray, " m"]
+        self, aimed: PlantWithFriction, f: Float[np.ndarray, " m"]
     ) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Return plant and level of what a proof asks; nothing is asked below its lowest angle."""
-        slope, own = self.spec.level(FRICTION), rubbing.loop.slopes
-        assert slope is not None, "rubbing plants belong to a specification with a friction margin"
-        factor = slope * (1.0 + self.spec.reserve + PROOF_RESERVE) / float(np.min(own[own > 0.0]))
+        """Return plant and level of what a multiplier asks; nothing is asked below the test's lowest angle."""
+        slope, own = self.spec.level(FRICTION), aimed.loop.slopes
+        assert slope is not None, "it belongs to a specification with a friction margin"
+        factor = slope * (1.0 + self.spec.reserve + MARGIN_RESERVE) / float(np.min(own[own > 0.0]))
         theta = 2 * np.pi * f * self.spec.sample_time_s
         asked = theta >= LOWEST_ANGLE
-        limit = limit_feedback(rubbing.loop, theta[asked], rubbing.multiplier, factor)
+        limit = limit_feedback(aimed.loop, theta[asked], aimed.multiplier, factor)
         plant, level = np.zeros(f.size, dtype=complex), np.full(f.size, NO_LIMIT)
         plant[asked], level[asked] = limit.plant, np.maximum(limit.level, 1.0 / NO_LIMIT)
         return plant, level
@@ -326,7 +327,7 @@ class Task:
         for position in range(len(grid.rows)):
             for name, curve in self.design_usage(grid, position, c_y, c_r).items():
                 rows.setdefault(name, []).append(curve)
-        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r) | self.rubbing_usage(grid, c_y)
+        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r) | self.friction_usage(grid, c_y)
         return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
     def curves(
@@ -378,27 +379,27 @@ class Task:
         cosine = np.real(grid.unit * np.conj(one)) / np.maximum(np.abs(one), 1e-300)
         return {PASSIVE: np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)}
 
-    def rubbing_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
-        """Return the usage of the proofs aimed at, of each law one row per proof, where there are any."""
-        if not grid.rubbing.size:
+    def friction_usage(self, grid: Grid, c_y: Complex[np.ndarray, "*n m"]) -> dict[str, np.ndarray]:
+        """Return the usage of the friction margins aimed at, of each law one row per plant, where there are any."""
+        if not grid.friction_plant.size:
             return {}
         own = c_y[..., None, :]
-        return {FRICTION: np.abs(own) / (grid.rubbing_level * np.abs(1.0 + grid.rubbing * own))}
+        return {FRICTION: np.abs(own) / (grid.friction_level * np.abs(1.0 + grid.friction_plant * own))}
 
-    def aim_proofs(self, x: LawNumbers, multiplier: str = "") -> Task:
-        """Return the task with one multiplier for every rubbing plant: that named, or the one that proves most of x."""
-        if not self.asks_proof:
+    def aim_multipliers(self, x: LawNumbers, multiplier: str = "") -> Task:
+        """Return the task with one multiplier per plant with friction: that named, or the one that shows most of x."""
+        if not self.asks_margin:
             return self
-        names = [multiplier] * len(self.rubbing) if multiplier else [
-            margin.multiplier if margin.factor else SIMPLEST for margin in self.prove(x)
+        names = [multiplier] * len(self.frictions) if multiplier else [
+            margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(x)
         ]  # fmt: skip
-        aimed = (replace(one, multiplier=name) for one, name in zip(self.rubbing, names, strict=True))
-        return replace(self, rubbing=tuple(aimed))
+        aimed = (replace(one, multiplier=name) for one, name in zip(self.frictions, names, strict=True))
+        return replace(self, frictions=tuple(aimed))
 
-    def prove(self, x: LawNumbers) -> list[FrictionMargin]:
-        """Return the friction margin of every rubbing plant."""
+    def find_margins(self, x: LawNumbers) -> list[FrictionMargin]:
+        """Return the margin of every plant with friction."""
         law = self.law_of(x)
-        return [friction_margin(replace(one.loop, law=law)) for one in self.rubbing]
+        return [friction_margin(replace(one.loop, law=law)) for one in self.frictions]
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""
@@ -408,8 +409,10 @@ class Task:
         filter_samples = float(x[T_F] / spec.sample_time_s) if x[K_D] > 0.0 else np.inf
         integral_rad_s = float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf
         slopes: dict[int, float] = {}
-        if self.asks_proof:
-            slopes = {one.plant: margin.least_slope for one, margin in zip(self.rubbing, self.prove(x), strict=True)}
+        if self.asks_margin:
+            slopes = {
+                one.plant: margin.least_slope for one, margin in zip(self.frictions, self.find_margins(x), strict=True)
+            }
         return [
             MeasuredLoop(
                 name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,

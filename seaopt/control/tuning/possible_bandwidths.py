@@ -70,7 +70,7 @@ class _Probes:
     """
 
     def __init__(self, task: Task, x: LawNumbers) -> None:
-        self.task, self.asked = task.aim_proofs(x), task.spec.bandwidth_hz
+        self.task, self.asked = task.aim_multipliers(x), task.spec.bandwidth_hz
         self.tried: dict[float, tuple[float, LawNumbers]] = {self.asked: (np.inf, x)}
 
     def find(self) -> tuple[PossibleBandwidths, list[LawNumbers]]:
@@ -98,7 +98,7 @@ class _Probes:
     def _measure(self, bandwidth_hz: float, x: LawNumbers) -> tuple[float, LawNumbers]:
         """Return usage and numbers, by measurement, of a law that keeps the limits on the frequencies looked at.
 
-        A friction margin is not measured again: its proof is looked at with a reserve, and takes long.
+        A friction margin is not measured again: it is aimed at with a reserve, and takes long.
         """
         task = self._aim(bandwidth_hz)
         plain = replace(task, spec=replace(task.spec, min_friction_margin=None))

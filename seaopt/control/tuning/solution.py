@@ -45,21 +45,21 @@ def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> Solution:
 
     """
     x, loops = _solve_once(task, warm)
-    return _meet_friction_margin(task, x, loops) if task.asks_proof else (x, loops)
+    return _meet_friction_margin(task, x, loops) if task.asks_margin else (x, loops)
 
 
 def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
     """Return the best law with the friction margin asked for, from the best without.
 
-    The multiplier that proves most of a law is made a limit, and the best law with that looked for, as another may then
-    prove more. Where none has the margin, it is the law with the largest that keeps all other limits.
+    The multiplier that shows most of a law is made a limit, and the best law with that looked for, as another may then
+    show more. Where none has the margin, it is the law with the largest that keeps all other limits.
     """
     best = (x, loops)
     for multiplier in ("", "", SIMPLEST):
         broken = list_broken_limits(task.spec, best[1], task.design_states)
         if not broken:
             return best
-        tried = _solve_once(task.aim_proofs(best[0], multiplier), (best[0],))
+        tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],))
         missed = list_broken_limits(task.spec, tried[1], task.design_states)
         if not missed or broken - {FRICTION}:  # what cannot be kept without a margin cannot be kept with it
             return tried
@@ -71,7 +71,7 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) 
 def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], other: LawNumbers) -> Solution:
     """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept.
 
-    At every slope two laws are tried: from the best so far, with the multiplier that proves most of it; and from the
+    At every slope two laws are tried: from the best so far, with the multiplier that shows most of it; and from the
     `other`, which misses all limits evenly with the simplest.
     """
     high = task.spec.level(FRICTION)
@@ -81,7 +81,7 @@ def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop],
         middle = float(np.sqrt(low * high))
         easier = replace(task, spec=replace(task.spec, min_friction_margin=middle))
         for start, multiplier in ((x, ""), (other, SIMPLEST)):
-            aimed = easier.aim_proofs(start, multiplier)
+            aimed = easier.aim_multipliers(start, multiplier)
             grid = aimed.grid(f)
             tried = refine(aimed, grid, improve(aimed, grid, start)[1])
             measured = aimed.measure(tried)
@@ -98,7 +98,7 @@ def _least_slope(loops: Sequence[MeasuredLoop]) -> float:
 
 
 def _solve_once(task: Task, warm: Sequence[LawNumbers]) -> Solution:
-    """Find the best numbers with the multipliers that are aimed at, or no proof where none is."""
+    """Find the best numbers with the multipliers that are aimed at, if any."""
     grid = task.grid(place_frequencies(task))
     x = recheck(task, grid, find_best(task, grid, warm))
     return x, task.measure(x)

@@ -293,8 +293,8 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
     task, grid = scan.task, scan.grid
     weights, worst = task.weights(grid.f), np.zeros(c_y.shape[0])
     value, turned = np.zeros(c_y.shape[0]), np.zeros(c_y.shape[0])
-    for proofs in task.rubbing_usage(grid, c_y).values():
-        worst = np.max(proofs, axis=(1, 2))
+    for margins in task.friction_usage(grid, c_y).values():
+        worst = np.max(margins, axis=(1, 2))
     for row, p in enumerate(grid.p):
         own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
         usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid.f, p, c_y, c_y)

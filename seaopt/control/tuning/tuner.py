@@ -21,7 +21,7 @@ from jaxtyping import Complex
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
-from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Nominal
@@ -44,7 +44,7 @@ from seaopt.control.tuning.optimisation_problem import (
     FRICTION,
     OBJECTIVE_HZ,
     LawNumbers,
-    RubbingPlant,
+    PlantWithFriction,
     Task,
     count_growing,
 )
@@ -205,20 +205,20 @@ def make_task(
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
         design_states=1 if design_plant is plant else 2,
-        rubbing=_find_rubbing(spec, [pair for _, pair in pairs], plants, whole, gain),
+        frictions=_find_friction(spec, [pair for _, pair in pairs], plants, whole, gain),
     )  # fmt: skip
 
 
-def _find_rubbing(
+def _find_friction(
     spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]], plants: Sequence[DigitalPlant],
     whole: Mapping[Plant, Plant], gain: float,
-) -> tuple[RubbingPlant, ...]:  # fmt: skip
+) -> tuple[PlantWithFriction, ...]:  # fmt: skip
     """Return the plants of which a friction margin is asked, and those that grow as they slide.
 
     Of those that slide, `whole` is the one with friction.
     """
     slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s)
-    rubbing: list[RubbingPlant] = []
+    found: list[PlantWithFriction] = []
     for number, (model, values) in enumerate(pairs):
         if model not in whole or (slope is None and not count_growing(plants[number])):
             continue
@@ -232,8 +232,8 @@ def _find_rubbing(
                 "change the plant or the measured output"
             )
         flattest, _ = friction_slopes(plant, values)
-        rubbing.append(RubbingPlant(plant=number, model=plant, loop=loop, flattest=flattest))
-    return tuple(rubbing)
+        found.append(PlantWithFriction(plant=number, model=plant, loop=loop, flattest=flattest))
+    return tuple(found)
 
 
 def _draw_plants(
@@ -286,7 +286,7 @@ def make_controller(
         blocked_by=tuple(explain_broken(spec, verdicts, loops[0], task.loop(x))),
         possible=None if not broken else possible,
     )
-    return replace(controller, friction=prove_friction(controller, *design))
+    return replace(controller, friction=find_friction_margin(controller, *design))
 
 
 def disturbance(loop: Loop, bandwidth_hz: float) -> float:

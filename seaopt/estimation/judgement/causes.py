@@ -38,7 +38,7 @@ SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the 
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
-ALIKE = 1e-3  # of a test's figures, by which parameters that act alike may differ
+SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
@@ -316,7 +316,10 @@ def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
     for name, test in tests.items():
         for group in groups:
             first = tests[group[0]]
-            same = abs(test.fall - first.fall) < ALIKE * first.fall and abs(test.chi2 - first.chi2) < ALIKE * first.chi2
+            same = (
+                abs(test.fall - first.fall) < SAME_EFFECT * first.fall
+                and abs(test.chi2 - first.chi2) < SAME_EFFECT * first.chi2
+            )
             if same:
                 group.append(name)
                 break

@@ -41,7 +41,7 @@ HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
 FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
-ALIKE = 0.9  # of what the best cause gains: no reason to prefer one
+RIVAL_SHARE = 0.9  # of what the best cause gains: no reason to prefer one
 FAR = 3.0  # times beyond a plausible range
 
 
@@ -257,7 +257,7 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
             )  # fmt: skip
         return
     best = causes[0]
-    rivals = [cause for cause in causes if cause.gain > ALIKE * best.gain][:3]
+    rivals = [cause for cause in causes if cause.gain > RIVAL_SHARE * best.gain][:3]
     if len(rivals) == 1:
         text = f"likely cause: {best.text}{best.consequence}"
     else:

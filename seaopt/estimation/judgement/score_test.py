@@ -43,7 +43,7 @@ from seaopt.units import unit_after
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 REDUNDANT = 1e-7  # of what a parameter does to the outputs: less of it left, and the free ones do the same
 SHARE = 0.3  # of the most that a step lowers the cost: a step is not a refit, and the best may be another
-ALIKE = 3.0  # of log-likelihood: what no residual distinguishes
+INDISTINGUISHABLE = 3.0  # of log-likelihood: what no residual distinguishes
 EXPLAINED_POWER = 0.1  # of a residual's: a parameter that leaves less is at fault, whatever else may be
 REFIT_ITERATIONS = 25
 MOST_REFITTED = 5  # parameters
@@ -164,7 +164,7 @@ def find_culprit(
     best = None if not ranked else _refit_with(minimum, fit, ranked[0], diagnostics=True)
     if best is None:
         return tests, None
-    alike = [name for name in ranked if refits[name].log_likelihood > best.log_likelihood - ALIKE]
+    alike = [name for name in ranked if refits[name].log_likelihood > best.log_likelihood - INDISTINGUISHABLE]
     again = best.require_minimum("diagnose")
     after = again.residuals()
     return tests, Culprit(

@@ -30,7 +30,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
-from seaopt.robustness.certificate.friction import FrictionDraws, prove_frictions
+from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -287,9 +287,9 @@ class Certificate:
         steps = simulate_steps(self.controller, self.models, self.parameters, self._draws())
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
         for name, model in self.models.items():
-            proved = name not in self.friction or self.friction[name].proved
-            found = seek_limit_cycles(self.controller, model, self.parameters, proved=proved)
-            if found or not proved:
+            shown = name not in self.friction or self.friction[name].shown
+            found = seek_limit_cycles(self.controller, model, self.parameters, shown=shown)
+            if found or not shown:
                 ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
                 cycles[name] = (*found, *ends)
         return replace(self, steps=steps, cycles=cycles)
@@ -375,7 +375,7 @@ class Certificate:
                 parameters=parameters,
                 varied=varied,
                 brackets={name: Bracket(**proven) for name, proven in bounds.items() if proven is not None},
-                friction=prove_frictions(controller, models, parameters),
+                friction=find_nominal_margins(controller, models, parameters),
                 friction_draws={
                     name: FrictionDraws(**one.draws.model_dump())
                     for name, one in stored.friction.items()
@@ -404,7 +404,7 @@ class Certificate:
                 | {"worst": self._worst_dict(name)}
                 for name, figures in self.plants.items()
             },
-            "friction": {name: self._friction_dict(name) for name in self._rubbing},
+            "friction": {name: self._friction_dict(name) for name in self._frictions},
             "monte_carlo": _list_fields(self.monte_carlo),
             "varied": [_list_fields(varied) for varied in self.varied],
             "remarks": list(self.remarks),
@@ -431,7 +431,7 @@ class Certificate:
             if few and bound > UNINFORMATIVE_BOUND
             else ()
         )
-        friction = [f"{name}: {self._describe_margin(name)}{self._describe_proof(name)}" for name in self._rubbing]
+        friction = [f"{name}: {self._describe_margin(name)}{self._describe_draws(name)}" for name in self._frictions]
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = self.controller.lifted_notes
         lifted += () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
@@ -448,7 +448,7 @@ class Certificate:
         return _list_fields(worst.witness) | {"largest": largest} | bounds
 
     @property
-    def _rubbing(self) -> tuple[str, ...]:
+    def _frictions(self) -> tuple[str, ...]:
         """The plants with friction, at the nominal parameters or at draws, and those with limit cycles."""
         return tuple(dict.fromkeys((*self.friction, *self.friction_draws, *self.cycles)))
 
@@ -457,21 +457,21 @@ class Certificate:
             return str(self.friction[name])
         return "friction: none at the nominal parameters" if name in self.friction_draws else "play"
 
-    def _describe_proof(self, name: str) -> str:
-        """Return what draws and predicted limit cycles add to a plant's proof, or to that there is none."""
+    def _describe_draws(self, name: str) -> str:
+        """Return what draws and predicted limit cycles add to what is said of a plant's friction."""
         drawn = f"; {self.friction_draws[name]}" if name in self.friction_draws else ""
         return drawn + self._describe_cycles(name)
 
     def _friction_dict(self, name: str) -> dict[str, Any]:
         """Return what friction and play do to a plant; a plant with play alone has no sector."""
         margin, cycles = self.friction.get(name), self.cycles.get(name, ())
-        stable = True if margin is not None and margin.proved and not cycles else None
-        proof: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
+        stable = True if margin is not None and margin.shown and not cycles else None
+        entry: dict[str, Any] = {"sector_stable": stable, "limit_cycles": [cycle.to_dict() for cycle in cycles]}
         if margin is not None:
-            proof |= _list_fields(margin) | {"draws": None}
+            entry |= _list_fields(margin) | {"draws": None}
         if name in self.friction_draws:
-            proof["draws"] = _list_fields(self.friction_draws[name])
-        return proof
+            entry["draws"] = _list_fields(self.friction_draws[name])
+        return entry
 
     def _describe_cycles(self, name: str) -> str:
         if name not in self.cycles:

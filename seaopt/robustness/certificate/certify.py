@@ -37,7 +37,7 @@ from seaopt.robustness.certificate.certificate import (
     Requirement,
     plant_margins,
 )
-from seaopt.robustness.certificate.friction import prove_friction_draws, prove_frictions
+from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
@@ -198,8 +198,8 @@ def certify(
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
-    friction = prove_frictions(controller, models, nominal)
-    friction_draws = prove_friction_draws(
+    friction = find_nominal_margins(controller, models, nominal)
+    friction_draws = find_margins_at_draws(
         controller, models, unknown, friction, samples, rng, required=min_friction_margin
     )
     requirements = (

@@ -103,17 +103,17 @@ class StoredSimulation(ResultTable):
 
 
 class StoredFrictionDraws(ResultTable):
-    """For how many draws stability is proved with friction, and the least margin."""
+    """For how many draws stability is shown with friction, and the least margin."""
 
     samples: Whole
-    proved: Whole
+    shown: Whole
     least_slope: NullIsInfinite
     factor: NullIsInfinite
     parameters: dict[str, Number]
 
 
 class StoredFriction(ResultTable):
-    """The proof of a plant with friction, of which all but the draws is made again."""
+    """The margin of a plant with friction, of which all but the draws is found again."""
 
     draws: StoredFrictionDraws | None = None
 

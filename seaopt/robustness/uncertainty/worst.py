@@ -45,7 +45,7 @@ GRADIENT_STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01, 0.001])
 PROBE_STEPS = np.repeat(np.array([0.3, 0.1, 0.03, 0.01]), 3)
 ON_BOUND = 1e-8  # of a physical bound, in standard deviations
 WITNESS_TOLERANCE = 1e-6
-ALIKE = 1.001  # figures within this factor are printed alike
+SAME_TEXT = 1.001  # figures within this factor are printed alike
 
 Trials = Float[np.ndarray, "s t k"]
 Score = Callable[[Float[np.ndarray, "m k"]], Float[np.ndarray, " m"]]
@@ -112,7 +112,10 @@ class Worst(tuple[Plant, ParameterSet]):
     def elsewhere(self) -> dict[str, Witness]:
         """The witnesses of the largest Ms and Mt, by name, that are larger than at the worst case's own parameters."""
         ms, mt = self.largest
-        larger = {"Ms": (ms, ms.ms > ALIKE * self.witness.ms), "Mt": (mt, mt.mt > ALIKE * self.witness.mt)}
+        larger = {
+            "Ms": (ms, ms.ms > SAME_TEXT * self.witness.ms),
+            "Mt": (mt, mt.mt > SAME_TEXT * self.witness.mt),
+        }
         return {name: witness for name, (witness, is_larger) in larger.items() if is_larger}
 
     def figures(self, controller: Controller) -> LoopFigures:

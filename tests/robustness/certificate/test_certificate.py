@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import beta, binomtest
 
 import seaopt as so
-from seaopt.control.laws.friction_proof import prove_friction
+from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.parameters import Parameter
@@ -367,14 +367,14 @@ def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
     assert again.friction == certificate.friction
 
 
-def test_friction_is_proved_over_draws_and_may_be_required(stand, thor):
-    """Viscous friction is in the sector: at every draw the loop with the least proved slope has stable eigenvalues."""
+def test_stability_with_friction_is_shown_over_draws_and_may_be_required(stand, thor):
+    """Viscous friction is in the sector: at every draw the loop with the least slope shown has stable eigenvalues."""
     rubbing = thor.update(f_c=50.0)
     controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25))
     ranges = {"eta": (0.8, 1.1), "f_c": (20.0, 80.0)}
     certificate = so.certify(controller, {"stand": stand}, rubbing, ranges=ranges, samples=20, min_friction_margin=1e4)
     drawn = certificate.friction_draws["stand"]
-    assert (drawn.samples, drawn.proved) == (20, 20)
+    assert (drawn.samples, drawn.shown) == (20, 20)
     assert drawn.least_slope == pytest.approx(drawn.factor * drawn.parameters["f_c"] / rubbing["v_s"].value)
     radius = thor["l"].value / (2 * np.pi * thor["N_p"].value)
     for eta in (0.8, 1.1, drawn.parameters["eta"]):
@@ -400,7 +400,7 @@ def smooth(stand, thor):
     return so.tune(stand, values, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6)), values
 
 
-def test_friction_at_draws_alone_is_proved_too(stand, smooth):
+def test_friction_at_draws_alone_is_looked_at_too(stand, smooth):
     """The draws' proof is that of the same law at the worst draw's parameters, with friction nominal there."""
     controller, values = smooth
     ranges = {"f_c": (0.0, 50.0)}
@@ -409,7 +409,7 @@ def test_friction_at_draws_alone_is_proved_too(stand, smooth):
     drawn = certificate.friction_draws["stand"]
     assert not row.met and not certificate.passed
     assert drawn.samples == 10 and row.value == drawn.least_slope
-    there = prove_friction(controller, stand, values.update(**drawn.parameters))
+    there = find_friction_margin(controller, stand, values.update(**drawn.parameters))
     assert there.least_slope == pytest.approx(row.value, rel=1e-3)
     (lower,) = friction_requirements({}, certificate.friction_draws, 1e4)
     assert lower.met
@@ -448,13 +448,13 @@ def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
 
 @pytest.mark.slow
 def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too(stand, rubbing):
-    """Nearly Coulomb's jump is not proved, a flatter curve is; at draws as at the nominal parameters."""
+    """Of nearly Coulomb's jump nothing is shown, a flatter curve is; at draws as at the nominal parameters."""
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, delay_samples=2)
     controller, sharp = so.tune(stand, rubbing, spec), rubbing.update(v_s=1e-6)
     asked = {"ranges": {"eta": (0.4, 3.0)}, "samples": 3}
     certificate = so.certify(controller, {"stand": stand}, sharp, min_friction_margin=1e3, **asked)
     margin, drawn = certificate.friction["stand"], certificate.friction_draws["stand"]
-    assert not margin.proved and (drawn.samples, drawn.proved) == (3, 0)
+    assert not margin.shown and (drawn.samples, drawn.shown) == (3, 0)
     (row,) = [row for row in certificate.requirements if row.name == "min_friction_margin"]
     assert row.value == min(*margin.slopes, drawn.least_slope) < margin.slopes[0]
     assert so.certify(controller, {"stand": stand}, sharp, **asked).friction_draws == {}

@@ -138,7 +138,7 @@ def test_a_cycle_that_the_current_holds_fails_the_certificate(blind, stand, rubb
     assert not row.met and row.value == cycle["simulated"]["force_N"]
 
 
-def test_near_the_edge_nothing_is_predicted_and_stability_is_proved(blind, stand, rubbing):
+def test_near_the_edge_nothing_is_predicted_and_stability_is_shown(blind, stand, rubbing):
     """1.2 times the gain: the sliding loop's spectral radius is .991."""
     edge = scaled(blind, 1.2)
     radius = np.max(np.abs(edge.close(friction_states(stand)["sliding"], rubbing).eigenvalues()))
@@ -149,7 +149,7 @@ def test_near_the_edge_nothing_is_predicted_and_stability_is_proved(blind, stand
     assert certificate.cycles == {}
 
 
-def test_with_play_nothing_is_proved_and_no_step_is_absurd(stand, thor):
+def test_with_play_nothing_is_shown_and_no_step_is_absurd(stand, thor):
     """Tuned within the play, where the spring is soft, the loop runs away beyond it."""
     loose, rubbing = so.plants.high_impedance(parts=["backlash"]), thor.update(f_c=20.0)
     controller = so.tune(loose, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, current_limit_A=9.0))

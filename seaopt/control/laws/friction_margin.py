@@ -11,12 +11,12 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 
 
-def prove_friction(
+def find_friction_margin(
     controller: Controller, plant: Plant, params: ParameterSet, first: str = "", least: float = 0.0
 ) -> FrictionMargin | None:
     """Return how much steeper friction may be with stability shown, between the samples too; None without friction.
 
-    The linear plant of the proof is the sliding one; what a curve's slope is above its flattest is in the sector.
+    The linear plant of the test is the sliding one; what a curve's slope is above its flattest is in the sector.
 
     Parameters
     ----------
@@ -37,19 +37,19 @@ def prove_friction(
     Examples
     --------
     >>> import seaopt as so
-    >>> stand, rubbing = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
-    >>> controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
-    >>> prove_friction(controller, stand, rubbing).proved
+    >>> stand, params = so.plants.high_impedance(), so.plants.thor().update(f_c=50.0)
+    >>> controller = so.tune(stand, params, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6))
+    >>> find_friction_margin(controller, stand, params).shown
     True
 
     """
-    return prove_friction_sets(controller, plant, [params], first, least)[0]
+    return find_friction_margins(controller, plant, [params], first, least)[0]
 
 
-def prove_friction_sets(
+def find_friction_margins(
     controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
 ) -> list[FrictionMargin | None]:
-    """Return `prove_friction` of a plant at several sets of parameters, all with the same conditions among them."""
+    """Return `find_friction_margin` at several sets of parameters, all with the same conditions among them."""
     return [
         None if loop is None else friction_margin(loop, first, least)
         for loop in take_friction_out(controller, plant, sets)
