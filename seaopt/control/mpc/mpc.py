@@ -53,6 +53,7 @@ from seaopt.formatting import format_count, format_number, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
+from seaopt.plants.memo import memo
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
 
@@ -146,18 +147,8 @@ class ForceMPC:
     gate : PlausibilityGate, optional
         Which measurements are believed, the first if it is in range; the others are predicted, and at a fault the
         current goes to zero.
-    possible_hz : float or None
-        Where a limit is broken: the first bandwidth that keeps them all on the way down from the one asked, in steps
-        of a sixth, moved up by bisection to a hundredth; None where none does down to a seventh.
-    friction : FrictionMargin or None
-        How much steeper friction may be with stability shown while no limit is active; None without friction.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
-    loops : mapping of name to Loop
-        Around the design plant while no limit is active, efforts in newtons of motor force; with friction sliding and
-        then stuck. Like `verdicts`, it follows from the fields above and is never given.
-    verdicts : tuple of Verdict
-        Every limit of the specification against these loops.
 
     """
 
@@ -171,19 +162,45 @@ class ForceMPC:
     shift: Float[np.ndarray, "n n"]
     solver: Any
     gate: PlausibilityGate | None = None
-    possible_hz: float | None = None
-    friction: FrictionMargin | None = None
     warnings: tuple[str, ...] = ()
-    loops: Mapping[str, Loop] = field(init=False)
-    verdicts: tuple[Verdict, ...] = field(init=False)
+    memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
-    def __post_init__(self) -> None:
+    @property
+    @memo
+    def loops(self) -> Mapping[str, Loop]:
+        """Around the design plant while no limit is active, in newtons of motor force; with friction sliding, stuck."""
         plant, values = self.design
         states = split_friction({"design plant": plant}, values)
-        loops = {name: self.close(one, values) for name, one in states.items()}
-        measured = [MeasuredLoop(name=name, figures=loop.figures()) for name, loop in loops.items()]
-        object.__setattr__(self, "loops", loops)
-        object.__setattr__(self, "verdicts", tuple(judge_all(self.spec, measured, len(measured), MPC_LIMITS)))
+        return {name: self.close(one, values) for name, one in states.items()}
+
+    @property
+    @memo
+    def measured_loops(self) -> tuple[MeasuredLoop, ...]:
+        """These loops as limits are judged on them."""
+        return tuple(MeasuredLoop(name=name, figures=loop.figures()) for name, loop in self.loops.items())
+
+    @property
+    @memo
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Every limit of the specification against these loops."""
+        return tuple(judge_all(self.spec, self.measured_loops, len(self.measured_loops), MPC_LIMITS))
+
+    @property
+    @memo
+    def possible_hz(self) -> float | None:
+        """Where a limit is broken: a bandwidth that keeps them all; None where none does down to a seventh.
+
+        It is the first on the way down from the one asked, in steps of a sixth, moved up by bisection to a hundredth.
+        """
+        return None if self.feasible else _find_possible(self)
+
+    @property
+    @memo
+    def friction(self) -> FrictionMargin | None:
+        """How much steeper friction may be with stability shown while no limit is active; None without friction."""
+        plant, values = self.design
+        (loop,) = make_friction_loops(plant, [values], self.measured, self.per_effort, self.delay_samples, self.law)
+        return None if loop is None else friction_margin(loop)
 
     @property
     def measured(self) -> str:
@@ -208,7 +225,7 @@ class ForceMPC:
     @property
     def achieved(self) -> LoopFigures:
         """Of the design plant while no limit is active, sliding where it has friction."""
-        return next(iter(self.loops.values())).figures()
+        return self.measured_loops[0].figures
 
     @property
     def feasible(self) -> bool:
@@ -225,8 +242,7 @@ class ForceMPC:
         """One line: the limits that block, and the bandwidth that is possible; empty where every limit is met."""
         if self.feasible:
             return ""
-        name, loop = next(iter(self.loops.items()))
-        design = MeasuredLoop(name=name, figures=loop.figures())
+        design, loop = self.measured_loops[0], next(iter(self.loops.values()))
         blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, design, loop))
         remedy = (
             f"{self.possible_hz:.4g} Hz is possible" if self.possible_hz is not None
@@ -394,10 +410,10 @@ class ForceMPC:
     def describe_figures(self) -> list[str]:
         """Return a line of margins for each loop of the design plant: with friction sliding and stuck."""
         lines: list[str] = []
-        for name, loop in self.loops.items():
-            a = loop.figures()
+        for loop in self.measured_loops:
+            a = loop.figures
             bandwidth = format_number(a.bandwidth_hz, missing="none")
-            lines.append(f"{name}: bandwidth {bandwidth} Hz, {a.describe_peaks()}; {a.describe_margins()}")
+            lines.append(f"{loop.name}: bandwidth {bandwidth} Hz, {a.describe_peaks()}; {a.describe_margins()}")
         return lines
 
     def __repr__(self) -> str:
@@ -464,11 +480,8 @@ def force_mpc(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
         )
     spec = settle_delay(spec, plant, params)
-    mpc = _design(plant, params.parameters if isinstance(params, Fit) else params, spec, gate)
-    return replace(
-        mpc, possible_hz=None if mpc.feasible else _find_possible(mpc), friction=_find_friction_margin(mpc),
-        warnings=warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, plant, params),
-    )  # fmt: skip
+    warnings = warn_short_delay(spec.loop_delay_samples, spec.sample_rate_hz, plant, params)
+    return _design(plant, params.parameters if isinstance(params, Fit) else params, spec, gate, warnings)
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:
@@ -476,7 +489,7 @@ def _find_possible(mpc: ForceMPC) -> float | None:
 
     def keeps(bandwidth_hz: float) -> bool:
         try:
-            return _design(*mpc.design, replace(mpc.spec, bandwidth_hz=bandwidth_hz), None).feasible
+            return _design(*mpc.design, replace(mpc.spec, bandwidth_hz=bandwidth_hz)).feasible
         except ControlError:  # slower than any weight makes it
             return False
 
@@ -484,15 +497,11 @@ def _find_possible(mpc: ForceMPC) -> float | None:
     return find_end(keeps, list_steps(asked, asked / LOWEST_SHARE), asked)
 
 
-def _find_friction_margin(mpc: ForceMPC) -> FrictionMargin | None:
-    """Return the friction margin of the design plant; None without friction."""
-    plant, values = mpc.design
-    (loop,) = make_friction_loops(plant, [values], mpc.measured, mpc.per_effort, mpc.delay_samples, mpc.law)
-    return None if loop is None else friction_margin(loop)
-
-
-def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, gate: PlausibilityGate | None) -> ForceMPC:
-    """Return the controller of a specification whose delay is settled, judged; friction slides in its model."""
+def _design(
+    plant: Plant, values: ParameterSet, spec: MPCSpec, gate: PlausibilityGate | None = None,
+    warnings: tuple[str, ...] = (),
+) -> ForceMPC:  # fmt: skip
+    """Return the controller of a specification whose delay is settled; friction slides in its model."""
     design = (plant, values)
     plant = take_sliding(plant, values)
     completed = plant.complete(values)
@@ -519,7 +528,7 @@ def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, gate: Plausibilit
     return ForceMPC(
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
         rest=np.linalg.solve(np.eye(b.size) - a, b), shift=shift, solver=make_solver(prediction),
-        gate=gate,
+        gate=gate, warnings=warnings,
     )  # fmt: skip
 
 

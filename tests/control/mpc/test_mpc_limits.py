@@ -11,6 +11,7 @@ from scipy.signal import cont2discrete
 
 import seaopt as so
 from seaopt.control import MPCSpec, close_loop, force_mpc
+from seaopt.control.loops.loop import Loop
 from seaopt.errors import ControlError
 
 TS, F_C, V_S = 1e-3, 50.0, 1e-3
@@ -146,7 +147,19 @@ def test_a_level_that_no_loop_keeps_is_refused(level):
 
 
 def test_the_report_has_its_limits(mpc, stand, thor, tmp_path):
-    fast = replace(made(stand, thor, bandwidth_hz=40.0), possible_hz=None)
+    fast = made(stand, thor, bandwidth_hz=40.0)
     for one, words in ((mpc, "design plant stuck"), (fast, "not met: max_sensitivity")):
         page = so.write_report([one], tmp_path / "report.html").read_text(encoding="utf-8")
         assert "Predictive control" in page and words in page and f"{one.achieved.ms:.4g}" in page
+
+
+def test_its_loops_are_judged_once(stand, rubbing, monkeypatch):
+    """Made, printed and asked for its limits: one measurement for sliding, one for stuck; a copy has its own."""
+    counted = []
+    measure = Loop.figures
+    monkeypatch.setattr(Loop, "figures", lambda loop: counted.append(loop) or measure(loop))
+    one = made(stand, rubbing)
+    assert one.feasible and one.achieved.stable and "sliding" in str(one)
+    assert len(counted) == 2
+    other = replace(one, spec=replace(one.spec, max_sensitivity=1.05))
+    assert one.feasible and not other.feasible and len(counted) == 4
