@@ -289,7 +289,7 @@ def test_with_a_link_that_turns_the_margin_is_that_of_the_plant_linearised_at_re
     late = control.ss(control.tf([1.0], [1.0, *[0.0] * controller.delay_samples], PERIOD))
     for slope in np.geomspace(1.0, margin.slopes[0], 20):
         viscous = thor.update(b_r=thor["b_r"].value + slope * radius**2)
-        plant = control.c2d(swing.linearize(viscous)["F1", "I"] * controller.command.per_effort, PERIOD)
+        plant = control.c2d(swing.linearize(viscous)[0, 0] * controller.command.per_effort, PERIOD)
         assert np.max(np.abs(control.feedback(plant * late * back, 1).poles())) < 1.0, slope
 
 
