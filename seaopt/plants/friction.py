@@ -133,6 +133,16 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
 
 
 @memo
+def remove_friction(plant: Plant) -> Plant:
+    """Return the plant as it moves at speed, where dry friction no longer changes with the velocity."""
+    friction = {
+        name: replace(friction, force=lambda v, p: 0.0 * v, slopes=lambda p: (0.0, 0.0), jump=None)
+        for name, friction in plant.friction.items()
+    }
+    return replace(plant, name=f"{plant.name} at speed", friction=friction)
+
+
+@memo
 def _friction_parameters(plant: Plant) -> frozenset[str]:
     """Return the parameters on which the difference of the slopes depends."""
     bounds = [bound_slopes(friction, _name_parameters(plant)) for friction in plant.friction.values()]

@@ -109,6 +109,9 @@ class Friction:
         The curve without its smoothing, for speeds from zero up: what it is at zero is what holds the joint at rest.
         A simulation in which the joint sticks, and stands still, takes it in the curve's place; a friction without one
         is what its curve says.
+    smoothing : str, optional
+        The parameter that is the speed over which the curve is smoothed through zero: as it falls the force tends to
+        a jump at rest, and a fit lets it fall by stages.
 
     """
 
@@ -118,6 +121,7 @@ class Friction:
     effort: Expression = _one
     slopes: Callable[[Any], tuple[Any, Any]] | None = None
     jump: Callable[[Any, Any], Any] | None = None
+    smoothing: str | None = None
 
     @property
     def slope_unit(self) -> str:

@@ -290,6 +290,7 @@ def _actuator(name: str, build: _Build, external: bool) -> Plant:
                 unit="N",
                 slopes=lambda p: part_laws.bound_friction_slopes(build.parts, p),
                 jump=lambda speed, p: part_laws.friction_level(build.parts, speed, p),
+                smoothing="v_s",
             )
         },
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in build.parts else None,

@@ -7,7 +7,7 @@ the fit's, at each one's own residuals. The gain counts only beyond what chance 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from itertools import combinations, zip_longest
 from typing import TypeVar
 
@@ -19,10 +19,11 @@ from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, f
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import measure_spread
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
+from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
-from seaopt.estimation.solver.settle import Solved, estimate_sigma
+from seaopt.estimation.solver.settle import Solved, estimate_sigma, sharpen
 from seaopt.estimation.solver.step_size import StepError, choose_first_steps
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
@@ -67,6 +68,8 @@ class Cause:
         Whether it leaves hardly anything of the residual of any output.
     consequence : str
         What it does to the residuals and the estimates.
+    preferred : mapping of name to (value, std)
+        What the refit gives the parameter or the delays that it frees.
 
     """
 
@@ -76,6 +79,7 @@ class Cause:
     solved: bool
     material: bool
     consequence: str
+    preferred: Mapping[str, tuple[float, float]]
 
 
 @record(eq=False)
@@ -83,7 +87,8 @@ class _Candidate:
     """A change to be refitted, and how to say what came of it: nothing where it came to nothing.
 
     `delays` are unknowns whose refit starts from the best of `FIRST_DELAYS`, all alike, `gains` unknowns that start
-    from how a simulation compares with its output. Where `certain`, nothing but a mistake explains a gain. `kept` are
+    from how a simulation compares with its output. `frees` are those whose values are worth stating, and what is to be
+    taken off them. Where `certain`, nothing but a mistake explains a gain. `kept` are
     the fit's own experiments with the samples that the change leaves, where it leaves out some: residuals of other
     samples tell a gain of many units by chance.
     """
@@ -91,11 +96,12 @@ class _Candidate:
     where: str
     experiments: tuple[Experiment, ...]
     params: ParameterSet
-    describe: Callable[[Mapping[str, float]], str | None]
+    describe: Callable[[Mapping[str, float], Mapping[str, float]], str | None]  # of the unknowns, and their stds
     certain: bool = False
     delays: tuple[str, ...] = ()
     gains: tuple[str, ...] = ()
     kept: tuple[Experiment, ...] = ()
+    frees: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 def find_causes(
@@ -187,13 +193,13 @@ def _refit(minimum: Minimum, candidate: _Candidate) -> Solved | None:
             other[i] = np.clip(z[i] + samples * problem.experiments[0].period, problem.unknowns.low[i], None)
         there = problem.evaluate(other)
         start = there if there.cost < start.cost else start
-    return _minimise_roughly(problem, start)
+    # Only the freed parameter's friction is sharpened: what the fit found out already needs no other search.
+    solved = _minimise_roughly(problem, start) if old.find_smoothing() else sharpen(problem, start, _minimise_roughly)
+    return solved if np.isfinite(solved.misfit) else None
 
 
-def _minimise_roughly(problem: FitProblem, start: Evaluation) -> Solved | None:
+def _minimise_roughly(problem: FitProblem, start: Evaluation) -> Solved:
     """Return a minimum that is near enough to tell a cause: sigma is estimated twice, the step chosen once."""
-    if not np.isfinite(start.cost):
-        return None
     problem, here = choose_first_steps(problem, start)
     problem = problem.with_each(substeps=min(MOST_SUBSTEPS, *(e.substeps for e in problem.experiments)))
     unknowns, solution = problem.unknowns, None
@@ -204,7 +210,7 @@ def _minimise_roughly(problem: FitProblem, start: Evaluation) -> Solved | None:
         )
         here = solution.evaluation
         if not np.isfinite(here.cost):
-            return None
+            break
     assert solution is not None
     return Solved(problem=problem, solution=solution, step_error=StepError())
 
@@ -240,8 +246,10 @@ def _weigh(
     fall = np.log(before[:, 0] / after[:, 0])
     gain = 0.5 * float(np.sum(before[:, 1] * fall)) / colour
     values = dict(zip(solved.problem.unknowns.names, solved.solution.z.tolist(), strict=True))
+    variances = colour * np.diag(invert(solved.solution.evaluation.hessian)[0])
+    stds = dict(zip(values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
     left = float(np.min(after[:, 0] / before[:, 0]))
-    text = candidate.describe(values) if gain > ENOUGH and not (poor and left > HALVED) else None
+    text = candidate.describe(values, stds) if gain > ENOUGH and not (poor and left > HALVED) else None
     if text is None:
         return None
     moved = [
@@ -261,6 +269,7 @@ def _weigh(
         gain=gain,
         solved=bool(np.all(after[:, 0] < SOLVED * before[:, 0])),
         consequence=consequence,
+        preferred={name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
         material=bool(moved) or left < HALVED or candidate.certain,
     )
 
@@ -292,6 +301,7 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
     tests = dict(suspects)
     for name in bending[:MOST_BENDING]:
         tests |= run_score_tests(minimum, fit, (name,)) if name not in tests else {}
+    speeds = {friction.smoothing for e in fit.experiments for friction in e.plant.friction.values()}
     groups = _group_alike({name: test for name, test in tests.items() if name in plain})
     in_turn = [name for rank in zip_longest(*groups) for name in rank if name is not None]
     for name in [*in_turn[:MOST_REFITTED], *(name for name in tests if name in bending)]:
@@ -301,13 +311,26 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
         start = test.preferred if name in bending else parameter.value
         params = free_more(fit, (name,)).update(**{name: start})
 
-        def describe(values: Mapping[str, float], parameter: Parameter = parameter) -> str | None:
-            value, unit = values[parameter.name], unit_after(parameter.unit)
-            return (
-                f"{parameter.name} = {value:.4g}{unit} in place of {parameter.value:.4g}{unit}; free it, or correct it"
-            )
+        def describe(values: Mapping[str, float], stds: Mapping[str, float], parameter: Parameter = parameter) -> str:
+            name = parameter.name
+            return _say_value(parameter, values[name], stds[name] if name in speeds else 0.0)
 
-        yield _Candidate(where=name, experiments=fit.experiments, params=params, describe=describe)
+        yield _Candidate(where=name, experiments=fit.experiments, params=params, describe=describe, frees={name: 0.0})
+
+
+def _say_value(parameter: Parameter, value: float, unresolved: float) -> str:
+    """Return what a parameter should have been; `unresolved` is the std of a speed that smooths friction."""
+    unit = unit_after(parameter.unit)
+    place = f"in place of {parameter.value:.4g}{unit}"
+    if value < 2.0 * unresolved:
+        return (
+            f"friction that jumps at rest more sharply than the logs resolve: {parameter.name} = {value:.1g}{unit} or "
+            f"less {place}; fix it there, or free it"
+        )
+    if value in (parameter.min, parameter.max):
+        way = "smaller" if value < parameter.value else "larger"
+        return f"{parameter.name} is much {way} {place}, as far as its bounds allow; correct it, or widen its bounds"
+    return f"{parameter.name} = {value:.4g}{unit} {place}; free it, or correct it"
 
 
 def _group_alike(tests: Mapping[str, ScoreTest]) -> list[list[str]]:
@@ -339,7 +362,7 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
         for e, lead, value in zip(experiments, leads, known, strict=True)
     )
 
-    def describe_common(values: Mapping[str, float]) -> str | None:
+    def describe_common(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         words: list[str] = []
         for e, lead, value in zip(experiments, leads, known, strict=True):
             late = values[f"{e.name}.delay_s"] - lead * e.log.period - value
@@ -351,7 +374,7 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
     kept = tuple(_cut_ends(e, lead) for e, lead in zip(experiments, leads, strict=True))
     yield _Candidate(
         where=experiments[0].name, experiments=shifted, params=params, describe=describe_common, delays=names,
-        kept=kept,
+        kept=kept, frees={name: lead * e.log.period for name, e, lead in zip(names, experiments, leads, strict=True)},
     )  # fmt: skip
     if all(len(e.outputs) == 1 for e in experiments):
         return
@@ -365,7 +388,7 @@ def _free_delays(experiments: tuple[Experiment, ...], params: ParameterSet) -> I
         for o in e.outputs
     )  # fmt: skip
 
-    def describe_each(values: Mapping[str, float]) -> str | None:
+    def describe_each(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         words: list[str] = []
         for e, lead, value in zip(experiments, leads, known, strict=True):
             late = {o: values[f"{e.name}-{o}.delay_s"] - lead * e.log.period - value for o in e.outputs}
@@ -438,7 +461,9 @@ def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *,
         if len(swapped) < len(experiments):
             continue
 
-        def describe(values: Mapping[str, float], one: str = one, other: str = other) -> str | None:
+        def describe(
+            values: Mapping[str, float], stds: Mapping[str, float], one: str = one, other: str = other
+        ) -> str | None:
             return f"the columns of {one} and {other} are swapped"
 
         yield _Candidate(where=f"{one}, {other}", experiments=swapped, params=params, describe=describe, certain=True)
@@ -474,7 +499,7 @@ def _clip_outputs(problem: FitProblem, residuals: ResidualsByExperiment, params:
         for o, ends in clipped[e.name].items()
     ]
 
-    def describe(values: Mapping[str, float]) -> str | None:
+    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         return f"{join_words(words)}, ahead of its noise; declare saturation"
 
     yield _Candidate(where=problem.experiments[0].name, experiments=experiments, params=params, describe=describe)
@@ -524,7 +549,9 @@ def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -
         known = plant.complete(params)["load_cell_hz"]
         pole = replace(known, value=0.3 * nyquist, free=True, max=100.0 * nyquist)
 
-        def describe(values: Mapping[str, float], group: tuple[str, ...] = group) -> str | None:
+        def describe(
+            values: Mapping[str, float], stds: Mapping[str, float], group: tuple[str, ...] = group
+        ) -> str | None:
             cut = values["load_cell_hz"]
             if cut > 2.0 * nyquist:
                 return None
@@ -543,7 +570,7 @@ def _free_gains(experiments: tuple[Experiment, ...], params: ParameterSet) -> It
     changed = tuple(replace(e, gain=dict.fromkeys(e.outputs, free)) for e in experiments)
     names = {f"{e.name}.gain.{o}": o for e in experiments for o in e.outputs}
 
-    def describe(values: Mapping[str, float]) -> str | None:
+    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         gains = [values[name] for name in names]
         common = float(np.median(gains))
         if len(gains) > 1 and all(abs(gain - common) < SNAP * abs(common) for gain in gains):
@@ -585,7 +612,7 @@ def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, pla
         for e in experiments
     )
 
-    def describe(values: Mapping[str, float]) -> str | None:
+    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         return f"the log is of the plant {plant.name}, not {experiments[0].plant.name}"
 
     yield _Candidate(

@@ -11,6 +11,7 @@ import numpy as np
 from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
+from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
 from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
 from seaopt.estimation.result.fit_result import Fit
@@ -22,6 +23,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import require_plant
 from seaopt.simulation.simulate import input_samples
+from seaopt.units import unit_after
 
 
 def fit(
@@ -97,6 +99,7 @@ def fit(
         holdout=holdout, noise=chosen.models_noise,
     )  # fmt: skip
     _check_samples(problem)
+    _check_stiffness(problem)
     solved = search_delay_cells(chosen.solve(problem, callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
     return judge(result, alternatives) if diagnostics else result
@@ -175,6 +178,25 @@ def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSe
     for name in params.free_names:
         parameters.setdefault(name, params[name])
     return ParameterSet(parameters.values())
+
+
+def _check_stiffness(problem: FitProblem) -> None:
+    """Refuse friction that is too sharp to be simulated; where its smoothing speed is free, the search raises that."""
+    for experiment in () if problem.find_smoothing() else problem.experiments:
+        if not experiment.is_too_stiff(problem.unknowns.start):
+            continue
+        steps, plant = experiment.count_stable_steps(problem.unknowns.start), experiment.data.plant
+        speeds = plant.complete(problem.params)
+        names = dict.fromkeys(f.smoothing for f in plant.friction.values() if f.smoothing)
+        sharp = [
+            f"give {n} = {speeds[n].value * steps / MAX_SUBSTEPS:.1e}{unit_after(speeds[n].unit)} or more in place of "
+            f"{speeds[n].value:.1g}, or free it"
+            for n in names
+        ]
+        raise EstimationError(
+            f"experiment {experiment.name}: {plant.name} is so stiff near rest that each sample takes {steps:.2g} "
+            f"integration steps, and {MAX_SUBSTEPS} are the most; {' and '.join(sharp) or 'smooth what is sharp'}"
+        )
 
 
 def _check_samples(problem: FitProblem) -> None:

@@ -266,4 +266,5 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
     yield FitFinding(
         severity="error" if any(cause.material for cause in rivals) else "warning", kind="cause",
         where=", ".join(dict.fromkeys(cause.where for cause in rivals)), text=text,
+        preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
     )  # fmt: skip

@@ -16,10 +16,11 @@ from seaopt.estimation.problem.normal_equations import add_gram
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.problem.unknowns import Slot, Slots
 from seaopt.records import record
-from seaopt.simulation import Clock, Model, Pass, Point, Segment, Weights, run_passes, stream
+from seaopt.simulation import Clock, Model, Pass, Point, Segment, Weights, count_stable_steps, run_passes, stream
 
 CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
 FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
+MAX_SUBSTEPS = 256
 
 
 @record(eq=False)
@@ -108,7 +109,7 @@ class FitExperiment:
     holdout : float
         Last fraction of the log that gets no weight.
     substeps : int
-        Integration steps per sample.
+        Least number of integration steps per sample; see `count_steps`.
     predictor : SteadyStateFilter or None
         With one, the residual is the error of the prediction one sample ahead.
 
@@ -159,6 +160,19 @@ class FitExperiment:
         """Whether offsets are wanted that the band does not show: they are then what is left over on average."""
         return self.data.offset is True and not sees_level(self.band_hz)
 
+    def count_steps(self, z: Float[np.ndarray, " n"]) -> int:
+        """Return the integration steps per sample: more than asked for where fewer would be unstable."""
+        stable = self.count_stable_steps(z)
+        return self.substeps if stable > MAX_SUBSTEPS else max(self.substeps, int(stable))
+
+    def is_too_stiff(self, z: Float[np.ndarray, " n"]) -> bool:
+        """Whether rates near rest, as sharp friction's, ask for finer steps than `MAX_SUBSTEPS` in a sample."""
+        return self.count_stable_steps(z) > MAX_SUBSTEPS
+
+    def count_stable_steps(self, z: Float[np.ndarray, " n"]) -> float:
+        """Return how many integration steps per sample are stable, whatever `substeps`."""
+        return 1.0 if self.model.linear else count_stable_steps(self.model, z[self.theta], self.period)
+
     def point(self, z: Float[np.ndarray, " n"]) -> Point:
         """Return where the passes are made."""
         slots = self.slots
@@ -173,7 +187,7 @@ class FitExperiment:
                 delay_s=slots.delay.at(z),
                 delay_free=slots.delay.index is not None,
             ),
-            substeps=self.substeps,
+            substeps=self.count_steps(z),
         )
         if self.predictor is None:
             return point

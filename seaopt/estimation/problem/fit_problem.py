@@ -141,10 +141,17 @@ class FitProblem:
         return list(threads().map(call, self.experiments))
 
     def evaluate(self, z: Float[np.ndarray, " n"]) -> Evaluation:
-        """Return cost, gradient and Hessian at the best linear unknowns; infinite if the plant overflows."""
+        """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
         passes = self.map(lambda experiment: experiment.run_all(z))
         names = (experiment.name for experiment in self.experiments)
-        return self.assemble(PassSet(z=z, by_experiment=dict(zip(names, passes, strict=True))))
+        here = self.assemble(PassSet(z=z, by_experiment=dict(zip(names, passes, strict=True))))
+        return replace(here, cost=np.inf) if any(e.is_too_stiff(z) for e in self.experiments) else here
+
+    def find_smoothing(self) -> list[int]:
+        """Return the unknowns that are speeds over which some plant's friction is smoothed through zero."""
+        plants = [experiment.data.plant for experiment in self.experiments]
+        names = {friction.smoothing for plant in plants for friction in plant.friction.values()}
+        return [i for i, name in enumerate(self.unknowns.names[: self.unknowns.shared]) if name in names]
 
     def take_step(self, step: TrustRegionStep[Evaluation]) -> Evaluation:
         """Return the evaluation at the end of a step."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, Literal
 
@@ -30,6 +31,8 @@ class FitFinding:
         EXPERIMENT.OUTPUT, an experiment, a parameter, or empty.
     text : str
         What it is and what to do.
+    preferred : mapping of name to (value, std)
+        What the logs would have in place of what was fixed, of a "cause".
 
     """
 
@@ -37,6 +40,7 @@ class FitFinding:
     kind: str
     where: str
     text: str
+    preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
 
 
 @record

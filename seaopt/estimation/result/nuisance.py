@@ -79,6 +79,6 @@ def describe_nuisance(
         std={
             key: float(np.sqrt(max(variance[slot.index], 0.0))) for key, slot in free.items() if slot.index is not None
         },
-        substeps=experiment.substeps,
+        substeps=experiment.count_steps(z),
         plant=experiment.data.plant.name,
     )

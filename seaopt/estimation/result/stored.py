@@ -98,6 +98,7 @@ class StoredFinding(ResultTable):
     kind: str
     where: str
     text: str
+    preferred: dict[str, tuple[float, float]] = {}
 
 
 class StoredOutput(ResultTable):

@@ -38,7 +38,7 @@ from seaopt.estimation.solver.methods import Method
 from seaopt.estimation.solver.settle import Solved, explains_little
 from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, StepError
 from seaopt.formatting import join_words
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.units import unit_after
 
@@ -71,9 +71,10 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
             for i, name in enumerate(names)
         )
     )
+    sizes = _take_sizes(problem)
     status, message = _find_status(solution, known, evaluation.hessian, names, solved.step_error)
     if status == "converged":
-        fitted, message = _mark_vague(fitted, params, known, message)
+        fitted, message = _mark_vague(fitted, sizes, known, message)
         status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
     outputs = _describe_outputs(problem, z, statistics) if statistics is not None else {}
     if statistics is not None and not _explains_something(problem, outputs, statistics):
@@ -114,10 +115,19 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         method=method.key,
         notes=(
             *(f"{experiment.name}: {note}" for experiment in experiments for note in experiment.notes),
-            *_find_oddities(fitted, params, evaluation),
+            *_find_oddities(fitted, sizes, evaluation),
         ),
         experiments=experiments,
         minimum=Minimum(problem=problem, z=z, method=method),
+    )
+
+
+def _take_sizes(problem: FitProblem) -> ParameterSet:
+    """Return the parameters at their starts; a speed that smooths friction at its plant's own, for it may be tiny."""
+    names = {problem.unknowns.names[i] for i in problem.find_smoothing()}
+    owns = {name: one for e in problem.experiments for name, one in e.data.plant.parameters.items() if name in names}
+    return problem.params.with_parameters(
+        *(replace(problem.params[name], value=one.value) for name, one in owns.items() if isinstance(one, Parameter))
     )
 
 

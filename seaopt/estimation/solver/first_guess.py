@@ -18,8 +18,10 @@ from seaopt.errors import LogError
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.frequency.response import FrequencyResponse, responses
+from seaopt.parameters import ParameterSet
+from seaopt.plants.friction import remove_friction
 from seaopt.records import record
-from seaopt.simulation import Model, linearise
+from seaopt.simulation import Model, linearise, make_model
 
 CANDIDATES = 128
 REFINED_CANDIDATES = 8
@@ -51,7 +53,7 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
     None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
     """
     unknowns = problem.unknowns
-    usable = (_measure_target(experiment) for experiment in problem.experiments)
+    usable = (_measure_target(experiment, problem.params) for experiment in problem.experiments)
     targets = [target for target in usable if target is not None]
     if not targets:
         return [], False
@@ -73,7 +75,7 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
     return guesses, refined[0][0] <= enough
 
 
-def _measure_target(experiment: FitExperiment) -> _Target | None:
+def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target | None:
     data, log, band_hz = experiment.data, experiment.data.log, experiment.band_hz
     active = [n for n in data.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
     if len(active) != 1 or len(data.stretches) != 1:
@@ -102,7 +104,11 @@ def _measure_target(experiment: FitExperiment) -> _Target | None:
     delay = experiment.slots.delay.value + (0.5 * log.period if data.hold == "zero" else 0.0)
     s = 2j * np.pi * estimates[0].frequency_hz[rows]
     gain = np.array([experiment.slots.gain[o].value for o in chosen])
-    model = linearise(experiment.model)
+    # Dry friction at rest is a damper of f_c/v_s, which is no more there once the actuator moves.
+    model = experiment.model
+    if not model.linear and data.plant.friction:
+        model = make_model(remove_friction(data.plant), params, model.free, model.outputs)
+    model = linearise(model)
     return _Target(
         model=model,
         index=experiment.theta.tolist(),

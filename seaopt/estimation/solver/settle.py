@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.fit_experiment import ResidualPower
+from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, ResidualPower
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.solver.least_squares import DECREMENT, Callback, Solution, minimise
@@ -25,7 +25,10 @@ from seaopt.records import record
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
 ROUGH = 1.0  # squared standard deviations to the minimum, near enough to tell the sigmas
-NOISE_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: Gauss-Newton is slow along it
+FALL = 4.0  # of a smoothing speed of friction, in a stage
+TOLD = 2.0  # of the misfit, which is twice a log-likelihood: what sharper friction has to gain
+HALF = 0.5  # of the finest steps, which leaves room to check their error
+FLAT_DECREMENT = 1e-3  # process noise that is hardly there, or sharp friction, is a flat direction: slow to search
 
 
 @record(eq=False)
@@ -48,12 +51,53 @@ class Solved:
 
 def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
     """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
+    return sharpen(problem, start, lambda stage, here: _settle(stage, here, max_iterations, callback))
+
+
+def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem, Evaluation], Solved]) -> Solved:
+    """Solve a problem; friction's free smoothing speeds fall by stages, as long as the logs gain by it.
+
+    The sharper friction is, the stiffer is the plant and the less do the logs tell how sharp: a search that went
+    straight down would end where nothing can be simulated. Each stage lets a speed fall to a quarter. The last is the
+    one that ends above that, beyond which the next gains no more than chance gives, or takes too fine steps.
+    """
+    places, unknowns = problem.find_smoothing(), problem.unknowns
+    if not places:
+        return solve(problem, start)
+
+    def solve_stage(problem: FitProblem, here: Evaluation) -> Solved:
+        low = unknowns.low.copy()
+        low[places] = np.maximum(low[places], here.z[places] * max(1.0 / FALL, _measure_stiffness(problem, here.z)))
+        return solve(replace(problem, unknowns=replace(unknowns, low=low)), here)
+
+    stiffness = _measure_stiffness(problem, start.z)
+    if stiffness > 1.0:  # too sharp to begin with
+        z = start.z.copy()
+        z[places] *= stiffness
+        start = problem.evaluate(z)
+    solved = solve_stage(problem, start)
+    while np.any(solved.solution.z[places] <= solved.problem.unknowns.low[places]):
+        if _measure_stiffness(problem, solved.solution.z) > HALF or not np.isfinite(solved.misfit):
+            break
+        sharper = solve_stage(solved.problem, solved.solution.evaluation)
+        if not solved.misfit - sharper.misfit > TOLD:
+            break
+        solved = sharper
+    return replace(solved, problem=replace(solved.problem, unknowns=unknowns))
+
+
+def _measure_stiffness(problem: FitProblem, z: Float[np.ndarray, " n"]) -> float:
+    """Return the stable integration steps over those that a search may take."""
+    return max(e.count_stable_steps(z) for e in problem.experiments) / (HALF * MAX_SUBSTEPS)
+
+
+def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
     unknowns, iterations = problem.unknowns, 0
     if not np.isfinite(start.cost):
         solution = minimise(problem, start, unknowns.low, unknowns.high)
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
     problem, here = choose_first_steps(problem, start)
-    decrement = NOISE_DECREMENT if problem.predicts else DECREMENT
+    decrement = FLAT_DECREMENT if problem.predicts or problem.find_smoothing() else DECREMENT
     checks: Checks = {}
     rough, before = problem.straight and not explains_little(problem, here.power), 0.0
     if rough:  # so good a start gives sigmas good enough to come near the minimum, and there they are estimated well

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, FitExperiment
+from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, MAX_SUBSTEPS, FitExperiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.records import record
@@ -19,7 +19,6 @@ STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
 FIRST_STEP_ERROR = 0.1  # allowed in an output while sigma is not yet known
 MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trust
 NEARBY = 10.0  # standard deviations, over which a step error does not change
-MAX_SUBSTEPS = 256
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
 
 
@@ -52,7 +51,7 @@ def choose_first_steps(problem: FitProblem, start: Evaluation) -> tuple[FitProbl
     """Return the problem with steps that do for a first search, and its evaluation there."""
     while True:
         finer = problem.map(lambda experiment, here=start: _choose_first_steps(experiment, here))
-        if finer == [experiment.substeps for experiment in problem.experiments]:
+        if finer == [experiment.count_steps(start.z) for experiment in problem.experiments]:
             return problem, start
         problem = _with_substeps(problem, finer)
         start = problem.evaluate(start.z)
@@ -62,12 +61,13 @@ def _choose_first_steps(experiment: FitExperiment, here: Evaluation) -> int:
     """Return the steps that an experiment's first samples ask for."""
     if experiment.model.linear:
         return experiment.substeps
-    z, halved, fine = here.passes.z, _halve_steps(experiment), []
+    z, fine = here.passes.z, []
+    halved = _halve_steps(experiment, z)
     for segment in experiment.segments:
         edges = np.array([0, min(segment.samples.n, FIRST_SAMPLES)])
         fine.append(halved.run(segment, z, edges=edges, sums=False, outputs=True))
     error = _measure_output_error(experiment, z, here.passes.by_experiment[experiment.name], fine)
-    return _choose_steps(experiment.substeps, StepError(output=error), FIRST_STEP_ERROR)
+    return _choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR)
 
 
 def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
@@ -77,8 +77,11 @@ def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple
     """
     while True:
         checks = check_steps(problem, here, checks)
-        substeps = [experiment.substeps for experiment in problem.experiments]
-        finer = [_choose_steps(e.substeps, checks[e.name].error, STEP_ERROR_SIGMA) for e in problem.experiments]
+        substeps = [experiment.count_steps(here.z) for experiment in problem.experiments]
+        finer = [
+            _choose_steps(steps, checks[e.name].error, STEP_ERROR_SIGMA)
+            for e, steps in zip(problem.experiments, substeps, strict=True)
+        ]
         if finer == substeps:
             return problem, here, checks
         trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
@@ -92,12 +95,12 @@ def check_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> Checks
     """Return the step error of every experiment: known still, where neither its step nor the minimum has changed."""
 
     def check(experiment: FitExperiment) -> Check:
-        known = checks.get(experiment.name)
-        if known is not None and known.substeps == experiment.substeps:
+        known, substeps = checks.get(experiment.name), experiment.count_steps(here.z)
+        if known is not None and known.substeps == substeps:
             moved = here.z - known.z
             if moved @ here.hessian @ moved < NEARBY**2:
                 return known
-        return Check(error=measure_step_error(problem, experiment, here), z=here.z, substeps=experiment.substeps)
+        return Check(error=measure_step_error(problem, experiment, here), z=here.z, substeps=substeps)
 
     return {e.name: made for e, made in zip(problem.experiments, problem.map(check), strict=True)}
 
@@ -132,7 +135,7 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Eva
     if experiment.model.linear:
         return StepError()
     z, passes, n = here.passes.z, here.passes.by_experiment[experiment.name], here.z.size
-    fine = _halve_steps(experiment).run_all(z)
+    fine = _halve_steps(experiment, z).run_all(z)
     worst = _measure_output_error(experiment, z, passes, fine)
     weighted = replace(experiment, sigma=_floored_sigma(experiment))
     coarse = weighted.normal(passes, n)
@@ -147,8 +150,8 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Eva
     return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
-def _halve_steps(experiment: FitExperiment) -> FitExperiment:
-    return replace(experiment, substeps=2 * experiment.substeps)
+def _halve_steps(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> FitExperiment:
+    return replace(experiment, substeps=2 * experiment.count_steps(z))
 
 
 def _floored_sigma(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:

@@ -1,0 +1,77 @@
+"""Fits of an actuator whose friction jumps at rest, made by a simulator that sticks exactly and shares no code."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.errors import EstimationError
+from seaopt.simulation import count_stable_steps, make_model
+from tests.stick_slip import Mass, simulate
+
+RATE_HZ, SECONDS = 500.0, 4.0
+FREE = ("k", "J", "b_r", "f_c")
+
+
+@pytest.fixture(scope="module")
+def truth(stand, thor):
+    return stand.complete(thor.update(f_c=35.0))
+
+
+@pytest.fixture(scope="module")
+def bench(stand, truth):
+    """Multisine and a slow triangle of current, 2 N of noise; the encoder is as good."""
+    p = {name: parameter.value for name, parameter in truth.items()}
+    t, rng = np.arange(int(RATE_HZ * SECONDS)) / RATE_HZ, np.random.default_rng(0)
+    sines = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 2 * np.pi)) for f in np.geomspace(0.3, 60, 20))
+    current = 0.25 * sines + 2.0 * (2.0 * np.abs(2.0 * ((t / 2.0 + 0.2) % 1.0) - 1.0) - 1.0)
+    effort = 2.0 * np.pi * p["N_p"] / p["l"] * p["eta"] * p["K_tau"]
+    open_loop = {
+        "sample_time_s": 1.0 / RATE_HZ, "delay_samples": 0, "reference": {"num": [1.0], "den": [1.0]},
+        "measurement": {"num": [0.0], "den": [1.0]},
+    }  # fmt: skip
+    force = simulate([Mass.of(p, jump=True)], [open_loop], effort * current[None], substeps=25).force[0]
+    noise = 2.0 * rng.normal(size=(2, t.size))
+    log = so.Log.from_arrays(time=t, I=current, F1=force + noise[0], q=(force + noise[1]) / p["k"])
+    return so.Experiment(plant=stand, log=log, name="jump", outputs=("F1", "q"))
+
+
+@pytest.mark.parametrize("start", [1e-3, pytest.param(1e-9, marks=pytest.mark.slow)])
+def test_a_free_smoothing_speed_falls_until_the_log_resolves_no_more(bench, truth, start):
+    fit = so.fit([bench], truth.update(v_s=start).free(*FREE, "v_s"))
+    assert fit.met, fit
+    for name in FREE:
+        found = fit.parameters[name]
+        assert abs(found.value - truth[name].value) < 4.0 * found.std, name
+    v_s = fit.parameters["v_s"]
+    assert v_s.value < 1e-4 and v_s.value < 4.0 * v_s.std  # nothing tells it from the jump
+
+
+def test_what_is_told_of_smooth_friction_is_no_bound(bench, truth):
+    fit = so.fit([bench], truth.update(v_s=1e-3).free(*FREE))
+    (cause,) = (finding for finding in fit.findings if finding.kind == "cause")
+    assert cause.where == "v_s" and "jumps" in cause.text
+    value, std = cause.preferred["v_s"]
+    assert truth["v_s"].min < value < 1e-4 and value < 4.0 * std
+    again = so.fit([bench], truth.update(v_s=value).free(*FREE))
+    assert again.met and not again.findings
+
+
+def test_friction_too_sharp_to_simulate_is_refused_with_the_speed_that_can_be(bench, truth):
+    with pytest.raises(EstimationError, match=r"v_s = .* or more in place of 1e-09") as caught:
+        so.fit([bench], truth.update(v_s=1e-9).free(*FREE))
+    least = float(str(caught.value).split("v_s = ")[1].split()[0])
+    steps = count_stable_steps(make_model(bench.plant, truth.update(v_s=least)), np.zeros(0), 1.0 / RATE_HZ)
+    assert 240 < steps < 270
+
+
+def test_steps_are_stable_at_rest(stand, truth):
+    """There the plant is the spring-mass with b + f_c/v_s of damping, whose fast pole is (b + f_c/v_s)/m, about."""
+    p, v_s, period = {name: parameter.value for name, parameter in truth.items()}, 1e-6, 1e-3
+    mass = Mass.of(p)
+    fast = np.max(np.abs(np.roots([mass.m, mass.b + mass.f_c / v_s, mass.k])))
+    steps = count_stable_steps(make_model(stand, truth.update(v_s=v_s)), np.zeros(0), period)
+    assert steps == np.ceil(fast * period / 2.5)
+    growth = np.polyval([1 / 24, 1 / 6, 1 / 2, 1.0, 1.0], -fast * period / steps)  # of Runge-Kutta's method
+    assert abs(growth) < 1.0
