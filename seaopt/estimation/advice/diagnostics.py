@@ -1,13 +1,14 @@
 """What is wrong with a fit, and what to do about it: tests of its residuals, of its predictions, and of its data.
 
-The tests have modules of their own: `correlation` of residuals, `forecasts`, `leverage`, and `score_test` for
-parameters that were fixed. What they found is put into plain sentences here.
+What is wrong with the model is the fit's own judgement (see `judge`): its findings come first. Tests of the residuals
+that need more than the verdict does have modules of their own: `correlation`, `forecasts`, `leverage`, and `score_test`
+for parameters that were fixed. What they found is put into plain sentences here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, field
+from dataclasses import asdict, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,33 +17,35 @@ from jaxtyping import Float
 from seaopt.estimation.advice.forecasts import (
     Percent,
     compute_percent,
-    filter_to_band,
     predict_one_step,
     simulate_freely,
-    split_samples,
 )
-from seaopt.estimation.judgement.causes import free_delay
-from seaopt.estimation.judgement.score_test import SIGNIFICANCE, Culprit, ScoreTest, correlate_with_inputs, find_culprit
-from seaopt.estimation.problem.correlation import INPUT_LAGS, QUANTILE, CrossCorrelation, autocorrelation
-from seaopt.estimation.problem.fit_experiment import FitExperiment, FitOutput
+from seaopt.estimation.judgement.judge import judge
+from seaopt.estimation.judgement.score_test import ScoreTest, run_score_tests
+from seaopt.estimation.problem.correlation import (
+    INPUT_LAGS,
+    QUANTILE,
+    CrossCorrelation,
+    autocorrelation,
+    cross_correlation,
+)
+from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.residual_statistics import (
     ExperimentResiduals,
     ResidualsByExperiment,
     compute_statistics,
 )
-from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.result.findings import FitFinding
+from seaopt.estimation.result.fit_result import Fit
+from seaopt.estimation.result.summary import describe_outputs
 from seaopt.estimation.uncertainty.leverage import PRIORS, Leverage, measure_leverage
 from seaopt.formatting import html_text
 from seaopt.records import record
-from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
+SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 LARGE = 0.05  # of an output's rms: a residual that is worth words for its colour alone
-HALF = 0.5  # of a residual's power: a delay that leaves less is taken for its cause
-WORSE_HELD_OUT = 1.5  # times the rms over the samples used: a held-out residual that is worth words
 LITTLE = 0.01  # share of what is known
-DELAY_REFIT_ITERATIONS = 25
 
 
 @record(eq=False)
@@ -88,6 +91,8 @@ class Diagnostics:
         the same effect as the free ones, or that would make a linear plant nonlinear.
     aic, bic : float
         Of the fit.
+    findings : tuple of FitFinding
+        Of the fit; of one that was made without diagnostics, of its judgement here.
     sentences : tuple of str
         What is wrong and what to do about it, the worst first; empty if no problem was found.
     residuals : mapping of experiment to ExperimentResiduals
@@ -101,6 +106,7 @@ class Diagnostics:
     held: Mapping[str, ScoreTest]
     aic: float
     bic: float
+    findings: tuple[FitFinding, ...]
     sentences: tuple[str, ...]
     residuals: ResidualsByExperiment = field(default_factory=dict[str, ExperimentResiduals], repr=False)
 
@@ -202,36 +208,32 @@ def diagnose(fit: Fit) -> Diagnostics:
     ...                   sensors=Sensors(noise_std={"F1": 2.0}))
     >>> late = so.Log.from_arrays(time=log.time[:-2], I=log["I"][2:], F1=log["F1"][:-2])
     >>> fit = so.fit([so.Experiment(plant=plant, log=late, name="late")], truth.free("J", "b_r"))
-    >>> print(diagnose(fit).sentences[0])
-    late.F1: the residual follows I, ... with a delay of 5 ms 99 % of its power is gone; free delay_s
+    >>> cause = next(one for one in diagnose(fit).findings if one.kind == "cause")
+    >>> print(cause.text)
+    likely cause: a delay of 5... ms; give delay_s, or free it ...
+    >>> value, std = cause.preferred["late.delay_s"]
+    >>> abs(value - 0.005) < 3 * std
+    True
 
     """
     minimum = fit.require_minimum("diagnose")
     problem = minimum.problem
+    if not fit.outputs:
+        fit = judge(replace(fit, outputs=describe_outputs(problem, minimum.z, compute_statistics(problem, minimum.z))))
     residuals = minimum.residuals()
     free, ahead = simulate_freely(minimum, residuals), predict_one_step(minimum)
-    white = _find_whiteness(fit, minimum)
     outputs: dict[str, dict[str, OutputDiagnostics]] = {experiment.name: {} for experiment in problem.experiments}
     for output in problem.outputs:
-        whiteness_p = white[output.experiment.name][output.name]
+        whiteness_p = fit.outputs[output.experiment.name][output.name].whiteness_p
         outputs[output.experiment.name][output.name] = _diagnose_output(output, residuals, free, ahead, whiteness_p)
     leverage, at_bound = measure_leverage(minimum), problem.unknowns.find_at_bound(minimum.z)
-    tests, culprit = find_culprit(minimum, fit, residuals)
     sentences = [] if fit.status == "converged" else [f"the fit is {fit.status.replace('_', ' ')}: {fit.message}"]
-    sentences += [f"{name} lies on its bound: widen the bound, or fix it there and say why" for name in at_bound]
-    sentences += [*_advise_on_outputs(fit, outputs, residuals, free, culprit), *_advise_on_leverage(leverage)]
+    sentences += [f"{one.where}: {one.text}" if one.where else one.text for one in fit.findings]
+    sentences += [*_advise_on_outputs(fit, outputs, residuals), *_advise_on_leverage(leverage)]
     return Diagnostics(
-        outputs=outputs, leverage=leverage, at_bound=at_bound, held=tests, aic=fit.aic, bic=fit.bic,
-        sentences=tuple(sentences), residuals=residuals,
+        outputs=outputs, leverage=leverage, at_bound=at_bound, held=run_score_tests(minimum, fit), aic=fit.aic,
+        bic=fit.bic, findings=fit.findings, sentences=tuple(sentences), residuals=residuals,
     )  # fmt: skip
-
-
-def _find_whiteness(fit: Fit, minimum: Minimum) -> dict[str, dict[str, float]]:
-    """Return each output's Ljung-Box p, which a fit without diagnostics does not have."""
-    if fit.outputs:
-        return {name: {output: row.whiteness_p for output, row in rows.items()} for name, rows in fit.outputs.items()}
-    statistics = compute_statistics(minimum.problem, minimum.z)
-    return {name: {output: sums.whiteness(output) for output in sums.outputs} for name, sums in statistics.items()}
 
 
 def _diagnose_output(
@@ -244,99 +246,41 @@ def _diagnose_output(
         whiteness_p=whiteness_p,
         autocorrelation=autocorrelation(residual, min(INPUT_LAGS, residual.size - 1)),
         autocorrelation_bound=QUANTILE / float(np.sqrt(max(count, 1))),
-        inputs=correlate_with_inputs(output, residuals),
+        inputs=_correlate_with_inputs(output, residuals),
         free_run=compute_percent(output, free),
         one_step=Percent(used=np.nan, held_out=None) if ahead is None else compute_percent(output, ahead),
     )
 
 
+def _correlate_with_inputs(output: FitOutput, residuals: ResidualsByExperiment) -> dict[str, CrossCorrelation]:
+    """Return the correlation of an output's residual with each input that moves."""
+    segments = output.experiment.segments
+    weighted = residuals[output.experiment.name].weighted_of(output.name)
+    correlations: dict[str, CrossCorrelation] = {}
+    for i, name in enumerate(output.experiment.data.plant.inputs):
+        cross = cross_correlation(weighted, [segment.samples.inputs[i] for segment in segments])
+        if cross is not None:
+            correlations[name] = cross
+    return correlations
+
+
 def _advise_on_outputs(
-    fit: Fit, outputs: Mapping[str, Mapping[str, OutputDiagnostics]], residuals: ResidualsByExperiment,
-    free: ResidualsByExperiment, culprit: Culprit | None,
-) -> list[str]:  # fmt: skip
-    """Return what is wrong with the residuals, and what to do about it; the parameter to blame first."""
-    problem = fit.require_minimum("diagnose").problem
-    trials = {
-        experiment.name: _try_delay(fit, experiment)
-        for experiment in problem.experiments
-        if any(_follows_input(row) for row in outputs[experiment.name].values())
-    }
-    if culprit is not None and not _is_to_blame(culprit, problem.outputs, outputs, trials):
-        culprit = None
-    sentences = [] if culprit is None else [culprit.sentence]
+    fit: Fit, outputs: Mapping[str, Mapping[str, OutputDiagnostics]], residuals: ResidualsByExperiment
+) -> list[str]:
+    """Return what the residuals show besides the fit's findings."""
+    problem, sentences = fit.require_minimum("diagnose").problem, list[str]()
+    # What a cause or the inputs would explain is not noise, whatever a filter predicts of it.
+    explained = any(one.kind in ("cause", "explained") for one in fit.findings)
     for output in problem.outputs:
-        row, trial = outputs[output.experiment.name][output.name], trials.get(output.experiment.name)
-        about_inputs = _advise_on_inputs(output, row, residuals, trial, culprit)
-        whitened = culprit is not None and culprit.remainders[output.label].white
-        # What the inputs would explain is not noise, whatever a filter predicts of it.
-        lacking = [one for one in fit.findings if one.kind == "explained" and one.where == output.label]
-        sentences += [f"{one.where}: {one.text}" for one in lacking]
-        quiet = whitened or bool(lacking)
-        sentences += about_inputs or ([] if quiet else _advise_on_colour(output, row, problem.predicts))
-        sentences += _advise_on_held_out(output, row, free)
+        row = outputs[output.experiment.name][output.name]
+        about_inputs = _advise_on_inputs(output, row, residuals, explained=explained)
+        sentences += about_inputs or ([] if explained else _advise_on_colour(output, row, problem.predicts))
     return sentences
 
 
-def _follows_input(row: OutputDiagnostics) -> bool:
-    return any(cross.p < SIGNIFICANCE and cross.worst_lag >= 0 for cross in row.inputs.values())
-
-
-@record(eq=False)
-class _DelayTrial:
-    """What a free delay of one experiment's input would change: the delay, and the power left of each output."""
-
-    delay_s: float
-    remaining: Mapping[str, float]
-    early: bool
-
-
-def _try_delay(fit: Fit, experiment: FitExperiment) -> _DelayTrial | None:
-    """Refit from the minimum with the delay free; None where it is free already, or cannot be."""
-    minimum = fit.require_minimum("diagnose")
-    if experiment.slots.delay.index is not None or depends_on_time(experiment.model):
-        return None
-    known, name = experiment.slots.delay.value, experiment.name
-    span = INPUT_LAGS * experiment.period
-    trial, z = minimum.problem.rebuild(
-        fit.parameters, minimum.z, {name: free_delay(experiment.data, known, known + span)}
-    )
-    before = trial.evaluate(z)
-    after = minimise(
-        trial, before, trial.unknowns.low, trial.unknowns.high, max_iterations=DELAY_REFIT_ITERATIONS
-    )  # fmt: skip
-    refitted = next(each.slots.delay.at(after.z) for each in trial.experiments if each.name == name)
-    remaining = after.evaluation.power[name].squares / np.maximum(before.power[name].squares, 1e-300)
-    return _DelayTrial(
-        delay_s=refitted, remaining=dict(zip(experiment.data.outputs, remaining.tolist(), strict=True)),
-        early=refitted <= known + 1e-3 * experiment.period,
-    )  # fmt: skip
-
-
-def _is_to_blame(
-    culprit: Culprit, measured: tuple[FitOutput, ...], outputs: Mapping[str, Mapping[str, OutputDiagnostics]],
-    trials: Mapping[str, _DelayTrial | None],
-) -> bool:  # fmt: skip
-    """Tell whether a fixed parameter explains whatever goes with an input, and does so better than a delay.
-
-    Where nothing does, it must leave white residuals: of what else moves the plant the test knows nothing.
-    """
-    related = False
-    for output in measured:
-        row, trial = outputs[output.experiment.name][output.name], trials.get(output.experiment.name)
-        if all(cross.p >= SIGNIFICANCE for cross in row.inputs.values()):
-            continue
-        related, remainder = True, culprit.remainders[output.label]
-        if trial is not None and trial.remaining[output.name] < min(HALF, remainder.power):
-            return False
-        if not remainder.explained:
-            return False
-    return related or all(remainder.white for remainder in culprit.remainders.values())
-
-
 def _advise_on_inputs(
-    output: FitOutput, row: OutputDiagnostics, residuals: ResidualsByExperiment, trial: _DelayTrial | None,
-    culprit: Culprit | None,
-) -> list[str]:  # fmt: skip
+    output: FitOutput, row: OutputDiagnostics, residuals: ResidualsByExperiment, *, explained: bool
+) -> list[str]:
     """Return which input the residual follows and what that means."""
     sentences: list[str] = []
     for name, cross in row.inputs.items():
@@ -350,32 +294,14 @@ def _advise_on_inputs(
             )
             continue
         late = f" = {1e3 * lag * output.experiment.period:.3g} ms" if lag else ""
+        residual = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
+        frequency = _find_centre_hz(residual, output.experiment.period)
+        rest = "what no cause above explains is a missing pole" if explained else "a missing pole"
         sentences.append(
-            f"{output.label}: the residual follows {name}, most around lag {lag}{late} {size}: "
-            f"{_find_remedy(output, residuals, trial, culprit)}"
+            f"{output.label}: the residual follows {name}, most around lag {lag}{late} {size}, half of its power is "
+            f"below {frequency:.3g} Hz: {rest}; compare() it with a plant that has one more part"
         )
     return sentences
-
-
-def _find_remedy(
-    output: FitOutput, residuals: ResidualsByExperiment, trial: _DelayTrial | None, culprit: Culprit | None
-) -> str:
-    """Return whether a fixed parameter or a delay would explain the residual; a missing pole or resonance otherwise."""
-    if culprit is not None:
-        remainder = culprit.remainders[output.label]
-        rest = (
-            "nothing follows it"
-            if remainder.follows_no_input
-            else f"{100.0 * remainder.power:.2g} % of its power is left"
-        )
-        return f"with {culprit.first} {rest}"
-    if trial is not None and trial.remaining[output.name] < HALF:
-        gone = 100.0 * (1.0 - trial.remaining[output.name])
-        return f"with a delay of {1e3 * trial.delay_s:.3g} ms {gone:.0f} % of its power is gone; free delay_s"
-    residual = np.concatenate(residuals[output.experiment.name].weighted_of(output.name))
-    frequency = _find_centre_hz(residual, output.experiment.period)
-    what = "a missing pole, or an input that is stamped late" if trial is not None and trial.early else "a missing pole"
-    return f"{what}; half of its power is below {frequency:.3g} Hz: compare() it with a plant that has one more part"
 
 
 def _find_centre_hz(residual: Float[np.ndarray, " n"], period: float) -> float:
@@ -400,21 +326,6 @@ def _advise_on_colour(output: FitOutput, row: OutputDiagnostics, predicts: bool)
             "drift or disturbances; the std allows for it, PredictionError() would use it"
         ]
     return []
-
-
-def _advise_on_held_out(output: FitOutput, row: OutputDiagnostics, free: ResidualsByExperiment) -> list[str]:
-    """Return that held-out samples leave a larger residual than those used."""
-    if row.free_run.held_out is None:
-        return []
-    residual = filter_to_band(output.experiment, free[output.experiment.name].raw_of(output.name))
-    used, held_out = (float(np.sqrt(np.mean(residual[rows] ** 2))) for rows in split_samples(output))
-    if held_out <= WORSE_HELD_OUT * used:
-        return []
-    return [
-        f"{output.label}: held out the residual's rms is {held_out:.3g} {output.unit}, over the samples used "
-        f"{used:.3g} {output.unit}: the plant changed, is excited elsewhere, or the fit follows what does not repeat; "
-        "log longer, or fix parameters"
-    ]
 
 
 def _advise_on_leverage(leverage: Mapping[str, Leverage]) -> list[str]:

@@ -1,4 +1,4 @@
-r"""Is a parameter that was fixed at fault? A score test of each, and a refit with the one that would do most.
+r"""Is a parameter that was fixed at fault? A score test of each.
 
 With :math:`g, H` the gradient and Gauss-Newton Hessian of the cost in the unknowns f and one more parameter c, which
 was fixed, the multiplier of "c is right" and what it would be by chance are
@@ -9,44 +9,30 @@ was fixed, the multiplier of "c is right" and what it would be by chance are
 with B the sum over the residuals' correlations that the covariance of a fit has too, so that the test holds for
 coloured residuals. :math:`s^2 / \operatorname{var} s` is chi-square with one degree of freedom where c is right (Rao,
 Proc. Cambridge Phil. Soc. 44, 1948; for residuals that are not as assumed White, Econometrica 50, 1982). One
-Gauss-Newton step with c free moves it by -s/I, and the cost falls by s^2/(2 I). What would lower it most is
-refitted: one step is not enough where a resonance has to move. Parameters whose refits are as likely are named
-together, for no residual shows which of them is wrong.
+Gauss-Newton step with c free moves it by -s/I, and the cost falls by s^2/(2 I): one step is no refit where a resonance
+has to move, see `causes`.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.estimation.problem.correlation import CrossCorrelation, cross_correlation
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
-from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_statistics
+from seaopt.estimation.problem.residual_statistics import compute_statistics
 from seaopt.estimation.result.covariance import compute_bread, compute_meat
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.least_squares import find_blocked
-from seaopt.estimation.solver.settle import settle
-from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.simulation import make_model
-from seaopt.units import unit_after
 
-SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 REDUNDANT = 1e-7  # of what a parameter does to the outputs: less of it left, and the free ones do the same
-SHARE = 0.3  # of the most that a step lowers the cost: a step is not a refit, and the best may be another
-INDISTINGUISHABLE = 3.0  # of log-likelihood: what no residual distinguishes
-EXPLAINED_POWER = 0.1  # of a residual's: a parameter that leaves less is at fault, whatever else may be
-REFIT_ITERATIONS = 25
-MOST_REFITTED = 5  # parameters
 
 
 @record
@@ -74,112 +60,6 @@ class ScoreTest:
     p: float
     preferred: float
     fall: float
-
-
-@record
-class Remainder:
-    """What a refit leaves of an output's residual.
-
-    Parameters
-    ----------
-    power : float
-        Over that of the fit.
-    follows_no_input, white : bool
-        Of what it leaves.
-
-    """
-
-    power: float
-    follows_no_input: bool
-    white: bool
-
-    @property
-    def explained(self) -> bool:
-        """Whether nothing of the residual follows an input, or little is left."""
-        return self.follows_no_input or self.power < EXPLAINED_POWER
-
-
-@record(eq=False)
-class Culprit:
-    """The fixed parameter that explains most, after a refit with it free, and those that explain as much.
-
-    Parameters
-    ----------
-    values : mapping of name to float
-        What a refit gives each of them, alone; the best first.
-    tests : mapping of name to ScoreTest
-        Their score tests.
-    std : float
-        Of the first.
-    remainders : mapping of EXPERIMENT.OUTPUT to Remainder
-        What the refit of the first leaves.
-
-    """
-
-    values: Mapping[str, float]
-    tests: Mapping[str, ScoreTest]
-    std: float
-    remainders: Mapping[str, Remainder]
-
-    @property
-    def first(self) -> str:
-        """The best with its value, in words."""
-        name = next(iter(self.values))
-        return f"{name} = {self.values[name]:.6g}{unit_after(self.tests[name].unit)}"
-
-    @property
-    def sentence(self) -> str:
-        """What the logs prefer, and what would do as well."""
-        name, (test, *_) = next(iter(self.values)), self.tests.values()
-        chi2 = f"chi-square {test.chi2:.3g} on one degree of freedom"
-        if len(self.values) == 1:
-            unit = unit_after(test.unit)
-            return (
-                f"{name} = {test.value:.6g}{unit} is held fixed, and the logs prefer {self.values[name]:.6g} ± "
-                f"{self.std:.2g}{unit} ({chi2}): check the value, or free it"
-            )
-        each = [
-            f"{name} = {value:.6g} in place of {self.tests[name].value:.6g}{unit_after(self.tests[name].unit)}"
-            for name, value in self.values.items()
-        ]
-        return (
-            f"one of {join_words([*self.values])}, which are held fixed, is wrong ({chi2}): "
-            f"{', '.join(each[:-1])} or {each[-1]} explain the logs alike; check these values, or free one"
-        )
-
-
-def find_culprit(
-    minimum: Minimum, fit: Fit, residuals: ResidualsByExperiment
-) -> tuple[dict[str, ScoreTest], Culprit | None]:
-    """Return the tests, and the parameters to blame if some are beyond chance, from the residuals of the fit."""
-    tests = run_score_tests(minimum, fit)
-    most = max((test.fall for test in tests.values()), default=0.0)
-    suspects = [name for name, test in tests.items() if test.p < SIGNIFICANCE and test.fall > SHARE * most]
-    refits: dict[str, Fit] = {}
-    for name in suspects[:MOST_REFITTED]:
-        refit = _refit_with(minimum, fit, name, diagnostics=False)
-        if refit is not None:
-            refits[name] = refit
-    ranked = sorted(refits, key=lambda name: refits[name].log_likelihood, reverse=True)
-    best = None if not ranked else _refit_with(minimum, fit, ranked[0], diagnostics=True)
-    if best is None:
-        return tests, None
-    alike = [name for name in ranked if refits[name].log_likelihood > best.log_likelihood - INDISTINGUISHABLE]
-    again = best.require_minimum("diagnose")
-    after = again.residuals()
-    return tests, Culprit(
-        values={name: refits[name].parameters[name].value for name in alike},
-        tests={name: tests[name] for name in alike},
-        std=float(best.parameters[alike[0]].std or 0.0),
-        remainders={
-            new.label: Remainder(
-                power=_measure_power(new, after) / max(_measure_power(old, residuals), 1e-300),
-                follows_no_input=_follows_no_input(new, after),
-                white=best.outputs[new.experiment.name][new.name].whiteness_p >= SIGNIFICANCE,
-            )
-            for old, new in zip(minimum.problem.outputs, again.problem.outputs, strict=True)
-        },
-    )
 
 
 def run_score_tests(
@@ -270,38 +150,3 @@ def _compute_scores(
     along[rest], along[places, np.arange(places.size)] = -across, 1.0
     meat = compute_meat(trial, z, along, compute_statistics(trial, z))
     return score, information, np.diag(meat + (along.T * unknowns.precision) @ along)
-
-
-def _refit_with(minimum: Minimum, fit: Fit, name: str, *, diagnostics: bool) -> Fit | None:
-    """Return the fit from the minimum with one more parameter free; None where that does not end inside its bounds."""
-    started = time.perf_counter()
-    trial, z = minimum.problem.rebuild(free_more(fit, (name,)), minimum.z)
-    solved = settle(trial, trial.evaluate(z), REFIT_ITERATIONS, None)
-    if not np.isfinite(solved.solution.evaluation.cost):
-        return None
-    refit = summarise(solved, minimum.method, diagnostics, started)
-    parameter = refit.parameters[name]
-    return refit if parameter.identified and not parameter.at_bound else None
-
-
-def _measure_power(output: FitOutput, residuals: ResidualsByExperiment) -> float:
-    """Return the power of an output's residuals, filtered but not in sigma."""
-    squares = [np.sum(r**2) for r in residuals[output.experiment.name].weighted_of(output.name)]
-    return float(np.sum(squares) * output.sigma**2)
-
-
-def _follows_no_input(output: FitOutput, residuals: ResidualsByExperiment) -> bool:
-    """Tell whether an output's residual follows no input."""
-    return all(cross.p >= SIGNIFICANCE for cross in correlate_with_inputs(output, residuals).values())
-
-
-def correlate_with_inputs(output: FitOutput, residuals: ResidualsByExperiment) -> dict[str, CrossCorrelation]:
-    """Return the correlation of an output's residual with each input that moves."""
-    segments = output.experiment.segments
-    weighted = residuals[output.experiment.name].weighted_of(output.name)
-    correlations: dict[str, CrossCorrelation] = {}
-    for i, name in enumerate(output.experiment.data.plant.inputs):
-        cross = cross_correlation(weighted, [segment.samples.inputs[i] for segment in segments])
-        if cross is not None:
-            correlations[name] = cross
-    return correlations

@@ -76,7 +76,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     if status == "converged":
         fitted, message = _mark_vague(fitted, sizes, known, message)
         status = "converged" if all(fitted[name].identified for name in names) else "not_identifiable"
-    outputs = _describe_outputs(problem, z, statistics) if statistics is not None else {}
+    outputs = describe_outputs(problem, z, statistics) if statistics is not None else {}
     if statistics is not None and not _explains_something(problem, outputs, statistics):
         status = "not_identifiable"
         fitted = _mark_unidentified(fitted, names)
@@ -274,7 +274,7 @@ def _derive_figures(
     return out
 
 
-def _describe_outputs(
+def describe_outputs(
     problem: FitProblem, z: Float[np.ndarray, " n"], statistics: StatisticsByExperiment
 ) -> dict[str, dict[str, OutputFit]]:
     """Return how well each output is explained, on the samples used and on those held out."""
