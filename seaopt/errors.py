@@ -50,6 +50,10 @@ class SimulationError(SeaoptError):
     """A simulation cannot be made, or left the numbers that can be trusted."""
 
 
+class StepSizeError(SimulationError):
+    """No number of integration steps that is tried reaches the accuracy asked for."""
+
+
 class EstimationError(SeaoptError):
     """A fit is not well posed."""
 

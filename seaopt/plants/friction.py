@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import CompletedParameters, Plant
+from seaopt.plants.plant import CompletedParameters, Plant, state_space
 from seaopt.plants.roles import Friction, PlantMaker, Port
 from seaopt.records import record
 
@@ -89,6 +89,48 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
             level = max(abs(float(friction.force(speed, p)) - viscous * speed) for speed in speeds)
             efforts[name] = abs(float(friction.effort(p))) * level
     return efforts
+
+
+def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
+    """Return the effort at the spring that is needed to let every joint that can stick slide, N or N m.
+
+    It is the largest force of each friction that declares its jump, at speeds up to `LOW_SPEED`.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> plant = so.plants.high_impedance(parts=["stribeck"])
+    >>> f_s, v_st = so.Parameter(name="f_s", value=30.0, unit="N"), so.Parameter(name="v_st", value=0.01, unit="m/s")
+    >>> find_breakaway(plant, plant.complete(so.plants.thor().update(f_c=20.0).with_parameters(f_s, v_st)))
+    30.0
+
+    """
+    p, speeds = params.by_attribute, [float(speed) for speed in SAMPLED_SPEEDS[SAMPLED_SPEEDS <= LOW_SPEED]]
+    return sum(
+        abs(float(friction.effort(p))) * max(float(friction.jump(speed, p)) for speed in speeds)
+        for friction in plant.friction.values()
+        if friction.jump is not None
+    )
+
+
+def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, " n"]:
+    """Return the frequencies (Hz) at which the plant swings at rest while every joint that can stick does so.
+
+    With A of the sliding plant, B the effect of the friction forces and C the rows of their velocities, a force that
+    keeps C x at zero leaves A - B (C B)^-1 C A.
+    """
+    sliding = friction_states(plant)[SLIDING]
+    a = state_space(sliding, params)[0]
+    effects, _, rows = (
+        np.array(block)
+        for block in friction_matrices(plant)(
+            np.zeros(len(plant.states)), np.zeros(len(plant.inputs)), plant.complete(params).vector
+        )
+    )
+    sticks = [friction.jump is not None for friction in plant.friction.values()]
+    effects, rows = effects[:, sticks], rows[sticks]
+    poles = np.linalg.eigvals(a - effects @ np.linalg.solve(rows @ effects, rows @ a))
+    return np.sort(np.abs(poles[np.imag(poles) > 0.0])) / (2 * np.pi)
 
 
 @memo

@@ -213,7 +213,7 @@ def _wait_for(command: list[str]) -> None:
         raise
 
 
-def define_constants(constants: Mapping[str, int]) -> str:
+def define_constants(constants: Mapping[str, float]) -> str:
     """Return the preprocessor's lines that define constants."""
     return "".join(f"#define {name} {value}\n" for name, value in constants.items())
 

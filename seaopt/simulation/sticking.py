@@ -7,9 +7,9 @@ A friction whose role declares its `jump` F is here the set-valued
 in place of its smoothed curve. A step first slides on, with the sign that the velocity has, by Runge's and Kutta's
 method of order four. If the velocity changes its sign in it, the step goes to where a straight line between both
 velocities passes zero, and for the rest of it the force is the constant that leaves no velocity at its end: the joint
-sticks. Where that takes more than F(0), the force is F(0), and the joint is off in the other direction. To step with
+sticks. Where that takes more than F(0), the force is F(0), and the joint slides in the other direction. To step with
 such a constant is Moreau's and Jean's method (Acary and Brogliato, Numerical Methods for Nonsmooth Dynamical Systems,
-2008); here it decides no more than the rest of a step in which a joint stops.
+2008); here it is used for no more than the rest of a step in which a joint stops.
 
 An output that contains accelerations contains the friction: at a joint that stands still the force that keeps it so.
 """
@@ -26,7 +26,8 @@ from seaopt.plants.friction import separate_friction
 from seaopt.plants.memo import memo
 from seaopt.simulation.integrator import runge_kutta_step
 
-LATEST_STOP = 0.999  # of a step: the rest of it has to tell which force stops the joint
+LATEST_STOP = 0.999  # of a step: in what is left of it a force must have an effect that can be divided by
+AT_ONCE = 1e-6  # of a step: a joint that stops before that is at rest
 TINY = 1e-300  # beside a difference that may be zero
 STILL_S = 1e-13  # a velocity that friction alone takes away in this time is rounding
 SWEEPS = 30  # over the forces of several joints that stop at once
@@ -43,7 +44,7 @@ def sticking_step(plant: Plant) -> ca.Function:
     joints = _Joints(plant)
     t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
     before = joints.speeds(x, p)
-    signs = ca.if_else(before >= 0.0, 1.0, -1.0)
+    signs = joints.signs(t, x, u, p)
 
     def slide(t: Any, x: Any) -> Any:
         return joints.rate(t, x, u, p, joints.slide(x, p, signs))
@@ -53,7 +54,8 @@ def sticking_step(plant: Plant) -> ca.Function:
     stops = signs * after <= 0.0
     shares = ca.if_else(stops, ca.fmin(ca.fabs(before) / (ca.fabs(before - after) + TINY), LATEST_STOP), 1.0)
     share = ca.mmin(shares)
-    first = stops * (shares <= share)  # another joint that stops later in the step is found by the next one
+    # A joint that stops later is found by the next step; not so beside one at rest, which ends every step at its start.
+    first = stops * ca.if_else(share < AT_ONCE, 1.0, shares <= share)
     middle, rest = runge_kutta_step(slide, t, x, share * h), (1.0 - share) * h
 
     def hold(forces: Any) -> Any:
@@ -77,7 +79,7 @@ def sticking_output(plant: Plant) -> ca.Function:
     joints = _Joints(plant)
     t, x, u, p = plant.t, plant.x, plant.u, plant.p
     speeds, levels = joints.speeds(x, p), joints.levels(p)
-    slide = joints.slide(x, p, ca.if_else(speeds >= 0.0, 1.0, -1.0))
+    slide = joints.slide(x, p, joints.signs(t, x, u, p))
     push = joints.accelerate(t, x, u, p, 0.0 * levels)
     effects = ca.horzcat(*(push - joints.accelerate(t, x, u, p, force) for force in joints.units(p)))
     still = ca.fabs(speeds) <= STILL_S * ca.fabs(ca.diag(effects))
@@ -117,6 +119,12 @@ class _Joints:
         """Return the forces of joints that slide in the directions `signs`."""
         speeds, values = ca.vertsplit(ca.fmax(signs * self.speeds(x, p), 0.0)), self._attributes(p)
         return signs * ca.vertcat(*(jump(speed, values) for jump, speed in zip(self.jumps, speeds, strict=True)))
+
+    def signs(self, t: Any, x: Any, u: Any, p: Any) -> Any:
+        """Return the directions in which the joints slide: of one at rest, that in which it is pushed."""
+        speeds = self.speeds(x, p)
+        pushed = ca.if_else(self.accelerate(t, x, u, p, 0.0 * self.levels(p)) >= 0.0, 1.0, -1.0)
+        return ca.if_else(speeds > 0.0, 1.0, ca.if_else(speeds < 0.0, -1.0, pushed))
 
     def levels(self, p: Any) -> Any:
         """Return what holds each joint at rest."""

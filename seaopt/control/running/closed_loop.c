@@ -32,7 +32,12 @@ static void piece(const seaopt_loop_args *a, double t, double lasting, const dou
 }
 
 static void integrate(const seaopt_loop_args *a, double t, const double *u, const double *newer, long steps, double *x, double *peak) {
-    if (a->late_s > 0.0) piece(a, t, a->late_s, u, steps, x, peak);
+    if (a->late_s > 0.0) {
+        double unmoved[NX];
+        piece(a, t, a->late_s, u, steps, x, peak);
+        memcpy(unmoved, x, sizeof unmoved);
+        piece(a, t + a->late_s, INSTANT * a->period, newer, 1, unmoved, peak); /* an output that the command reaches at once */
+    }
     piece(a, t + a->late_s, a->period - a->late_s, newer, steps, x, peak);
 }
 

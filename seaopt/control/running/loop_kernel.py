@@ -24,6 +24,7 @@ from seaopt.simulation.integrator import runge_kutta_step
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 from seaopt.simulation.sticking import sticking_output, sticking_step
 
+INSTANT = 1e-9  # of a sample: after it an output shows what the command does at once
 CHAINED_SAMPLES = 250  # samples that the virtual machine chains in one call
 MAX_EXPANDED_STEPS = 8  # coarse steps per sample up to which its operations are one flat list there
 Rows = Float[np.ndarray, "runs n"]
@@ -182,7 +183,7 @@ def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
 def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
         "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1,
-        "NY": len(channel_names(plant)), "NZ": structure.law_states + structure.waiting,
+        "NY": len(channel_names(plant)), "NZ": structure.law_states + structure.waiting, "INSTANT": INSTANT,
     }  # fmt: skip
     template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
     return "\n".join((define_constants(constants), generate_code(sample, advance), template))
@@ -285,8 +286,10 @@ def _period_function(
     ends: list[tuple[Any, Any]] = []
     for steps in (substeps, 2 * substeps):
         at, highest = x, top
-        for command, begin, lasting in pieces:
+        for number, (command, begin, lasting) in enumerate(pieces):
             h = lasting / steps
+            if number:  # an output that the command reaches at once
+                _, highest = advance(begin, at, highest, command, p, INSTANT * sample_time_s)
             for i in range(steps):
                 at, highest = advance(begin + i * h, at, highest, command, p, h)
         ends.append((at, highest))

@@ -435,7 +435,21 @@ class Certificate:
         peak = self.controller.spec.allowed(BY_NAME["max_reference_peak"])
         lifted = self.controller.lifted_notes
         lifted += () if peak else ("the overshoot of steps is not judged: no max_reference_peak is asked for",)
-        return (*self.remarks, *warn_unidentified(self.parameters, used), *friction, *outside, *little, *lifted)
+        return (
+            *self.remarks, *warn_unidentified(self.parameters, used), *friction, *self._ideal_notes(), *outside,
+            *little, *lifted,
+        )  # fmt: skip
+
+    def _ideal_notes(self) -> tuple[str, ...]:
+        """Say that friction that sticks was simulated with an ideal sensor, where nothing else was."""
+        if self.simulated is not None or self.runs is None:
+            return ()
+        if not any(each.friction == "sticking" for chosen in self.runs.scenarios.values() for each in chosen):
+            return ()
+        return (
+            "steps were simulated with an ideal sensor: noise can free a joint that sticks, so that the force wanders; "
+            "call with_simulation(sensors=...), or give the problem file sensors",
+        )
 
     def _worst_dict(self, name: str) -> dict[str, Any]:
         """Return the worst case, the largest Ms and Mt with their parameters, and bounds where there are any."""

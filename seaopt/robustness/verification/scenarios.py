@@ -16,7 +16,7 @@ from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import find_dry_friction, take_sliding
+from seaopt.plants.friction import find_breakaway, find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
 from seaopt.simulation.sticking import can_stick
@@ -28,8 +28,9 @@ STEP_SHARES = (0.02, 0.1, 0.5)  # of the force that the current limit can hold a
 LEAST_STEP = 1e-4  # of the force that the current limit can hold at rest: a smaller one is of a run that diverges
 UNSATURATED = 0.9  # of the step that just reaches the current limit
 FRICTION_STEPS = (0.2, 1.0, 5.0, 25.0)  # times the dry friction, where there is no limit
-STUCK_STEP = 0.1  # times the dry friction: of smaller steps the response, once friction lets go, is the same
+STUCK_STEPS = (0.1, 0.3, 0.7)  # times the friction that holds a joint at rest
 PEAK_GRACE = 1.1  # of the reference peak allowed, for the overshoot of a step
+INTEGRAL_ROUNDING = 1e-9  # of an eigenvalue that is 1
 SETTLING_PERIODS = 40.0  # of the bandwidth, until a step is within `SETTLED`
 WAITING_PERIODS = 20.0  # of the bandwidth, until friction that sticks lets go of a step of its own size
 SETTLED = 0.1  # of a step: how far the force may be off once it has settled
@@ -163,7 +164,8 @@ class Scenario:
             return f"it applies to plants whose link is {self.on}"
         if any(phase.held for phase in self.phases) and partner is None:
             return "there is no plant with the same actuator and its link fixed"
-        if self.friction == "sticking" and not can_stick(plant):
+        held = partner if any(phase.held for phase in self.phases) else None
+        if self.friction == "sticking" and not all(can_stick(each) for each in (plant, held) if each is not None):
             return "the plant has no friction that jumps at rest"
         for name in (name for phase in self.phases for name in phase.scale):
             if name not in plant.parameters:
@@ -241,9 +243,10 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     its reference; a moving link gives way, so that there the force goes back to zero and only what every scenario
     requires is required.
 
-    Dry friction that can stick is simulated in both ways: each step comes again with friction that sticks, and a step
-    of a tenth of the friction besides, in which the integral has to grow until friction lets go. The time to settle is
-    then longer, by `WAITING_PERIODS` for each time that the friction is the step, and the force may end a tenth off.
+    Dry friction that can stick is simulated in both ways: each step comes again with friction that sticks. Where the
+    law has an integral there are steps of 0.1, 0.3 and 0.7 times the friction besides, in which it has to grow until
+    friction lets go. The time to settle is then longer, by `WAITING_PERIODS` for each time that the friction is the
+    step, and the force may end further off, by 2 % of the friction, but by no more than a tenth of the step.
 
     Parameters
     ----------
@@ -264,19 +267,28 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     tail = _size_last_phase(controller, plant)
     steps = [_step(controller, plant, name, force, tail) for name, force in sizes.items()]
     if stuck:
-        steps += [_stick(controller, step, stuck) for step in steps]
-        if not plant.moves:
-            small = _step(controller, plant, f"step of {STUCK_STEP:g} times the friction", STUCK_STEP * stuck, tail)
-            steps.append(_stick(controller, small, stuck))
+        if not plant.moves and _integrates(controller):
+            least = LEAST_STEP * (controller.force_limit(0.01) or 0.0)
+            small = {f"step of {share:g} times the friction": share * stuck for share in STUCK_STEPS}
+            sizes |= {name: force for name, force in small.items() if force > least}
+        sticking = (_step(controller, plant, name, force, tail) for name, force in sizes.items())
+        steps += [_stick(controller, step, stuck) for step in sticking]
     return tuple(steps)
 
 
+def _integrates(controller: Controller) -> bool:
+    """Tell whether the law has an integral, an eigenvalue of 1."""
+    return bool(np.any(np.abs(np.linalg.eigvals(controller.law.a) - 1.0) < INTEGRAL_ROUNDING))
+
+
+def make_sticking(scenario: Scenario) -> Scenario:
+    """Return a scenario with friction that sticks, under a name that says so; its limits are the same."""
+    return replace(scenario, name=f"{scenario.name}, sticking", friction="sticking")
+
+
 def _find_sticking_friction(plant: Plant, sets: Sequence[ParameterSet]) -> float:
-    """Return the dry friction (N) of the first set that has any, where it can stick; 0 for none."""
-    if not can_stick(plant):
-        return 0.0
-    levels = (sum(find_dry_friction(plant, plant.complete(each)).values()) for each in sets)
-    return next((level for level in levels if level > 0.0), 0.0)
+    """Return the largest friction (N) of the sets that holds joints at rest; 0 for none."""
+    return max(find_breakaway(plant, plant.complete(each)) for each in sets) if can_stick(plant) else 0.0
 
 
 def _step(controller: Controller, plant: Plant, name: str, force: float, tail: float) -> Scenario:
@@ -296,14 +308,15 @@ def _step(controller: Controller, plant: Plant, name: str, force: float, tail: f
 
 def _stick(controller: Controller, step: Scenario, friction: float) -> Scenario:
     """Return a step with friction that sticks."""
-    sticking = replace(step, name=f"{step.name}, sticking", friction="sticking")
+    sticking = make_sticking(step)
     if step.settling_s is None:
         return sticking
     force = step.phases[-1].force_N
     settling_s = step.settling_s + WAITING_PERIODS / controller.spec.bandwidth_hz * friction / force
     last = replace(step.phases[-1], duration_s=max(step.phases[-1].duration_s, 1.25 * settling_s))
     return replace(
-        sticking, phases=(*step.phases[:-1], last), settling_s=settling_s, final_error=SETTLED * force
+        sticking, phases=(*step.phases[:-1], last), settling_s=settling_s,
+        final_error=min(SETTLED * force, (step.final_error or 0.0) + 0.02 * friction),
     )  # fmt: skip
 
 

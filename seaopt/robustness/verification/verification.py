@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller
-from seaopt.errors import ControlError, SimulationError, suggestion
+from seaopt.errors import ControlError, StepSizeError, suggestion
 from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -18,8 +18,10 @@ from seaopt.plants.impacts import check_held
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
-from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out
-from seaopt.simulation.sticking import can_stick
+from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
+
+ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
+TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
 
 
 @record(eq=False)
@@ -172,7 +174,7 @@ def verify(
     plants: Mapping[str, Plant],
     parameters: ParameterSet,
     *,
-    scenarios: Sequence[Scenario] | Callable[..., Sequence[Scenario]] | None = None,
+    scenarios: Sequence[Scenario] | ChooseScenarios | None = None,
     draws: Mapping[str, Sequence[ParameterSet]] | None = None,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
@@ -248,28 +250,36 @@ def verify(
     for name, stage in stages.items():
         chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant, sets[name]))
         obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
-        played[name] = tuple(scenario for scenario, obstacle in obstacles if obstacle is None)
+        possible = [scenario for scenario, obstacle in obstacles if obstacle is None]
+        done: list[Scenario] = []
         if scenarios is None:
             reason = "nothing saturates without current_limit_A"
             skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
         skipped += [(scenario.name, name, obstacle) for scenario, obstacle in obstacles if obstacle is not None]
         simulated = wall = 0.0
-        for scenario in played[name]:
+        for scenario in possible:
             before = [] if known is None else known.recall(stage, name, scenario, sets[name], seed)
             if before:
                 rows, error = rows + before, max(error, known.error if known is not None else 0.0)
+                done.append(scenario)
                 continue
-            trace = _play(stage, scenario, sets[name], seed)
-            ideal = trace if stage.is_ideal else _play(stage.ideal, scenario, sets[name], seed)
-            unlimited = None
-            if overshoots_at_limit(stage, scenario, ideal):
-                unlimited = _play(stage.ideal.unlimited, scenario, sets[name], seed)
-            rows += [
-                judge_run(stage, name, scenario, trace, k, sets[name], ideal, unlimited) for k in range(len(sets[name]))
-            ]
-            for one in (trace,) if ideal is trace else (trace, ideal):
+            actual = scenario
+            try:
+                outcomes, traces = _run_scenario(stage, name, actual, sets[name], seed)
+            except StepSizeError:
+                actual = make_sticking(scenario)
+                if scenario.friction == "sticking" or actual.obstacle(stage.plant, stage.partner):
+                    raise
+                skipped.append((scenario.name, name, TOO_STEEP))
+                if any(other.name == actual.name for other in possible):
+                    continue
+                outcomes, traces = _run_scenario(stage, name, actual, sets[name], seed)
+            rows += outcomes
+            done.append(actual)
+            for one in traces:
                 simulated += len(sets[name]) * one.time.size * controller.sample_time_s
                 wall, error = wall + one.wall_s, max(error, one.error)
+        played[name] = tuple(done)
         speeds[name] = simulated / wall if wall else math.nan
     return Verification(
         passed=bool(rows) and all(row.passed for row in rows), rows=tuple(rows), skipped=tuple(skipped),
@@ -281,14 +291,17 @@ def verify(
     )  # fmt: skip
 
 
-def _play(stage: Stage, scenario: Scenario, sets: Sequence[ParameterSet], seed: int) -> Playback:
-    """Play a scenario; where friction is too sharp for the steps of its smoothed curve, with friction that sticks."""
-    try:
-        return play(stage, scenario, sets, seed=seed)
-    except SimulationError:
-        if scenario.friction == "sticking" or not can_stick(stage.plant):
-            raise
-    return play(stage, replace(scenario, friction="sticking"), sets, seed=seed)
+def _run_scenario(
+    stage: Stage, name: str, scenario: Scenario, sets: Sequence[ParameterSet], seed: int
+) -> tuple[list[Outcome], list[Playback]]:
+    """Play and judge one scenario at every set of parameters; return the outcomes and what was simulated for them."""
+    trace = play(stage, scenario, sets, seed=seed)
+    ideal = trace if stage.is_ideal else play(stage.ideal, scenario, sets, seed=seed)
+    unlimited = None
+    if overshoots_at_limit(stage, scenario, ideal):
+        unlimited = play(stage.ideal.unlimited, scenario, sets, seed=seed)
+    outcomes = [judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))]
+    return outcomes, [trace] if ideal is trace else [trace, ideal]
 
 
 def check_plants(plants: Mapping[str, Plant], draws: Mapping[str, Any], partners: Mapping[str, Plant]) -> None:

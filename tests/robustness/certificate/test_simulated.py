@@ -111,6 +111,7 @@ def test_what_cannot_be_had_is_said(stand, thor):
 
 
 def test_a_plant_that_cannot_be_simulated_has_not_passed(controller, linear, stand, thor):
+    stand = replace(stand, friction={"F_f": replace(stand.friction["F_f"], jump=None)})  # a curve is all there is
     stuck = replace(linear, parameters=thor.update(f_c=500.0, v_s=1e-9), models={"stand": stand}, worst={})
     found = stuck.with_simulation()
     (row,) = [item for item in found.requirements if item.name == "simulation_failures"]
