@@ -78,9 +78,13 @@ def test_findings_of_a_fit_stand_in_the_report(stand, short_log, thor, tmp_path,
         assert section.count("<li") == len(fit.findings)
         assert section.count("<b>error</b>") == len(fit.errors)
         assert "F1 and F2 are swapped" in section
+        for text in (page, repr(each)):  # beside the standard deviations
+            assert text.lower().count("hold only if the model is right") == 1
     clean = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1",))], thor.free("J"))
     assert not clean.findings
-    assert "Findings" not in so.write_report([clean], tmp_path / "clean.html").read_text(encoding="utf-8")
+    page = so.write_report([clean], tmp_path / "clean.html").read_text(encoding="utf-8")
+    assert "Findings" not in page
+    assert not clean.caveat and "only if the model is right" not in page + repr(clean)
 
 
 def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path, without_drawing):

@@ -132,6 +132,13 @@ class Fit:
         return f"{first.where}: {first.text}" + (f" (and {len(more)} more)" if more else "")
 
     @property
+    def caveat(self) -> str:
+        """What to say beside the standard deviations of a fit that is not met; empty of one that is."""
+        if self.met:
+            return ""
+        return "standard deviations and intervals hold only if the model is right, and this fit is not met"
+
+    @property
     def aic(self) -> float:
         """Akaike's criterion, -2 log L + 2 k, with k the unknowns and one sigma per output."""
         return 2.0 * self.all_unknowns - 2.0 * self.log_likelihood
@@ -285,6 +292,7 @@ class Fit:
         ]
         lines.append(f"  {self.samples} samples, {self.iterations} iterations, {self.wall_s:.2f} s")
         free = ParameterSet(parameter for parameter in self.parameters.values() if parameter.free)
+        lines += [f"  {self.caveat}:"] if self.caveat and free else []
         lines += [f"  {line}" for line in repr(free).splitlines()]
         lines += [
             f"  {name} = {figure.value:.5g} ± {figure.std:.2g}{unit_after(figure.unit)}"
