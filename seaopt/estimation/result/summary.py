@@ -37,7 +37,7 @@ from seaopt.estimation.solver.least_squares import Solution
 from seaopt.estimation.solver.methods import Method
 from seaopt.estimation.solver.settle import Solved, explains_little
 from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, StepError
-from seaopt.formatting import join_words
+from seaopt.formatting import format_number, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.units import unit_after
@@ -142,7 +142,7 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
         times, way = (ratio, "above") if ratio > 1.0 else (start / parameter.value, "below")
         if times > ANOTHER_SIZE:
             odd.append(
-                f"{name} = {parameter.value:.3g} is {times:.0f} times {way} its start of {start:.3g}: "
+                f"{name} = {parameter.value:.3g} is {format_number(times)} times {way} its start of {start:.3g}: "
                 "check the units of time, inputs and outputs"
             )
     samples = int(max(float(np.max(power.counts)) for power in evaluation.power.values()))

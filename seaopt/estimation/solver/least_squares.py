@@ -25,6 +25,10 @@ from seaopt.estimation.problem.normal_equations import M, QuadraticModel, TrustR
 from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
+STILL_MOVING = (
+    "still moving when its iterations were used up; start closer, fix a parameter, or in Python give the method a "
+    "larger max_iterations"
+)
 Callback = Callable[[int, float], None]
 DampedSolver = Callable[[float, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]  # (lambda, b) -> (H + lambda)^-1 b
 
@@ -152,7 +156,7 @@ def minimise(
             callback(iteration, here.cost)
     return Solution(
         z=here.z, evaluation=here, status="max_iterations", iterations=max_iterations,
-        message=f"still moving after {max_iterations} iterations; raise max_iterations or start closer",
+        message=STILL_MOVING,
     )  # fmt: skip
 
 

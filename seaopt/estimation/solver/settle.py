@@ -11,7 +11,7 @@ from jaxtyping import Float
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, ResidualPower
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
-from seaopt.estimation.solver.least_squares import DECREMENT, Callback, Solution, minimise
+from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, minimise
 from seaopt.estimation.solver.step_size import (
     Checks,
     StepError,
@@ -126,8 +126,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
         if done or spent or attempt == MAX_ROUNDS - 1:
             solution = replace(solution, z=here.z, evaluation=here, iterations=iterations)
             if not done and spent:
-                message = f"still moving after {iterations} iterations; raise max_iterations or start closer"
-                solution = replace(solution, status="max_iterations", message=message)
+                solution = replace(solution, status="max_iterations", message=STILL_MOVING)
             elif not done:
                 message = f"sigma or the integration step still changes after {MAX_ROUNDS} rounds; give sigma"
                 solution = replace(solution, status="stalled", message=message)

@@ -96,13 +96,19 @@ def check_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> Checks
 
     def check(experiment: FitExperiment) -> Check:
         known, substeps = checks.get(experiment.name), experiment.count_steps(here.z)
-        if known is not None and known.substeps == substeps:
-            moved = here.z - known.z
-            if moved @ here.hessian @ moved < NEARBY**2:
-                return known
+        if known is not None and known.substeps == substeps and _lies_near(here, known.z):
+            return known
         return Check(error=measure_step_error(problem, experiment, here), z=here.z, substeps=substeps)
 
     return {e.name: made for e, made in zip(problem.experiments, problem.map(check), strict=True)}
+
+
+@np.errstate(all="ignore")
+def _lies_near(here: Evaluation, z: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether the step error at z holds here, too; it does not where derivatives are not finite."""
+    moved = here.z - z
+    distance = moved @ here.hessian @ moved
+    return bool(np.isfinite(distance) and distance < NEARBY**2)
 
 
 def find_worst(checks: Checks) -> StepError:

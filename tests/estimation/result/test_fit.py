@@ -427,6 +427,12 @@ def test_a_unit_that_a_parameter_can_absorb_is_asked_about(stand, short_log, tho
     assert any("1000 times below its start of 1: check the units" in note for note in fit.notes)
 
 
+def test_how_far_a_value_is_from_its_start_has_few_digits(stand, short_log, thor):
+    fit = so.fit([experiment(stand, short_log)], thor.update(b_r=1e-134).free("b_r"))
+    (note,) = (note for note in fit.notes if "times above its start of 1e-134" in note)
+    assert len(note.split(" is ")[1].split(" times ")[0]) <= len("1.259e+133")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [40, 100])
 def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples):

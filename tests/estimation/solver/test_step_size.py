@@ -1,0 +1,39 @@
+"""When a known error of the integration step holds at another point, too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.estimation.solver.step_size import check_steps
+
+
+def test_a_step_error_is_measured_again_where_derivatives_are_not_finite(swing, thor):
+    """Warnings are errors here: none may reach the user either."""
+    log = so.virtual_log(swing, thor, so.bench.PAPER_SWING, duration_s=2, rate_hz=400, seed=1,
+                         sensors=so.Sensors(noise_std={"F1": 2.0}))  # fmt: skip
+    fit = so.fit(
+        [so.Experiment(plant=swing, log=log, name="swing", outputs=("F1",))], thor.free("J"), diagnostics=False
+    )
+    problem = fit.minimum.problem
+    here = problem.evaluate(fit.minimum.z)
+    known = check_steps(problem, here, {})
+    assert check_steps(problem, here, known)["swing"] is known["swing"]
+    for value in (np.inf, -np.inf, np.nan):
+        lost = replace(here, hessian=np.full_like(here.hessian, value))
+        again = check_steps(problem, lost, known)["swing"]
+        assert again is not known["swing"] and again.error == known["swing"].error
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_a_search_that_ends_early_states_its_iterations_once(stand, short_log, thor, iterations):
+    """The count stands in the fit's text; what its verdict says to do can be done in a problem file."""
+    method = so.OutputError(search=False, max_iterations=iterations)
+    start = thor.update(J=3e-5, b_r=1e-2).free("J", "b_r", "eta")
+    fit = so.fit([so.Experiment(plant=stand, log=short_log, name="chirp", outputs=("F1",))], start, method=method)
+    assert fit.status == "max_iterations" and fit.iterations == iterations
+    assert f"{iterations} iterations" in repr(fit) and f"{iterations} iterations" not in fit.message
+    assert "start closer" in fit.message
