@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import platform
 import sys
+import time
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -49,6 +51,7 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
+REPORT_S = 30.0  # between lines of progress that go to a file
 UNMET = "on a fit that is not met"
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
@@ -123,11 +126,10 @@ class Session:
 
     @contextmanager
     def _progress(self, label: str) -> Generator[Callable[[str], None]]:
-        """Show a stage's progress on a terminal; elsewhere write one line when it is done. An error writes nothing."""
+        """Show a stage's progress on a terminal; elsewhere write lines. A stage that ends in an error is not done."""
         if not self._console.is_terminal:
-            notes = [""]
-            yield lambda note: notes.__setitem__(0, note)
-            self.say(f"{label}: {notes[0] or 'done'}")
+            with self._write_progress(label) as tell:
+                yield tell
             return
         columns = (
             SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<22}"),
@@ -141,6 +143,29 @@ class Session:
                 progress.remove_task(task)
                 raise
             progress.update(task, total=1, completed=1)
+
+    @contextmanager
+    def _write_progress(self, label: str) -> Generator[Callable[[str], None]]:
+        """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
+        note, ended, started = "", Event(), time.monotonic()
+
+        def tell(text: str) -> None:
+            nonlocal note
+            note = text
+
+        def write_lines() -> None:
+            with suppress(OSError):  # a stderr that cannot be written is the stage's to find
+                while not ended.wait(REPORT_S):
+                    self.say(f"{label}, {time.monotonic() - started:.0f} s: {note or 'running'}")
+
+        writer = Thread(target=write_lines, daemon=True)
+        writer.start()
+        try:
+            yield tell
+        finally:
+            ended.set()
+            writer.join()
+        self.say(f"{label}: {note or 'done'}")
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Return the problem's experiments, read or made once."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from threading import enumerate as enumerate_threads
 
 import numpy as np
 import pytest
@@ -270,3 +272,30 @@ def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):
     controller = json.loads((tmp_path / "out" / "controller.json").read_text(encoding="utf-8"))
     assert controller["fit_met"] is False
     assert not export_controller(tmp_path / "out", tmp_path / "c", json=False)
+
+
+def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch, capsys):
+    """At most one line per interval, also while the stage tells nothing; none where it ends before."""
+    monkeypatch.setattr("seaopt.cli.session.REPORT_S", 0.2)
+
+    def take_long(session, tell):
+        tell("iteration 3, cost 12.5")
+        time.sleep(0.7)
+
+    monkeypatch.setattr(Session, "_fit", take_long)
+    session = Session(write(BENCH), tmp_path / "out")
+    session.run("fit")
+    *lines, last = capsys.readouterr().err.splitlines()
+    assert 1 <= len(lines) <= 3 and last == "fitting the logs: iteration 3, cost 12.5"
+    assert all(line.startswith("fitting the logs, ") and "iteration 3, cost 12.5" in line for line in lines)
+    monkeypatch.setattr(Session, "_fit", lambda session, tell: tell("reading logs"))
+    session.run("fit")
+    assert capsys.readouterr().err == "fitting the logs: reading logs\n"
+
+    def fail(session, tell):
+        raise so.SeaoptError("wrong")
+
+    monkeypatch.setattr(Session, "_fit", fail)
+    with pytest.raises(so.SeaoptError):
+        session.run("fit")
+    assert not capsys.readouterr().err and "write_lines" not in " ".join(thread.name for thread in enumerate_threads())
