@@ -66,6 +66,14 @@ def test_bad_files_say_where_and_what(csv, text, error, words):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize("time", ["F1 [N]", "cur [s]", 3, 9])
+def test_a_column_that_is_not_the_time_is_refused_with_those_that_may_be(csv, time):
+    """It is in another unit, its values run backwards, or it is not there."""
+    path = csv("stamp [s],cur [s],F1 [N]\n0,1,2\n1,0,1\n2,1,3\n")
+    with pytest.raises(so.SeaoptError, match=r"stamp \[s\], cur \[s\], F1 \[N\]"):
+        so.read_log(path, time=time, channels={"F1": "F1 [N]"})
+
+
 def test_missing_file_and_folder(tmp_path):
     with pytest.raises(LogError, match="no such file"):
         so.read_log(tmp_path / "nothing.csv", time="time [s]", channels=CHANNELS)

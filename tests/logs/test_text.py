@@ -150,7 +150,7 @@ def test_blocks_meet_without_seam(file, monkeypatch):
         ("t [s],F [N]\n0,1\n1,inf\n", 'line 3: "inf" in column "F \\[N\\]" is not finite'),
         ("t [s],F [N]\n0,1\n1,2,3\n", "line 3 has 3 columns and the header 2"),
         ("t,F\n0,1\n1,2\n", 'column "t" has no unit'),
-        ("t [N],F [N]\n0,1\n1,2\n", "time: unit"),
+        ("t [N],F [N]\n0,1\n1,2\n", "not a unit of time"),
         ("x [s],F [N]\n0,1\n1,2\n", "no column is named like a time"),
         ("t [s],time [s]\n0,1\n1,2\n", "2 columns are named like a time"),
         ("t [s],F [N]\n0,1\n", "too few samples"),

@@ -21,7 +21,7 @@ from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule, check_increas
 from seaopt.logs.log.log import Log
 from seaopt.logs.reading.column import Column, spell_column, suspect_wrap
 from seaopt.logs.reading.counter import Counter
-from seaopt.logs.reading.selection import HOW_TO_ALIGN, ClockColumn, SelectedChannel, Selection, select
+from seaopt.logs.reading.selection import HOW_TO_ALIGN, ClockColumn, SelectedChannel, Selection, advise_time, select
 from seaopt.signals import Origin, Signal, Table
 from seaopt.units import factor, si_unit
 
@@ -80,6 +80,22 @@ def read_table(
     ('columns that hold no numbers were left out: note',)
 
     """
+    table, _ = _read_files(path, time, channels, align, window_s, counter, rate_hz, digest=digest)
+    return table
+
+
+def _read_files(
+    path: str | Path | Sequence[str | Path],
+    time: str | int | Column | None,
+    channels: Mapping[str, str | int | Column] | None,
+    align: Rule | None,
+    window_s: tuple[float, float] | None,
+    counter: Counter | None,
+    rate_hz: float | None,
+    *,
+    digest: bool,
+) -> tuple[Table, ClockColumn]:
+    """Return the table, and the column that its time is from; see `read_table`."""
     files = [path] if isinstance(path, str | Path) else path
     require_type(files, Sequence, "path", "give a path, or a list of them", LogError)
     for file in files:
@@ -104,7 +120,8 @@ def read_table(
     for name, channel in chosen.channels.items():
         signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, hashes[channel.source.path])
         notes += _remark_on(signals[name])
-    return Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
+    table = Table(time=clock, signals=signals, source=", ".join(map(str, files)), notes=tuple(notes))
+    return table, chosen.clock
 
 
 def read_log(
@@ -150,16 +167,16 @@ def read_log(
     [0.1, 0.15]
 
     """
-    table = read_table(
-        path, time=time, channels=channels, align=align, window_s=window_s, counter=counter, rate_hz=rate_hz,
-        digest=digest,
-    )  # fmt: skip
+    table, clock = _read_files(path, time, channels, align, window_s, counter, rate_hz, digest=digest)
     if duplicates is not None:
         table = _merge_duplicates(table, duplicates)
     for signal in table.signals.values():
         if not np.any(np.isfinite(signal.values)):
             raise LogError(f'{table.source}: column "{signal.origin.column}" holds no number; choose another column')
-    return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes)
+    try:
+        return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes)
+    except LogError as error:  # the columns have one length: it is their time
+        raise LogError(f'{error}; if "{clock.name}" is not the time, {advise_time(clock.source)}') from error
 
 
 def _merge_duplicates(table: Table, how: str) -> Table:

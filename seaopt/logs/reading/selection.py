@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from seaopt.errors import LogError, SeaoptError, suggestion
+from seaopt.errors import LogError, SeaoptError, UnitError, suggestion
 from seaopt.logs.formats import Field, Source, keep_rows
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.reading.column import Column, spell_column
@@ -197,7 +197,7 @@ def _explain_missing(places: Sequence[Source], name: str, column: str | int) -> 
     """Return what to do about a column that is not there, or about a header that several columns have."""
     fields = [field for source in places for field in source.fields]
     if isinstance(column, int):
-        return f"no column {column} for {name}; the file has {len(fields)}"
+        return f"no column {column} for {name}; the file has {len(fields)}: {_list_names([f.name for f in fields])}"
     repeated = [field.position for field in fields if field.header == column]
     if repeated:
         numbers = ", ".join(map(str, repeated[:MAX_NAMES]))
@@ -241,10 +241,8 @@ def _make_clock(source: Source, field: Field, column: Column) -> ClockColumn:
             column=field.name,
         )
     unit = resolve_unit(source, column, field)
-    try:
-        factor(unit, "s")
-    except SeaoptError as error:
-        raise type(error)(f"{source.path}: time: {error}") from error
+    if not same_dimension(unit, "s"):
+        raise UnitError(f'{source.path}: column "{field.name}" is in {unit}, not a unit of time; {advise_time(source)}')
     return ClockColumn(
         source=source, path=source.path, name=field.name, unit=unit, offset_s=column.clock_offset_s, rows=source.rows
     )
@@ -283,8 +281,9 @@ def _find_log_clock(
     clocks = list(dict.fromkeys(field.clock for _, field in places))
     if len(clocks) > 1:
         names = [clock for clock in clocks if clock is not None]
-        shown = ", ".join(names[:MAX_NAMES]) + (", ..." if len(names) > MAX_NAMES else "")
-        raise LogError(f"{source.path}: holds several clocks ({shown}); name the log's with time= (--time)")
+        raise LogError(
+            f"{source.path}: holds several clocks ({_list_names(names)}); name the log's with time= (--time)"
+        )
     column = Column(column=clocks[0]) if clocks[0] is not None else _find_time_column(source)
     return _make_clock(*find_column([source], "time", column), column)
 
@@ -312,12 +311,15 @@ def _find_time_column(source: Source) -> Column:
     if len(times) == 1:
         return Column(column=times[0])
     why = "no column is" if not times else f"{len(times)} columns are"
-    shown = ", ".join(names[:MAX_NAMES]) + (", ..." if len(names) > MAX_NAMES else "")
     raise ClockError(
-        f"{source.path}: {why} named like a time; give time= (--time), one of the columns: {shown or 'none'}; or "
-        "rate_hz= where there is none",
+        f"{source.path}: {why} named like a time; {advise_time(source)}; or rate_hz= where there is none",
         candidates=times or names,
     )
+
+
+def advise_time(source: Source) -> str:
+    """Return how to name the time, and the columns that may be it."""
+    return f"give time= (--time), one of the columns: {_list_names([f.name for f in source.fields if f.numeric])}"
 
 
 def is_time_name(name: str) -> bool:
@@ -437,8 +439,8 @@ def _can_align(align: Rule | None, field: Field) -> bool:
     return align is not None and field.clock is not None
 
 
-def _list_names(names: list[str]) -> str:
-    return ", ".join(names[:MAX_NAMES]) + (f", ... ({len(names)} in all)" if len(names) > MAX_NAMES else "")
+def _list_names(names: Sequence[str]) -> str:
+    return (", ".join(names[:MAX_NAMES]) or "none") + (f", ... ({len(names)} in all)" if len(names) > MAX_NAMES else "")
 
 
 def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str]]:
