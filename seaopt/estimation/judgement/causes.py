@@ -45,6 +45,7 @@ FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free de
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
 LIKELY_GAINS = (0.05, 20.0)  # of sensors that are not of another unit
 SNAP = 0.1  # of a factor: an estimate so near is taken for it
+FASTEST_POLE = 2.0  # of Nyquist's frequency: a sensor's pole beyond it does nothing that a log shows
 CLIP_QUANTILES = 1.0 - np.geomspace(1e-3, 0.4, 40)  # of what was measured: where it may be cut
 CLIPPED_SAMPLES = 20  # that have to be beyond a level
 CLIPPED_POWER = 0.2  # of a residual's
@@ -547,13 +548,14 @@ def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -
     for group in groups:
         plant = wrapped(first.plant, ("load_cell",), outputs=group)
         known = plant.complete(params)["load_cell_hz"]
-        pole = replace(known, value=0.3 * nyquist, free=True, max=100.0 * nyquist)
+        # The faster a pole, the more integration steps it takes: its range ends soon after what is said of it.
+        pole = replace(known, value=0.3 * nyquist, free=True, max=2.0 * FASTEST_POLE * nyquist)
 
         def describe(
             values: Mapping[str, float], stds: Mapping[str, float], group: tuple[str, ...] = group
         ) -> str | None:
             cut = values["load_cell_hz"]
-            if cut > 2.0 * nyquist:
+            if cut > FASTEST_POLE * nyquist:
                 return None
             names = join_words([*group])
             return f"{names} passed a low-pass of {cut:.3g} Hz; log it unfiltered, or add the part load_cell"
