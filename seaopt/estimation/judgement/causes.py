@@ -201,7 +201,7 @@ def _refit(minimum: Minimum, candidate: _Candidate) -> Solved | None:
 
 def _minimise_roughly(problem: FitProblem, start: Evaluation) -> Solved:
     """Return a minimum that is near enough to tell a cause: sigma is estimated twice, the step chosen once."""
-    problem, here = choose_first_steps(problem, start)
+    problem, here = choose_first_steps(problem, start, MOST_SUBSTEPS)
     problem = problem.with_each(substeps=min(MOST_SUBSTEPS, *(e.substeps for e in problem.experiments)))
     unknowns, solution = problem.unknowns, None
     for _ in range(ROUNDS):

@@ -47,27 +47,29 @@ class Check:
 Checks = Mapping[str, Check]  # by experiment, those that are known
 
 
-def choose_first_steps(problem: FitProblem, start: Evaluation) -> tuple[FitProblem, Evaluation]:
-    """Return the problem with steps that do for a first search, and its evaluation there."""
+def choose_first_steps(
+    problem: FitProblem, start: Evaluation, most: int = MAX_SUBSTEPS
+) -> tuple[FitProblem, Evaluation]:
+    """Return the problem with steps that do for a first search, `most` per sample at most, and its evaluation there."""
     while True:
-        finer = problem.map(lambda experiment, here=start: _choose_first_steps(experiment, here))
+        finer = problem.map(lambda experiment, here=start: _choose_first_steps(experiment, here, most))
         if finer == [experiment.count_steps(start.z) for experiment in problem.experiments]:
             return problem, start
         problem = _with_substeps(problem, finer)
         start = problem.evaluate(start.z)
 
 
-def _choose_first_steps(experiment: FitExperiment, here: Evaluation) -> int:
+def _choose_first_steps(experiment: FitExperiment, here: Evaluation, most: int) -> int:
     """Return the steps that an experiment's first samples ask for."""
-    if experiment.model.linear:
-        return experiment.substeps
     z, fine = here.passes.z, []
+    if experiment.model.linear or experiment.count_steps(z) >= most:
+        return experiment.count_steps(z)
     halved = _halve_steps(experiment, z)
     for segment in experiment.segments:
         edges = np.array([0, min(segment.samples.n, FIRST_SAMPLES)])
         fine.append(halved.run(segment, z, edges=edges, sums=False, outputs=True))
     error = _measure_output_error(experiment, z, here.passes.by_experiment[experiment.name], fine)
-    return _choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR)
+    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR), most)
 
 
 def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
