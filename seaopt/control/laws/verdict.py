@@ -259,7 +259,9 @@ def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop) -
         )
     if limit.sense == "equal to" and not np.isfinite(verdict.value):
         return f"{limit.name}, of which there is none"
-    return f"{limit.name} {verdict.value:.4g} of {verdict.allowed:g}"
+    # As many digits as tell the figure from what is allowed.
+    digits = next((count for count in range(4, 9) if float(f"{verdict.value:.{count}g}") != verdict.allowed), 9)
+    return f"{limit.name} {verdict.value:.{digits}g} of {verdict.allowed:g}"
 
 
 def _reached(spec: Limits, verdict: Verdict, loop: Loop) -> str:

@@ -228,6 +228,11 @@ def test_each_broken_limit_is_named_once_with_its_worst_figure_and_its_plants(fi
     assert "26 of 25" in texts[1] and "(design plant stuck)" in texts[1]
 
 
+def test_a_figure_that_hardly_breaks_its_limit_is_told_from_it(figures, loop):
+    measured = [MeasuredLoop(name="design plant", figures=replace(figures, ms=1.60004))]
+    assert "1.60004 of 1.6" in explain_broken(PLAIN, judge_all(PLAIN, measured, 1), measured[0], loop)[0]
+
+
 def test_a_message_has_room_for_the_worst_limits_and_counts_the_rest():
     blocked = [f"max_something_{number} {number}.123 of 1.6 (design plant sliding)" for number in range(8)]
     text = shorten_blocked(blocked)
