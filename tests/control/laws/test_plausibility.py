@@ -127,6 +127,7 @@ def test_the_c_code_of_a_pid_does_what_python_does(precision, compiler, tuned, t
         assert statuses == found[2], name
 
 
+@pytest.mark.slow
 def test_the_c_code_of_predictive_control_does_what_python_does(mpc, compiler, thor, stand, tmp_path):
     compiled = CompiledMPC(compiler, tmp_path, mpc)
     for name, faults in {**FAULTS, "first readings": dict(enumerate(FIRST))}.items():

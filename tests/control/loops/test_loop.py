@@ -188,8 +188,10 @@ def test_zeros_in_brackets_are_found_to_rounding():
 
 
 @pytest.mark.parametrize(("gains", "returns"), [
-    ({"k_p": 0.9, "k_i": 14.0, "k_d": 0.013, "k_r": 1.75, "c": 0.8}, False),
-    ({"k_p": 1.95, "k_i": 4.45, "k_d": 0.032, "k_r": 2.07, "c": 0.4}, True),  # lingers from the start
+    pytest.param({"k_p": 0.9, "k_i": 14.0, "k_d": 0.013, "k_r": 1.75, "c": 0.8}, False, marks=pytest.mark.slow),
+    pytest.param(  # lingers from the start
+        {"k_p": 1.95, "k_i": 4.45, "k_d": 0.032, "k_r": 2.07, "c": 0.4}, True, marks=pytest.mark.slow
+    ),
     ({"k_p": 0.86, "k_i": 20.0, "k_d": 0.079, "k_r": 1.66, "c": 0.65}, True),  # comes back
 ])  # fmt: skip
 def test_a_shoulder_is_where_a_dense_grid_has_it(gains, returns):

@@ -83,6 +83,7 @@ def test_steps_of_the_stabilised_plant_end_without_hunting(plant, tuned):
     assert np.all(runs.overshoot(steps) < 0.3 * 1.1)
 
 
+@pytest.mark.slow
 def test_a_fall_that_cannot_be_had_is_answered_with_the_largest_that_can(plant, impossible):
     """With a tenth less than the largest it is feasible, with half as much again it is not."""
     controller, possible, fall = impossible, impossible.possible, STRIBECK_SLOPE * 25.0 / 0.005

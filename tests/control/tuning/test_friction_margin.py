@@ -66,6 +66,7 @@ def test_what_is_asked_costs_disturbance_rejection_and_no_other_limit(designed):
     assert figures.ms <= 1.6 and figures.noise_gain <= 25.0 and figures.reference_peak <= 1.3
 
 
+@pytest.mark.slow
 def test_a_margin_that_cannot_be_had_is_answered_with_the_largest(stand, rubbing):
     """The other limits are kept, with the tuner's reserve; a global search without any finds a seventh more."""
     controller = so.tune(stand, rubbing, replace(SPEC, min_friction_margin=1e7))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import pytest
 
 import seaopt as so
 from tests.stick_slip import Mass, simulate
 
 
+@pytest.mark.slow
 def test_the_bandwidths_at_amplitudes_of_use_are_those_of_simulated_sines(stand):
     """Between the lowest and the highest named, the gain falls through -3 dB; at the sliding bandwidth none has it."""
     rubbing = so.plants.thor().update(

@@ -100,6 +100,7 @@ def _held(a, b, delay):
     return late[:-1, :-1] @ early[:-1, :-1], late[:-1, :-1] @ early[:-1, -1], late[:-1, -1]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_had_names_witness_limit_and_bandwidth(stand, swing, thor):
     done = tune_certified(stand, thor, SPEC, {"swing": swing}, ranges={"delay_s": (0.0, 2e-3)}, samples=5)
     assert done.status == "infeasible"

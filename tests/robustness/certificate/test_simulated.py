@@ -110,6 +110,7 @@ def test_what_cannot_be_had_is_said(stand, thor):
     assert "no port at link 2" in found.simulation_dict()["left_out"]["environments"]
 
 
+@pytest.mark.slow
 def test_a_plant_that_cannot_be_simulated_has_not_passed(controller, linear, stand, thor):
     stand = replace(stand, friction={"F_f": replace(stand.friction["F_f"], jump=None)})  # a curve is all there is
     stuck = replace(linear, parameters=thor.update(f_c=500.0, v_s=1e-9), models={"stand": stand}, worst={})

@@ -124,6 +124,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
     assert view.force_std() ** 2 == pytest.approx(expected + step**2 * np.mean(rounding**2), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand, thor):
     """An integrator pushes against 300 N of static friction: 45 N at 2.7 Hz by the spectrum of the last 8 s."""
     hunter = so.tune(stand, thor, replace(controller.spec, max_noise_gain=None, reference_weights="error"))

@@ -149,6 +149,7 @@ def test_near_the_edge_nothing_is_predicted_and_stability_is_shown(blind, stand,
     assert certificate.cycles == {}
 
 
+@pytest.mark.slow
 def test_with_play_nothing_is_shown_and_no_step_is_absurd(stand, thor):
     """Tuned within the play, where the spring is soft, the loop runs away beyond it."""
     loose, rubbing = so.plants.high_impedance(parts=["backlash"]), thor.update(f_c=20.0)

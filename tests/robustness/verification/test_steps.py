@@ -196,6 +196,7 @@ def test_the_friction_that_holds_sizes_the_steps(blind, stand, rubbing):
     assert not any("times the friction" in each.name for each in step_scenarios(law, plant, [weak]))  # not worth a step
 
 
+@pytest.mark.slow
 def test_friction_that_is_too_steep_is_played_as_friction_that_sticks(blind, stand, rubbing):
     """The rows are those that were simulated, can be played again, and what was left out is said."""
     found = verify(blind, {"stand": stand}, rubbing.update(v_s=1e-8), scenarios=step_scenarios)
