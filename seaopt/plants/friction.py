@@ -187,7 +187,7 @@ def remove_friction(plant: Plant) -> Plant:
 @memo
 def _friction_parameters(plant: Plant) -> frozenset[str]:
     """Return the parameters on which the difference of the slopes depends."""
-    bounds = [bound_slopes(friction, _name_parameters(plant)) for friction in plant.friction.values()]
+    bounds = [bound_slopes(friction, name_parameters(plant, plant.p)) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
     return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
 
@@ -203,12 +203,13 @@ def list_fall_parameters(plant: Plant, friction: Friction) -> tuple[str, ...]:
     ('f_c', 'f_s', 'v_st')
 
     """
-    flattest, _ = bound_slopes(friction, _name_parameters(plant))
+    flattest, _ = bound_slopes(friction, name_parameters(plant, plant.p))
     return _list_parameters(plant, ca.SX(flattest))
 
 
-def _name_parameters(plant: Plant) -> SimpleNamespace:
-    return SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
+def name_parameters(plant: Plant, p: Any) -> SimpleNamespace:
+    """Return a vector of a plant's parameters as the namespace that its roles take."""
+    return SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(p), strict=True)))
 
 
 def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:

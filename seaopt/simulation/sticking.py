@@ -16,13 +16,12 @@ An output that contains accelerations contains the friction: at a joint that sta
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 
 from seaopt.plants import Plant
-from seaopt.plants.friction import separate_friction
+from seaopt.plants.friction import name_parameters, separate_friction
 from seaopt.plants.memo import memo
 from seaopt.simulation.integrator import runge_kutta_step
 
@@ -96,7 +95,7 @@ class _Joints:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.jumps = [friction.jump for friction in plant.friction.values() if friction.jump is not None]
-        equations, parameters = separate_friction(plant), self._attributes(plant.p)
+        equations, parameters = separate_friction(plant), name_parameters(plant, plant.p)
         chosen: list[Any] = []
         velocities: list[Any] = []
         forces, every = ca.vertsplit(equations.forces), ca.vertsplit(equations.velocities)
@@ -117,7 +116,7 @@ class _Joints:
 
     def slide(self, x: Any, p: Any, signs: Any) -> Any:
         """Return the forces of joints that slide in the directions `signs`."""
-        speeds, values = ca.vertsplit(ca.fmax(signs * self.speeds(x, p), 0.0)), self._attributes(p)
+        speeds, values = ca.vertsplit(ca.fmax(signs * self.speeds(x, p), 0.0)), name_parameters(self.plant, p)
         return signs * ca.vertcat(*(jump(speed, values) for jump, speed in zip(self.jumps, speeds, strict=True)))
 
     def signs(self, t: Any, x: Any, u: Any, p: Any) -> Any:
@@ -128,15 +127,12 @@ class _Joints:
 
     def levels(self, p: Any) -> Any:
         """Return what holds each joint at rest."""
-        return ca.vertcat(*(ca.SX(jump(0.0, self._attributes(p))) for jump in self.jumps))
+        return ca.vertcat(*(ca.SX(jump(0.0, name_parameters(self.plant, p))) for jump in self.jumps))
 
     def units(self, p: Any) -> list[Any]:
         """Return the forces of which each pushes one joint, by its level or, where that is zero, by one."""
         levels = self.levels(p)
         return ca.horzsplit(ca.diag(ca.if_else(levels > 0.0, levels, 1.0)))
-
-    def _attributes(self, p: Any) -> SimpleNamespace:
-        return SimpleNamespace(**dict(zip(self.plant.parameters, ca.vertsplit(p), strict=True)))
 
 
 def _find_holding(speeds: Any, effects: Any, held: Any, limits: Any) -> Any:
