@@ -130,11 +130,13 @@ def _place(loc: Sequence[int | str]) -> str:
 
 
 def _known_keys(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:
-    """Return the keys that are known where `loc` points."""
+    """Return the keys that are known where `loc` points; of several models, it names the one that was tried."""
+    inner: list[type[BaseModel]] = []
     for key in loc[:-1]:
         if key in model.model_fields:
             inner = _models_in(model.model_fields[str(key)].annotation)
             model = inner[0] if inner else model
+        model = next((one for one in inner if one.__name__ == key), model)
     return [field.alias or name for name, field in model.model_fields.items()]
 
 

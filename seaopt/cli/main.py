@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -265,7 +265,7 @@ def schema(
 
 
 def main() -> None:
-    """Run the command line; a SeaoptError is one line on stderr and exit code 2."""
+    """Run the command line; a SeaoptError is one line on stderr, with the place in a text, and exit code 2."""
     prepare_streams()
     try:
         try:
@@ -273,7 +273,7 @@ def main() -> None:
         finally:
             sys.stdout.flush()
     except SeaoptError as error:
-        _end(str(error))
+        _end(str(error), _list_notes(error))
     except BrokenPipeError:
         raise SystemExit(0) from None
     except MemoryError:
@@ -283,7 +283,17 @@ def main() -> None:
         _end(f"stdout: cannot be written ({error.strerror or error}); free its disk, or write elsewhere")
 
 
-def _end(text: str) -> NoReturn:
-    """Write one line on stderr, as a terminal may see it, and leave with the exit code of bad input."""
-    sys.stderr.write(f"seaopt: {printable(' '.join(text.split()))}\n")
+def _list_notes(error: BaseException | None) -> list[str]:
+    """Return the notes of an error and of those that it was raised from, line by line."""
+    notes: list[str] = []
+    while error is not None:
+        notes += [line for note in getattr(error, "__notes__", ()) for line in note.splitlines()]
+        error = error.__cause__
+    return notes
+
+
+def _end(text: str, notes: Iterable[str] = ()) -> NoReturn:
+    """Write one line on stderr, as a terminal may see it, with notes below; leave with the exit code of bad input."""
+    for line in (f"seaopt: {' '.join(text.split())}", *notes):
+        sys.stderr.write(f"{printable(line)}\n")
     raise SystemExit(2)

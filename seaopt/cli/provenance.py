@@ -130,8 +130,9 @@ def _shape_by_robustness(problem: Problem, retune: int) -> dict[str, Any]:
     return out
 
 
-def _describe_plants(problem: Problem, plants: set[str]) -> dict[str, Any]:
+def _describe_plants(problem: Problem, names: set[str]) -> dict[str, Any]:
     """Return plants and the values of their parameters."""
+    plants = problem.with_partners(names)
     known = dict.fromkeys(name for each in sorted(plants) for name in problem.plants[each].parameters)
     return {
         "plant": {name: problem.table.plant[name].model_dump(mode="json") for name in sorted(plants)},
@@ -143,7 +144,8 @@ def _read_by_certify(problem: Problem) -> dict[str, Any]:
     """Return what a certificate reads besides the controller: plants, parameters, and [robustness] but for tuning's."""
     table, plants = problem.table.model_dump(mode="json"), problem.certified_plants()
     robustness = problem.robustness.model_dump(mode="json", exclude={"retune"})
-    sources = {"parameters": table["parameters"], "plant": {name: table["plant"][name] for name in plants}}
+    read = {name: table["plant"][name] for name in problem.with_partners(plants)}
+    sources = {"parameters": table["parameters"], "plant": read}
     return sources | {"robustness": robustness, "design": _controller(problem).plant}
 
 

@@ -79,6 +79,8 @@ class Session:
         self._experiments: tuple[Experiment, ...] | None = None
         self._warned: set[str] = set()
         self._console = Terminal(stderr=True)
+        for note in self.problem.notes:
+            self._note(note)
 
     def plan_stages(self) -> list[str]:
         """Return the stages that the problem has what it takes for."""

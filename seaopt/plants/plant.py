@@ -481,6 +481,7 @@ def _check_roles(plant: Plant) -> None:
         fields = ("coordinate", "rate", "drive")
         named += [(f"port.{name}", getattr(port, name), plant.states) for name in fields]
         named += [("port.payload", name, plant.parameters) for name in port.payload]
+    named += [(f"friction.{name}.smoothing", one.smoothing, plant.parameters) for name, one in plant.friction.items()]
     if plant.mode is not None:
         named += [("mode.parameter", plant.mode.parameter, plant.parameters)]
         named += [("mode.state", plant.mode.state, plant.states)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -31,9 +31,12 @@ from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
+from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
 from seaopt.problem.references import check_references, range_remarks
 from seaopt.problem.schema import (
+    AnyPlant,
     ColumnTable,
+    EquationsTable,
     ExperimentTable,
     FitTable,
     ParameterTable,
@@ -97,10 +100,26 @@ class Problem:
         return self.plants[self.table.controller.plant]
 
     @property
+    def notes(self) -> list[str]:
+        """What of the file's own plants may be a mistake: what they declare and do not use."""
+        tables = {name: table for name, table in self.table.plant.items() if isinstance(table, EquationsTable)}
+        return [f"plant.{name}.{text}" for name, table in tables.items() for text in list_unused(table)]
+
+    @property
     def robustness(self) -> RobustnessTable:
-        """What the controller must survive; every plant if the file does not say."""
-        table = self.table.robustness
-        return table if table is not None else RobustnessTable(plants=list(self.plants))
+        """What the controller must survive; every plant if the file does not say, but for those that others name."""
+        if self.table.robustness is not None:
+            return self.table.robustness
+        partners = {partner for table in self.table.plant.values() for partner in list_partners(table)}
+        return RobustnessTable(plants=[name for name in self.plants if name not in partners])
+
+    def with_partners(self, names: Iterable[str]) -> list[str]:
+        """Return plants and those that they hold or probe with, in the file's order."""
+        wanted = set(names)
+        for name in reversed(order_plants(self.table.plant)):  # those that name others first
+            if name in wanted:
+                wanted |= set(list_partners(self.table.plant[name]))
+        return [name for name in self.plants if name in wanted]
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -312,7 +331,7 @@ def read_problem(path: Path | str) -> Problem:
     source = Path(path)
     table = _read_table(source)
     try:
-        plants = {name: _make_plant(name, plant.kind, plant.model_extra or {}) for name, plant in table.plant.items()}
+        plants = _make_plants(table.plant)
         parameters = _make_parameters(table.parameters, plants)
         check_references(table, plants, parameters)
         spec = _make_spec(table)
@@ -324,11 +343,20 @@ def read_problem(path: Path | str) -> Problem:
     )  # fmt: skip
 
 
-def _make_plant(name: str, kind: str, options: Mapping[str, Any]) -> Plant:
-    try:
-        return plant_of_kind(kind, **options)
-    except SeaoptError as error:
-        raise type(error)(f"plant.{name}: {error}") from error
+def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
+    """Return the plants of a file in its order; those that others hold or probe with are made first."""
+    plants: dict[str, Plant] = {}
+    for name in order_plants(tables):
+        table = tables[name]
+        try:
+            own = isinstance(table, EquationsTable)
+            plants[name] = (
+                make_plant(name, table, plants) if own else plant_of_kind(table.kind, **(table.model_extra or {}))
+            )
+        except SeaoptError as error:
+            text = str(error).removeprefix(f"plant {name}: ")
+            raise type(error)(f"plant.{name}: {text}") from error
+    return {name: plants[name] for name in tables}
 
 
 def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, StringConstraints, Tag, model_validator
 
 from seaopt.control.laws.limits import BY_NAME
 from seaopt.documents import Flag, Number, Whole
@@ -35,6 +36,127 @@ class PlantTable(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     kind: str
+
+
+Formula = Annotated[
+    Annotated[str, Strict()] | Number,
+    Field(description="Numbers, names, + - * / ^, brackets, sin, cos, tan, tanh, exp, log, sqrt, abs, min, max, atan2, "
+          "if_else(a > b, then, else), pi."),
+]  # fmt: skip
+
+
+class DefaultTable(_Strict):
+    """A parameter of a plant of the user's own, with what it is where [parameters] does not say."""
+
+    unit: str
+    value: Number
+    min: Number | None = None
+    max: Number | None = None
+    description: str = ""
+
+
+class DerivedTable(_Strict):
+    """A figure that follows from the parameters."""
+
+    value: Formula
+    unit: str
+
+
+class ActuationTable(_Strict):
+    """What a controller commands, and the effort that one unit of it makes, of the parameters."""
+
+    input: str
+    effort: Formula
+    unit: str = "N"
+    efficiency: str | None = None
+
+
+class SensingTable(_Strict):
+    """Regulated and sensed signals: names of outputs, or of states."""
+
+    regulated: list[str] = []
+    motor_position: str | None = None
+    motor_speed: str | None = None
+    link_position: str | None = None
+
+
+class SpringTable(_Strict):
+    """The elastic element; its deflection is of states and parameters."""
+
+    deflection: Formula
+    unit: str
+    stiffness: str | None = None
+    mass: str | None = None
+    damping: str | None = None
+
+
+class PortTable(_Strict):
+    """Where the world touches the plant; `held` and `probe` are other plants of the file."""
+
+    motion: str | None = None
+    coordinate: str | None = None
+    rate: str | None = None
+    effort: str | None = None
+    payload: list[str] = []
+    drive: str | None = None
+    ratio: Formula = 1.0
+    held: Name | None = None
+    probe: Name | None = None
+
+
+class FrictionTable(_Strict):
+    """A dissipative force: of v, the velocity that it opposes, and of the parameters."""
+
+    velocity: Formula
+    force: Formula
+    unit: str = "N"
+    effort: Formula = 1.0
+    slopes: tuple[Formula, Formula] | None = None
+    jump: Formula | None = None
+    smoothing: str | None = None
+
+
+class ModeTable(_Strict):
+    """A mode whose frequency one parameter sets."""
+
+    name: str
+    parameter: str
+    state: str
+
+
+class EquationsTable(_Strict):
+    """A plant of the user's own: names with their SI units, equations as text, roles."""
+
+    states: dict[str, str]
+    inputs: dict[str, str] = {}
+    outputs: dict[str, str]
+    parameters: dict[str, str | DefaultTable] = {}
+    optional_inputs: list[str] = []
+    definitions: dict[str, Formula] = {}
+    f: dict[str, Formula]
+    h: dict[str, Formula]
+    derived: dict[str, DerivedTable] = {}
+    energy: Formula | None = None
+    actuation: ActuationTable | None = None
+    sensing: SensingTable | None = None
+    spring: SpringTable | None = None
+    ports: list[PortTable] = []
+    friction: dict[str, FrictionTable] = {}
+    mode: ModeTable | None = None
+
+
+def _choose_plant(table: Any) -> str:
+    """Return which table a plant is: one of equations where it has any, and no kind."""
+    own = (
+        isinstance(table, Mapping) and "kind" not in table and not table.keys().isdisjoint(EquationsTable.model_fields)
+    )
+    return EquationsTable.__name__ if own or isinstance(table, EquationsTable) else PlantTable.__name__
+
+
+AnyPlant = Annotated[
+    Annotated[PlantTable, Tag(PlantTable.__name__)] | Annotated[EquationsTable, Tag(EquationsTable.__name__)],
+    Discriminator(_choose_plant),
+]
 
 
 class HoldTable(_Strict):
@@ -291,7 +413,7 @@ class ProblemTable(_Strict):
     version: Annotated[Literal[1], Field(alias="schema")]
     title: str = "untitled"
     parameters: dict[str, Number | ParameterTable] = {}
-    plant: dict[Name, PlantTable]
+    plant: dict[Name, AnyPlant]
     experiment: list[ExperimentTable] = []
     fit: FitTable = FitTable()
     controller: ControllerTable | None = None

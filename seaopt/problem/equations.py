@@ -1,0 +1,349 @@
+"""Plants that a problem file writes down itself: names with units, equations as text, roles.
+
+Every name stands for itself in the texts. f and h may use states, inputs, frictions, parameters and the time t; a role
+may use what its function in `seaopt.plants.roles` gets, which is parameters, often with states, and for the curves of a
+friction the velocity v. A definition stands for its text in all of them. The texts become CasADi functions, as those of
+a plant that was pickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import Any
+
+import casadi as ca
+
+from seaopt.errors import PlantError, UnitError, suggestion
+from seaopt.parameters import Parameter
+from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, SeriesSpring
+from seaopt.plants.expressions import RESERVED, list_names, parse
+from seaopt.plants.stored_equations import StoredFunction, store_function
+from seaopt.problem.schema import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
+from seaopt.records import record
+from seaopt.units import factor, si_unit
+
+TIME, VELOCITY = "t", "v"  # names of their own: in f and h, and in the curves of a friction
+KINDS = {
+    "states": "a state", "inputs": "an input", "friction": "a friction", "parameters": "a parameter",
+    "definitions": "a definition",
+}  # fmt: skip
+Read = Callable[[str, Formula], Any]  # returns the expression of a formula, given its place
+
+
+def order_plants(tables: Mapping[str, AnyPlant]) -> list[str]:
+    """Return the names of a file's plants, those that others name as held or probe before these.
+
+    Raises
+    ------
+    PlantError
+        A plant that is named is not there, or plants name each other in a circle.
+
+    """
+    named = {name: set(list_partners(table)) for name, table in tables.items()}
+    for name, partners in named.items():
+        for partner in sorted(partners - tables.keys()):
+            known = suggestion(partner, tables)
+            raise PlantError(f'plant.{name}: ports names "{partner}", which is not a [plant] of this file; {known}')
+    return _sort(named, "plants hold or probe each other")
+
+
+def list_partners(table: AnyPlant) -> list[str]:
+    """Return the names of the plants that a plant's ports name."""
+    ports = table.ports if isinstance(table, EquationsTable) else []
+    return [name for port in ports for name in (port.held, port.probe) if name is not None]
+
+
+def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) -> Plant:
+    """Return the plant of a table.
+
+    Parameters
+    ----------
+    name : str
+        Of the plant.
+    table : EquationsTable
+        As the problem file has it.
+    partners : mapping of name to Plant
+        The plants that its ports name.
+
+    Raises
+    ------
+    PlantError
+        A name, an equation or a role is not as it must be; the message names the place.
+    UnitError
+        A unit is unknown, or not SI.
+
+    """
+    _check_names(table)
+    _check_units(table)
+    _check_equations(table)
+    texts = _Texts(table=table, definitions=_sort_definitions(table))
+    equations = {
+        what: texts.store(
+            lambda read, what=what: {key: read(f"{what}.{key}", text) for key, text in getattr(table, what).items()},
+            TIME, texts.states, (*table.inputs, *table.friction), texts.parameters,
+        )
+        for what in ("f", "h")
+    }  # fmt: skip
+    plant = Plant(
+        name=name, states=table.states, inputs=table.inputs, outputs=table.outputs,
+        parameters={key: _declare(key, declared) for key, declared in table.parameters.items()},
+        f=equations["f"], h=equations["h"], derived=texts.derive(), energy=texts.of_states("energy", table.energy),
+        optional_inputs=frozenset(table.optional_inputs),
+        actuation=texts.actuate(), sensing=_sense(table), spring=texts.spring(),
+        ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
+        friction={key: texts.rub(f"friction.{key}", one) for key, one in table.friction.items()},
+        mode=None if table.mode is None else Mode(**table.mode.model_dump()),
+    )  # fmt: skip
+    _check_outputs(plant)
+    _check_held(plant)
+    return plant
+
+
+def list_unused(table: EquationsTable) -> list[str]:
+    """Return a sentence for each parameter, input and definition that nothing of the plant uses."""
+    content = table.model_dump(exclude={"states", "inputs", "outputs", "parameters", "definitions"})
+    used = {name for text in _list_texts(content) for name in list_names(text)}
+    for name in reversed(_sort_definitions(table)):  # those that use others first
+        if name in used:
+            used |= set(list_names(str(table.definitions[name])))
+    return [
+        f'{group}.{name} is not used; leave it out, or look for the equation that lacks "{name}"'
+        for group in ("parameters", "inputs", "definitions")
+        for name in getattr(table, group)
+        if name not in used
+    ]
+
+
+def _list_texts(content: Any) -> Iterator[str]:
+    """Return every formula of a table, and every name in a role, which reads as one."""
+    if isinstance(content, Mapping):
+        for key, value in content.items():
+            yield from _list_texts(value) if key != "unit" else ()
+    elif isinstance(content, list | tuple):
+        for value in content:
+            yield from _list_texts(value)
+    elif isinstance(content, str):
+        yield content
+
+
+@record
+class _Texts:
+    """A table's formulas as functions; `definitions` in an order in which each uses only earlier ones."""
+
+    table: EquationsTable
+    definitions: list[str]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return tuple(self.table.states)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return tuple(self.table.parameters)
+
+    def store(self, write: Callable[[Read], Any], *arguments: tuple[str, ...] | str) -> StoredFunction:
+        """Return what `write` makes of the formulas that it reads, as a function of namespaces and single names."""
+
+        def function(*given: Any) -> Any:
+            symbols: dict[str, Any] = {}
+            for names, one in zip(arguments, given, strict=True):
+                symbols |= {names: one} if isinstance(names, str) else vars(one)
+            own = {name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments}
+            symbols = self.define(own) | symbols
+            elsewhere = self.explain(symbols)
+            return write(lambda place, text: _read(text, symbols, place, elsewhere))
+
+        return store_function(function, *arguments)
+
+    def define(self, symbols: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the definitions that use no other names of the plant than these."""
+        known = dict(symbols)
+        for name in self.definitions:
+            text = self.table.definitions[name]
+            missing = {used for used in list_names(str(text)) if used not in known} & self.names.keys()
+            if not missing:
+                known[name] = _read(text, known, f"definitions.{name}", self.explain(known))
+        return {name: known[name] for name in self.definitions if name in known}
+
+    @property
+    def names(self) -> dict[str, str]:
+        """What each name of the plant is."""
+        kinds = {TIME: "the time"} | dict.fromkeys(self.table.outputs, "an output")
+        for group, kind in KINDS.items():
+            kinds |= dict.fromkeys(getattr(self.table, group), kind)
+        return kinds
+
+    def explain(self, symbols: Mapping[str, Any]) -> dict[str, str]:
+        """Return why the names of the plant that are not among the symbols may not stand beside them."""
+        return {
+            name: "is an output; write its expression, or make it one of definitions" if kind == "an output"
+            else f"is {kind}, which may not stand here; known: {', '.join(symbols)}"
+            for name, kind in self.names.items() if name not in symbols
+        }  # fmt: skip
+
+    def of_states(self, place: str, text: Formula | None) -> Any:
+        """Return a formula of states and parameters as a function; None where there is none."""
+        return None if text is None else self.store(lambda read: read(place, text), self.states, self.parameters)
+
+    def of_parameters(self, place: str, text: Formula) -> StoredFunction:
+        """Return a formula of the parameters as a function."""
+        return self.store(lambda read: read(place, text), self.parameters)
+
+    def derive(self) -> StoredFunction | None:
+        """Return the function of the derived figures."""
+        figures = self.table.derived
+        return self.store(
+            lambda read: {key: (read(f"derived.{key}", one.value), one.unit) for key, one in figures.items()},
+            self.parameters,
+        ) if figures else None  # fmt: skip
+
+    def actuate(self) -> Actuation | None:
+        """Return what a controller commands."""
+        role = self.table.actuation
+        return None if role is None else Actuation(
+            input=role.input, effort=self.of_parameters("actuation.effort", role.effort), unit=role.unit,
+            efficiency=role.efficiency,
+        )  # fmt: skip
+
+    def spring(self) -> SeriesSpring | None:
+        """Return the elastic element."""
+        role = self.table.spring
+        return None if role is None else SeriesSpring(
+            deflection=self.of_states("spring.deflection", role.deflection), unit=role.unit,
+            stiffness=role.stiffness, mass=role.mass, damping=role.damping,
+        )  # fmt: skip
+
+    def port(self, place: str, role: PortTable, partners: Mapping[str, Plant]) -> Port:
+        """Return a port; the plants that it names are made already."""
+        makers = {
+            what: None if name is None else lambda name=name: partners[name]
+            for what, name in (("held", role.held), ("probe", role.probe))
+        }
+        return Port(
+            motion=role.motion, coordinate=role.coordinate, rate=role.rate, effort=role.effort,
+            payload=tuple(role.payload), drive=role.drive, ratio=self.of_parameters(f"{place}.ratio", role.ratio),
+            **makers,
+        )  # fmt: skip
+
+    def rub(self, place: str, role: FrictionTable) -> Friction:
+        """Return a friction."""
+
+        def curve(what: str, text: Formula) -> StoredFunction:
+            return self.store(lambda read: read(f"{place}.{what}", text), VELOCITY, self.parameters)
+
+        slopes = role.slopes
+        return Friction(
+            velocity=self.of_states(f"{place}.velocity", role.velocity), force=curve("force", role.force),
+            unit=role.unit, effort=self.of_parameters(f"{place}.effort", role.effort),
+            slopes=None if slopes is None else self.store(
+                lambda read: tuple(read(f"{place}.slopes", text) for text in slopes), self.parameters
+            ),
+            jump=None if role.jump is None else curve("jump", role.jump), smoothing=role.smoothing,
+        )  # fmt: skip
+
+
+def _read(text: Formula, symbols: Mapping[str, Any], place: str, elsewhere: Mapping[str, str]) -> Any:
+    return parse(text, symbols, place, elsewhere) if isinstance(text, str) else ca.SX(float(text))
+
+
+def _sense(table: EquationsTable) -> Sensing | None:
+    if table.sensing is None:
+        return None
+    return Sensing(**table.sensing.model_dump(exclude={"regulated"}), regulated=tuple(table.sensing.regulated))
+
+
+def _declare(name: str, declared: Any) -> str | Parameter:
+    """Return a parameter's unit, or the parameter with its default."""
+    if isinstance(declared, str):
+        return declared
+    return Parameter(name=name, **declared.model_dump(exclude_none=True))
+
+
+def _sort_definitions(table: EquationsTable) -> list[str]:
+    uses = {name: set(list_names(str(text))) & table.definitions.keys() for name, text in table.definitions.items()}
+    return _sort(uses, "definitions use each other")
+
+
+def _sort(uses: Mapping[str, Iterable[str]], what: str) -> list[str]:
+    """Return names so that each comes after those that it uses; a circle is refused."""
+    try:
+        return list(TopologicalSorter(uses).static_order())
+    except CycleError as error:
+        circle = " -> ".join(reversed(error.args[1]))
+        raise PlantError(f"{what} in a circle, {circle}; take one of them out") from error
+
+
+def _check_names(table: EquationsTable) -> None:
+    seen: dict[str, str] = {}
+    for group in KINDS:
+        for name in getattr(table, group):
+            place = f"{group}.{name}"
+            if not name.isidentifier():
+                raise PlantError(f'{group}: "{name}" is not a name; use letters, digits and _')
+            if name in RESERVED or name == TIME:
+                what = "the time" if name == TIME else "a function or constant"
+                raise PlantError(f"{place} has the name of {what} of the equations; rename it")
+            if name == VELOCITY and table.friction and group in ("parameters", "definitions"):
+                raise PlantError(f"{place} has the name of the velocity in a friction's force and jump; rename it")
+            if name in seen:
+                raise PlantError(f"{place} is also one of {seen[name]}; rename one")
+            seen[name] = group
+
+
+def _check_units(table: EquationsTable) -> None:
+    """Refuse units that are unknown or not SI, for the equations are in SI and nothing converts inside them."""
+    units = {f"{group}.{name}": unit for group in ("states", "inputs", "outputs")
+             for name, unit in getattr(table, group).items()}  # fmt: skip
+    for name, declared in table.parameters.items():
+        units[f"parameters.{name}"] = declared if isinstance(declared, str) else declared.unit
+    roles = {"actuation": table.actuation, "spring": table.spring}
+    roles |= {f"friction.{name}": one for name, one in table.friction.items()}
+    roles |= {f"derived.{name}": one for name, one in table.derived.items()}
+    units |= {f"{place}.unit": role.unit for place, role in roles.items() if role is not None}
+    for place, unit in units.items():
+        try:
+            same = factor(unit, si_unit(unit)) == 1.0
+        except UnitError as error:
+            raise UnitError(f"{place}: {error}") from error
+        if not same:
+            raise UnitError(f'{place} = "{unit}" is not an SI unit; write "{si_unit(unit)}", which equations are in')
+
+
+def _check_equations(table: EquationsTable) -> None:
+    for what, group in (("f", "states"), ("h", "outputs")):
+        written, names = getattr(table, what), getattr(table, group)
+        kind = group.removesuffix("s")
+        for name in written:
+            if name not in names:
+                raise PlantError(f"{what}.{name} is the equation of no {kind}; {suggestion(name, names)}")
+        for name in names:
+            if name not in written:
+                raise PlantError(f'{kind} "{name}" has no equation; write {what}.{name}')
+    used = {name for text in (*table.f.values(), *table.h.values(), *table.definitions.values())
+            for name in list_names(str(text))}  # fmt: skip
+    for name in table.friction:
+        if name not in used:
+            raise PlantError(f'friction.{name} is in no equation; write "- {name}" in f, in place of its force')
+
+
+def _check_outputs(plant: Plant) -> None:
+    for name, row in zip(plant.outputs, ca.vertsplit(plant.output), strict=True):
+        for source, symbol in zip(plant.inputs, ca.vertsplit(plant.u), strict=True):
+            if ca.is_equal(row, symbol, 1):
+                raise PlantError(
+                    f'h.{name} is the input "{source}" itself, which tells nothing of the plant; leave it out'
+                )
+
+
+def _check_held(plant: Plant) -> None:
+    """Refuse a held plant that is not this one without the link's states."""
+    for number, port in enumerate(plant.ports, 1):
+        if port.held is None:
+            continue
+        held, left = port.held(), [name for name in plant.states if name not in (port.coordinate, port.rate)]
+        if list(held.states) != left or list(held.inputs)[:1] != list(plant.inputs)[:1]:
+            raise PlantError(
+                f"ports.{number}.held: plant {held.name} has the states {', '.join(held.states) or 'none'}; with the "
+                f"link held they are {', '.join(left) or 'none'}, and the first input is the same"
+            )
