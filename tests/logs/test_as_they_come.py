@@ -142,7 +142,7 @@ def test_late_stamps_of_a_perfect_clock_are_put_on_its_rate():
     rng = np.random.default_rng(1)
     index = np.delete(np.arange(20_000), np.arange(9000, 9007))
     late = np.abs(30e-6 * rng.normal(size=index.size)) + np.where(rng.random(index.size) < 1e-3, 2e-3, 0.0)
-    stamps = np.maximum.accumulate(index / 1000 + late) + 1e-9 * np.arange(index.size)
+    stamps = np.maximum.accumulate(index / 1000 + late) + 1e-12 * np.arange(index.size)
     log = so.Log.from_arrays(time=stamps, F1=index.astype(float))
     with pytest.raises(LogError, match='rule = "restamp"'):
         log.restamp()
@@ -150,7 +150,24 @@ def test_late_stamps_of_a_perfect_clock_are_put_on_its_rate():
     np.testing.assert_allclose(even.time - even.time[0], index / 1000, atol=1e-9)
     assert [(segment.start, segment.stop) for segment in even.segments] == [(0, 9000), (9000, index.size)]
     with pytest.raises(LogError, match="drift"):
-        log.restamp(rate_hz=1000.5)
+        log.restamp(rate_hz=1020)
+
+
+@pytest.mark.parametrize("ppm", [0.0, 40.0, -200.0, 2e4])
+def test_a_stated_rate_is_nominal(ppm):
+    """60 s of a logger whose crystal is off by some ppm, stamped 0.1 ms late by a PC, with a gap of 30 samples."""
+    rng = np.random.default_rng(3)
+    index = np.delete(np.arange(60_000), np.arange(17_000, 17_030))
+    true = index * 1e-3 * (1.0 + 1e-6 * ppm)
+    log = so.Log.from_arrays(time=np.round(true + np.abs(rng.normal(0, 1e-4, index.size)), 5), F1=index.astype(float))
+    if ppm > 1e4:  # no crystal is so far off: the rate is wrong
+        with pytest.raises(LogError, match=r"drift.* 980\.39"):
+            log.restamp(rate_hz=1000)
+        return
+    even = log.restamp(rate_hz=1000)
+    np.testing.assert_allclose(even.time - even.time[0], true, atol=2e-5)
+    assert [(segment.start, segment.stop) for segment in even.segments] == [(0, 17_000), (17_000, index.size)]
+    assert ("than stated" in even.notes[-1]) == (ppm != 0.0)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -238,8 +238,9 @@ class Log:
         Parameters
         ----------
         rate_hz : float, optional
-            The rate of the device that sampled, where a PC put the timestamps on: they may then jitter by more than
-            their rounding, but not drift from that rate. A gap is as many whole samples as it is long.
+            The nominal rate of the device that sampled, where a PC put the timestamps on: they may then jitter by more
+            than their rounding. Where they show that its clock is off, by up to half a per cent, their rate is taken
+            and noted. A gap is as many whole samples as it is long.
 
         Returns
         -------

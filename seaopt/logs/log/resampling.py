@@ -14,7 +14,9 @@ from seaopt.logs.quality.clock import GAP, sample_rate_hz, split_at_gaps, timest
 from seaopt.signals import Recording
 
 AROUND = 20  # samples on either side of a long step that tell a gap from a late stamp
-PARTS = 20  # of a log, whose medians tell whether a stated rate is the timestamps' own
+PARTS = 20  # of a log, whose medians tell the rate at which the timestamps run
+MOST_DRIFT = 5e-3  # of a stated rate, as of a ceramic resonator: a sampling clock that is further off has another rate
+RESOLVED = 5.0  # standard deviations of the drift's slope: less is jitter
 MOST_RESAMPLED = 100  # samples that interpolation may make of one
 LEAST_RATE = 0.8  # of the log's rate; below it interpolation would fold what is above the new Nyquist frequency
 
@@ -117,6 +119,9 @@ def _restamp_at(log: Recording, rate_hz: float) -> tuple[Float[np.ndarray, " n"]
 
     A sample that was stamped late is followed by a step that is too short: the timestamps come back to their line. At a
     gap they do not: the median of the next `AROUND` samples lies above that of the ones before by whole periods.
+
+    The stated rate is nominal and says how samples are counted. Where the timestamps show by how much the sampling
+    clock is off, as crystals are, theirs is taken.
     """
     time, period = log.time, 1.0 / rate_hz
     late = time - period * np.arange(time.size)
@@ -127,23 +132,45 @@ def _restamp_at(log: Recording, rate_hz: float) -> tuple[Float[np.ndarray, " n"]
     jumps = np.flatnonzero((lost[1:] > 0) & (lost[:-1] > 0)) + 1
     lost[jumps] = 0.0  # two late samples at one gap
     line = period * (np.arange(time.size) + np.cumsum(lost))
-    off = time - line
-    off -= np.median(off)
-    # The line has to hold from end to end: half a period of drift, and samples would be counted wrongly.
-    parts = [float(np.median(part)) for part in np.array_split(off, min(PARTS, time.size))]
-    if max(parts) - min(parts) > 0.5 * period:
+    drift, left = _measure_drift(line, time - line)
+    if abs(drift) > MOST_DRIFT or left > 0.5 * period:  # a half, and samples would be counted wrongly
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
-            f"{max(parts) - min(parts):.3g} s and rise at {sample_rate_hz(_median_period(log)):.6g} Hz on average; "
-            "correct it, or call log.resample(rate_hz=...), in a problem file resample = { rate_hz = ... }"
+            f"{np.ptp(line) * abs(drift) + left:.3g} s and rise at {sample_rate_hz(_median_period(log)):.6g} Hz on "
+            "average; correct it, or call log.resample(rate_hz=...), in a problem file "
+            "resample = { rate_hz = ... }"
         )
+    clock = f"the stated clock of {rate_hz:g} Hz"
+    if drift:
+        line *= 1.0 + drift
+        way = "slower" if drift > 0.0 else "faster"
+        clock = f"their clock of {rate_hz / (1.0 + drift):.9g} Hz, {1e6 * abs(drift):.3g} ppm {way} than stated"
+    off = time - line
+    off -= np.median(off)
     gaps = int(np.count_nonzero(lost))
     between = f" with {gaps} gap{'s' * (gaps != 1)} of whole samples" if gaps else ""
     note = (
-        f"timestamps, off by {np.sqrt(np.mean(off**2)):.3g} s rms and {np.max(np.abs(off)):.3g} s at most, put on the "
-        f"stated clock of {rate_hz:g} Hz{between}"
+        f"timestamps, off by {np.sqrt(np.mean(off**2)):.3g} s rms and {np.max(np.abs(off)):.3g} s at most, put on "
+        f"{clock}{between}"
     )
     return line + np.median(time - line), note
+
+
+def _measure_drift(line: Float[np.ndarray, " n"], off: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return by which share timestamps run slower than a line, and how far that leaves them from it, in s.
+
+    The slope is that of the medians of parts of the log, which no spike moves; zero where jitter gives as much. What is
+    left of the medians tells whether timestamps and line count alike from end to end.
+    """
+    count = min(PARTS, line.size)
+    x, y = (np.array([np.median(part) for part in np.array_split(values, count)]) for values in (line, off))
+    x, y = x - np.mean(x), y - np.mean(y)
+    power = float(x @ x)
+    drift = float(x @ y) / power
+    left = y - drift * x
+    if drift**2 * power * max(count - 2, 0) <= RESOLVED**2 * float(left @ left):
+        drift, left = 0.0, y
+    return drift, float(np.ptp(left))
 
 
 def _median_period(log: Recording) -> float:
