@@ -11,7 +11,7 @@ import inspect
 import os
 import sys
 import tempfile
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -49,7 +49,9 @@ checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=
 sys.modules["seaopt_type_checker"] = checker
 
 ALWAYS, EVERY = 3, 200
-check_all_calls, calls = jaxtyping.jaxtyped, Counter[CodeType]()
+check_all_calls = jaxtyping.jaxtyped
+numbers: dict[CodeType, int] = {}  # of functions: a hash of the code itself at every call takes longer than most calls
+calls: defaultdict[int, int] = defaultdict(int)
 
 
 def check_calls(function):
@@ -61,13 +63,13 @@ def check_calls(function):
         if dataclasses.is_dataclass(function) and "__init__" in vars(function):
             function.__init__ = check_calls(function.__init__)
         return function
-    code, checked = function.__code__, None
+    number, checked = numbers.setdefault(function.__code__, len(numbers)), None
 
     @functools.wraps(function)
     def call(*args, **kwargs):
         nonlocal checked
-        calls[code] += 1
-        if calls[code] > ALWAYS and calls[code] % EVERY:
+        calls[number] = count = calls[number] + 1
+        if count > ALWAYS and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
             checked = check_all_calls(function, typechecker=checker.check)

@@ -59,8 +59,8 @@ def test_the_law_is_the_written_one():
 def independent(loop, f):
     """Return L and F/F_ref in NumPy alone, from matrices and coefficients."""
     z = np.exp(2j * np.pi * f * loop.plant.sample_time_s)
-    p = np.array([loop.plant.c @ np.linalg.inv(x * np.eye(len(loop.plant.b)) - loop.plant.a) @ loop.plant.b for x in z])
-    p = (p + loop.plant.d) * z**-loop.plant.delay_samples
+    states = np.linalg.solve(z[:, None, None] * np.eye(len(loop.plant.b)) - loop.plant.a, loop.plant.b[None, :, None])
+    p = ((loop.plant.c @ states)[:, 0] + loop.plant.d) * z**-loop.plant.delay_samples
     value = lambda c: sum(v * z**-i for i, v in enumerate(c))  # noqa: E731
     c_r, c_y = (value(tf.num) / value(tf.den) for tf in loop.law.transfer_functions())
     return p * c_y, p * c_r / (1 + p * c_y), c_y / (1 + p * c_y)
