@@ -1,6 +1,7 @@
 """Symbolic CasADi plants: the paper's actuator between two links, and a user's own."""
 
 from seaopt.plants.exchange import export_fmu, to_control
+from seaopt.plants.friction import let_stick
 from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
 from seaopt.plants.modes import Modes, Resonance, modes
 from seaopt.plants.parts import PARTS, wrapped
@@ -27,6 +28,7 @@ __all__ = [
     "high_impedance",
     "jacobians",
     "known_parameters",
+    "let_stick",
     "modes",
     "moving_output",
     "plant_of_kind",

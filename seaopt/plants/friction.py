@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.errors import PlantError
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import CompletedParameters, Plant, state_space
@@ -36,6 +37,7 @@ def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
 
     They are what the role states; else the least and largest at `SAMPLED_SPEEDS` in both directions.
     """
+    p = friction.add_rated(p)
     if friction.slopes is not None:
         return friction.slopes(p)
     v = ca.SX.sym("v")
@@ -86,7 +88,8 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
     for (name, friction), (flattest, steepest) in zip(plant.friction.items(), slopes, strict=True):
         if flattest != steepest:
             viscous = max(float(flattest), 0.0)
-            level = max(abs(float(friction.force(speed, p)) - viscous * speed) for speed in speeds)
+            rated = friction.add_rated(p)
+            level = max(abs(float(friction.force(speed, rated)) - viscous * speed) for speed in speeds)
             efforts[name] = abs(float(friction.effort(p))) * level
     return efforts
 
@@ -107,7 +110,7 @@ def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     """
     p, speeds = params.by_attribute, [float(speed) for speed in SAMPLED_SPEEDS[SAMPLED_SPEEDS <= LOW_SPEED]]
     return sum(
-        abs(float(friction.effort(p))) * max(float(friction.jump(speed, p)) for speed in speeds)
+        abs(float(friction.effort(p))) * max(float(friction.jump(speed, friction.add_rated(p))) for speed in speeds)
         for friction in plant.friction.values()
         if friction.jump is not None
     )
@@ -166,6 +169,42 @@ def take_sliding(plant: Plant, params: ParameterSet) -> Plant:
     return next(iter(split_friction({"": plant}, params).values()))
 
 
+def can_stick(plant: Plant) -> bool:
+    """Tell whether a plant has a friction that declares its jump."""
+    return any(friction.jump is not None for friction in plant.friction.values())
+
+
+def let_stick(plant: Plant) -> Plant:
+    """Return the plant with friction that sticks: simulated and fitted as it jumps at rest, not as its smoothed curve.
+
+    A joint that friction holds then stands still, where the smoothed curve lets it creep. The speed of the smoothing
+    no longer does anything in simulation and fit; linear analysis goes on with the smoothed curve.
+
+    Raises
+    ------
+    PlantError
+        No friction of the plant declares its jump.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import seaopt as so
+    >>> plant, params = so.plants.high_impedance(), so.plants.thor().update(f_c=300.0)
+    >>> log = so.Log.from_arrays(time=np.arange(2000) / 1000, I=np.ones(2000))  # 1 A is 240 N
+    >>> bool(abs(so.simulate(so.plants.let_stick(plant), params, log)["F1"][-1]) < 1e-12)
+    True
+    >>> round(float(so.simulate(plant, params, log)["F1"][-1]))  # smoothed, it creeps on to 240 N
+    240
+
+    """
+    if not can_stick(plant):
+        raise PlantError(
+            f"plant {plant.name} has no friction that sticks; declare its jump where the plant is made: "
+            "friction={NAME: Friction(..., jump=lambda speed, p: ...)}"
+        )
+    return replace(plant, sticks=True)
+
+
 def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = ()) -> bool:
     """Tell whether a plant's friction differs between sticking and sliding."""
     if not plant.friction:
@@ -178,7 +217,9 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
 def remove_friction(plant: Plant) -> Plant:
     """Return the plant as it moves at speed, where dry friction no longer changes with the velocity."""
     friction = {
-        name: replace(friction, force=lambda v, p: 0.0 * v, slopes=lambda p: (0.0, 0.0), jump=None)
+        name: replace(
+            friction, force=lambda v, p: 0.0 * v, slopes=lambda p: (0.0, 0.0), jump=None, loads=None, rated={}
+        )
         for name, friction in plant.friction.items()
     }
     return replace(plant, name=f"{plant.name} at speed", friction=friction)
@@ -212,6 +253,12 @@ def name_parameters(plant: Plant, p: Any) -> SimpleNamespace:
     return SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(p), strict=True)))
 
 
+def name_symbols(plant: Plant, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, ...]:
+    """Return vectors of states, inputs and parameters as the namespaces that a plant's roles take."""
+    vectors = ((plant.states, x), (plant.inputs, u), (plant.parameters, p))
+    return tuple(SimpleNamespace(**dict(zip(names, ca.vertsplit(v), strict=True))) for names, v in vectors)
+
+
 def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:
     """Return the parameters on which an expression depends."""
     symbols = zip(plant.parameters, ca.vertsplit(plant.p), strict=True)
@@ -227,8 +274,8 @@ def _with_slope(plant: Plant, state: str) -> Plant:
             friction,
             force=lambda v, p: bound_slopes(friction, p)[which] * v,
             slopes=lambda p: (bound_slopes(friction, p)[which],) * 2,
-            jump=None,
-        )
+            jump=None, loads=None, rated={},
+        )  # fmt: skip
 
     def follow(maker: PlantMaker | None) -> PlantMaker | None:
         return None if maker is None else partial(_make_with_slope, maker, state)
@@ -260,10 +307,7 @@ class SeparatedFriction:
 def separate_friction(plant: Plant) -> SeparatedFriction:
     """Return the equations in the plant's own symbols t, x, u and p, and one symbol for each friction force."""
     forces = {name: ca.SX.sym(name) for name in plant.friction}
-    x, u, p = (
-        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
-        for names, symbols in ((plant.states, plant.x), (plant.inputs, plant.u), (plant.parameters, plant.p))
-    )
+    x, u, p = name_symbols(plant, plant.x, plant.u, plant.p)
     for name, symbol in forces.items():
         setattr(u, name, symbol)
     f, h = plant.f(plant.t, x, u, p), plant.h(plant.t, x, u, p)

@@ -9,6 +9,7 @@ from typing import Any
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
+from seaopt.plants.friction import let_stick
 from seaopt.plants.parts import PARTS
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import all_parameters
@@ -24,8 +25,10 @@ KINDS: dict[str, Callable[..., Plant]] = {
 }
 
 
-def plant_of_kind(kind: str, **options: Any) -> Plant:
+def plant_of_kind(kind: str, *, friction: str = "smoothed", **options: Any) -> Plant:
     """Return a plant by the name of its kind, built in or from the entry-point group ``seaopt.plants``.
+
+    With ``friction="sticking"`` it is simulated and fitted with friction that jumps at rest: `let_stick`.
 
     Raises
     ------
@@ -43,11 +46,14 @@ def plant_of_kind(kind: str, **options: Any) -> Plant:
             make = installed[kind].load()
         except Exception as error:
             raise PlantError(f'kind = "{kind}" cannot be loaded from {installed[kind].value}: {error}') from error
+    if friction not in ("smoothed", "sticking"):
+        raise PlantError(f'friction = "{friction}" is not known; {suggestion(str(friction), ("smoothed", "sticking"))}')
     accepted = list(inspect.signature(make).parameters)
     for name in options:
         if name not in accepted:
             raise PlantError(f'{name} is not an option of kind "{kind}"; {suggestion(name, accepted)}')
-    return make(**options)
+    plant = make(**options)
+    return let_stick(plant) if friction == "sticking" else plant
 
 
 def known_parameters() -> dict[str, Parameter]:

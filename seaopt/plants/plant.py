@@ -63,6 +63,9 @@ class Plant:
         What a controller commands and what effort that makes, what is measured, the elastic element, where the world
         touches it (the port that is loaded and looked at first), friction by name, and a mode that ranges may name:
         `seaopt.plants.roles`.
+    sticks : bool
+        Simulate and fit friction that declares its `jump` as it is, a joint at rest standing still; else as its
+        smoothed curve.
 
     Raises
     ------
@@ -104,6 +107,7 @@ class Plant:
     ports: tuple[Port, ...] = field(default=(), repr=False)
     friction: Mapping[str, Friction] = field(default_factory=dict[str, Friction], repr=False)
     mode: Mode | None = field(default=None, repr=False)
+    sticks: bool = False
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
     u: Any = field(init=False, repr=False)
@@ -123,7 +127,8 @@ class Plant:
         spaces = [SimpleNamespace(**symbols[key]) for key in "xup"]
         x, u, p = spaces
         for name, friction in self.friction.items():
-            setattr(u, name, friction.force(friction.velocity(x, p), p))
+            _check_loads(self, name, friction, spaces)
+            setattr(u, name, friction.force_at(x, u, p))
         put(self, "t", time)
         for key, named in symbols.items():
             put(self, key, ca.vertcat(*named.values()) if named else ca.SX(0, 1))
@@ -458,6 +463,20 @@ def _check_names(plant: Plant) -> None:
     unknown = sorted(plant.optional_inputs - set(plant.inputs))
     if unknown:
         raise PlantError(f"plant {plant.name}: optional input {unknown[0]} is not an input; add it to inputs")
+
+
+def _check_loads(plant: Plant, name: str, friction: Friction, spaces: list[SimpleNamespace]) -> None:
+    """Refuse loads of a friction that are not rated, or that have a parameter's name."""
+    loads = list(friction.loads(*spaces)) if friction.loads is not None else []
+    if sorted(loads) != sorted(friction.rated):
+        given = ", ".join(friction.rated) or "none"
+        raise PlantError(
+            f"plant {plant.name}: friction {name} has the loads {', '.join(loads) or 'none'}, and rated has {given}; "
+            "give the largest size of each load in rated"
+        )
+    taken = [load for load in loads if load in plant.parameters]
+    if taken:
+        raise PlantError(f'plant {plant.name}: load "{taken[0]}" of friction {name} is a parameter; name it otherwise')
 
 
 def _check_roles(plant: Plant) -> None:

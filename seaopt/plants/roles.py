@@ -7,7 +7,9 @@ inputs, outputs and parameters, whose units the plant knows.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import field
+from types import SimpleNamespace
 from typing import Any
 
 from seaopt.records import record
@@ -112,6 +114,24 @@ class Friction:
     smoothing : str, optional
         The parameter that is the speed over which the curve is smoothed through zero: as it falls the force tends to
         a jump at rest, and a fit lets it fall by stages.
+    loads : callable ``(x, u, p) -> {name: expression}``, optional
+        What the friction grows with, such as the torque that a gear transmits. `force`, `jump` and `slopes` find each
+        among the parameters, under its name.
+    rated : mapping of name to float
+        The largest size of each load, with which linear analysis, which knows none, takes the friction.
+
+    Examples
+    --------
+    A gear that rubs by a tenth of the torque that the motor gives it:
+
+    >>> rub = Friction(
+    ...     velocity=lambda x, p: x.omega, unit="N m",
+    ...     force=lambda v, p: (p.f_c + 0.1 * abs(p.load)) * v / abs(v),
+    ...     loads=lambda x, u, p: {"load": p.K_tau * u.I}, rated={"load": 2.0},
+    ... )
+    >>> p, x = SimpleNamespace(f_c=1.0, K_tau=0.5), SimpleNamespace(omega=3.0)
+    >>> rub.force_at(x, SimpleNamespace(I=4.0), p)
+    1.2
 
     """
 
@@ -122,6 +142,20 @@ class Friction:
     slopes: Callable[[Any], tuple[Any, Any]] | None = None
     jump: Callable[[Any, Any], Any] | None = None
     smoothing: str | None = None
+    loads: Callable[[Any, Any, Any], Mapping[str, Any]] | None = None
+    rated: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    def force_at(self, x: Any, u: Any, p: Any) -> Any:
+        """Return the force of a state, inputs and parameters."""
+        return self.force(self.velocity(x, p), self.add_loads(x, u, p))
+
+    def add_loads(self, x: Any, u: Any, p: Any) -> Any:
+        """Return the parameters, and the loads of a state and inputs among them."""
+        return p if self.loads is None else SimpleNamespace(**vars(p), **self.loads(x, u, p))
+
+    def add_rated(self, p: Any) -> Any:
+        """Return the parameters, and the rated loads among them."""
+        return SimpleNamespace(**vars(p), **self.rated) if self.rated else p
 
     @property
     def slope_unit(self) -> str:

@@ -114,8 +114,9 @@ def store_plant(plant: Any) -> dict[str, Any]:
 
     def store_friction(one: Friction) -> Friction:
         return replace(
-            one, velocity=store(one.velocity, x, p), force=store(one.force, "velocity", p),
-            effort=store(one.effort, p), slopes=store(one.slopes, p), jump=store(one.jump, "speed", p),
+            one, velocity=store(one.velocity, x, p), force=store(one.force, "velocity", (*p, *one.rated)),
+            effort=store(one.effort, p), slopes=store(one.slopes, (*p, *one.rated)),
+            jump=store(one.jump, "speed", (*p, *one.rated)), loads=store(one.loads, x, u, p),
         )  # fmt: skip
 
     def store_port(one: Port) -> Port:

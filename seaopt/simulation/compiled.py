@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
 from seaopt.simulation.discretisation import Clock, transition
-from seaopt.simulation.integrator import rate_functions
+from seaopt.simulation.integrator import output_function, rate_functions, step_function
 from seaopt.simulation.model import Model
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
@@ -60,11 +60,15 @@ def kernel_source(model: Model, layout: Layout, delayed: int) -> str:
     """Return the C source of the passes of a model."""
     constants = {
         "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": layout.shared, "NQ": model.np, "ND": layout.drift_terms,
-        "LINEAR": int(model.linear), "CORRECT": int(layout.corrected), "DELAYED": delayed,
+        "LINEAR": int(model.linear), "STEPPED": int(model.sticks), "CORRECT": int(layout.corrected), "DELAYED": delayed,
     }  # fmt: skip
     generated = ""
     if model.linear:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
+    elif model.sticks:
+        step, output = step_function(model), output_function(model)
+        plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]
+        generated = generate_code(step, output, *plain)
     else:
         rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
@@ -75,6 +79,12 @@ def kernel_source(model: Model, layout: Layout, delayed: int) -> str:
         )
         generated = "\n".join((generate_code(rates.rate, rates.output), *chains))
     return "\n".join((define_constants(constants), _text("layout.h"), generated, _text("pass.c")))
+
+
+def _drop_derivatives(function: ca.Function, name: str) -> ca.Function:
+    """Return a function's first result alone."""
+    arguments = function.sx_in()
+    return ca.Function(name, arguments, function.call(arguments)[:1], {"cse": True})
 
 
 @lru_cache(maxsize=2)
@@ -141,8 +151,10 @@ def _memory_of(a: Float[np.ndarray, "nx nx"], limit: int) -> int:
 def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
     clock = point.clock
     foh = float(clock.hold == "first")
-    rates = rate_functions(model, moving=_count_delayed(model, point) == 2)
-    constants = np.array(rates.prepare(model.parameters(point.theta))).ravel()
+    constants = model.parameters(point.theta)
+    if not model.sticks:
+        rates = rate_functions(model, moving=_count_delayed(model, point) == 2)
+        constants = np.array(rates.prepare(constants)).ravel()
     return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
 
 

@@ -12,7 +12,6 @@ of the numbers that the step computes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -21,36 +20,27 @@ from jaxtyping import Float
 
 from seaopt.plants.memo import memo
 from seaopt.records import record
-from seaopt.simulation.model import Model, linearise
+from seaopt.simulation.model import Model, fill_parameters, linearise
+from seaopt.simulation.runge_kutta import runge_kutta_step
+from seaopt.simulation.sticking import sticking_line_step, sticking_output
 
 STABLE = 2.5  # of a rate times the step: order four is stable up to 2.78 along the real axis, 2.83 along the imaginary
-
-
-def runge_kutta_step(rate: Callable[[Any, Any], Any], t: Any, x: Any, h: Any) -> Any:
-    """Return x after a step of Runge's and Kutta's fourth order with the rate (t, x) -> dx/dt."""
-    k1 = rate(t, x)
-    k2 = rate(t + h / 2, x + h / 2 * k1)
-    k3 = rate(t + h / 2, x + h / 2 * k2)
-    k4 = rate(t + h, x + h * k3)
-    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 @memo
 def step_function(model: Model) -> ca.Function:
     """Return the CasADi function (t, x, u0, u1, p, h) -> (x1, dx1/dx, dx1/d[theta, h, u0, u1])."""
-    rate = ca.Function("rate", [model.t, model.x, model.u, model.p], [model.f])
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
     x, p = ca.SX.sym("x", model.nx), ca.SX.sym("p", model.p.numel())
     u0, u1 = ca.SX.sym("u0", model.nu), ca.SX.sym("u1", model.nu)
-    middle = 0.5 * (u0 + u1)
-    k1 = rate(t, x, u0, p)
-    k2 = rate(t + h / 2, x + h / 2 * k1, middle, p)
-    k3 = rate(t + h / 2, x + h / 2 * k2, middle, p)
-    k4 = rate(t + h, x + h * k3, u1, p)
-    x1 = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    if model.sticks:
+        x1 = sticking_line_step(model.plant)(t, x, u0, u1, fill_parameters(model, p), h)
+    else:
+        rate = ca.Function("rate", [model.t, model.x, model.u, model.p], [model.f])
+        x1 = runge_kutta_step(lambda s, x: h * rate(t + s * h, x, u0 + s * (u1 - u0), p), 0.0, x, 1.0)
     moved = ca.vertcat(p[: model.np], h, u0, u1)
     results = [x1, ca.densify(ca.jacobian(x1, x)), ca.densify(ca.jacobian(x1, moved))]
-    return ca.Function("seaopt_step", [t, x, u0, u1, p, h], results)
+    return ca.Function("seaopt_step", [t, x, u0, u1, p, h], results, {"cse": True})
 
 
 def count_stable_steps(model: Model, theta: Float[np.ndarray, " np"], period: float) -> float:
@@ -68,10 +58,13 @@ def count_stable_steps(model: Model, theta: Float[np.ndarray, " np"], period: fl
 @memo
 def output_function(model: Model) -> ca.Function:
     """Return the CasADi function (t, x, u, p) -> (y, dy/dx, dy/dtheta, dy/du)."""
-    derivatives = (ca.densify(ca.jacobian(model.h, by)) for by in (model.x, model.theta, model.u))
-    results = [ca.densify(model.h), *derivatives]
     arguments = [model.t, model.x, model.u, model.p]
-    return ca.Function("seaopt_output", arguments, results)
+    h = model.h
+    if model.sticks:
+        rows = [list(model.plant.outputs).index(name) for name in model.outputs]
+        h = sticking_output(model.plant)(*arguments[:3], fill_parameters(model, model.p))[rows]
+    derivatives = (ca.densify(ca.jacobian(h, by)) for by in (model.x, model.theta, model.u))
+    return ca.Function("seaopt_output", arguments, [ca.densify(h), *derivatives], {"cse": True})
 
 
 @record(eq=False)

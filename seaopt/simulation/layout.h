@@ -1,7 +1,7 @@
 /* Sizes of the arrays of a pass. Built with these constants in front (see seaopt/simulation/compiled.py):
      NX states, NU inputs, NY outputs, ND drift terms per output,
      NP derivatives that are shared: parameters (NQ), then a free delay, then what only the correction gain depends on;
-     NI linear only: forcing terms (inputs in force, and the constant); LINEAR, CORRECT 0 or 1;
+     NI linear only: forcing terms (inputs in force, and the constant); LINEAR, STEPPED, CORRECT 0 or 1;
      DELAYED of a linear plant how many inputs in force are besides u_a; of another 0, or with a free delay 1, or 2 where the
      delay moves the inputs themselves, which are then joined by lines. */
 #include <math.h>

@@ -13,8 +13,10 @@ from jaxtyping import Float
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import can_stick
 from seaopt.plants.memo import memo
 from seaopt.records import record
+from seaopt.simulation.sticking import separate_jumps
 
 
 @record(eq=False)
@@ -34,6 +36,9 @@ class Model:
         The computed outputs, in order.
     linear : bool
         Whether f and h are affine in the state and the input for every theta, and do not depend on time.
+    sticks : bool
+        Whether friction that jumps is simulated as it is (`seaopt.simulation.sticking`). f and h are then those
+        without it, as the plant moves at speed.
 
     """
 
@@ -49,7 +54,13 @@ class Model:
     f: Any
     h: Any
     linear: bool
+    sticks: bool = False
     memory: dict[Any, Any] = field(default_factory=dict, repr=False)  # of `memo`: what is made of the expressions
+
+    @property
+    def order(self) -> int:
+        """Order of the error of its steps: where a joint stops within one, that is found to order two."""
+        return 2 if self.sticks else 4
 
     @property
     def nx(self) -> int:
@@ -74,7 +85,8 @@ class Model:
     def __reduce__(self) -> tuple[Any, ...]:
         known = [str(symbol) for symbol in ca.vertsplit(self.p)]
         stored = ca.Function("model", [self.t, self.x, self.u, self.p], [self.f, self.h])
-        return _restore_model, (self.plant, self.free, self.outputs, known, self.constants, stored, self.linear)
+        content = (self.plant, self.free, self.outputs, known, self.constants, stored, self.linear, self.sticks)
+        return _restore_model, content
 
     def __copy__(self) -> Model:
         return self  # nothing of a model changes
@@ -139,20 +151,25 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
     theta = ca.vertcat(*(symbols[name] for name in names)) if names else ca.SX(0, 1)
     known = [symbol for name, symbol in symbols.items() if name not in names and name not in zero]
     rows = [list(plant.outputs).index(name) for name in outputs]
-    f, h = plant.dynamics, plant.output[rows]
+    f, h, levels = plant.dynamics, plant.output[rows], ca.SX(0)
+    if plant.sticks and can_stick(plant):
+        f, h, levels = separate_jumps(plant)
+        h = h[rows]
     if zero:
-        f, h = ca.substitute([f, h], [ca.vertcat(*(symbols[name] for name in zero))], [ca.DM.zeros(len(zero))])
+        none = [ca.DM.zeros(len(zero))]
+        f, h, levels = ca.substitute([f, h, levels], [ca.vertcat(*(symbols[name] for name in zero))], none)
+    sticks = not ca.simplify(levels).is_zero()
     u = plant.u if plant.u.numel() else ca.SX.sym("no_input")
     return Model(
         plant=plant, free=names, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta,
         p=ca.vertcat(theta, *known), constants=np.zeros(len(known)),
-        f=f, h=h, linear=_is_linear(f, h, plant.t, plant.x, u),
+        f=f, h=h, linear=not sticks and _is_linear(f, h, plant.t, plant.x, u), sticks=sticks,
     )  # fmt: skip
 
 
 def _restore_model(
     plant: Plant, free: tuple[str, ...], outputs: tuple[str, ...], known: list[str],
-    constants: Float[np.ndarray, " nc"], stored: Any, linear: bool,
+    constants: Float[np.ndarray, " nc"], stored: Any, linear: bool, sticks: bool,
 ) -> Model:  # fmt: skip
     """Return a pickled model, in its plant's symbols."""
     symbols = dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)) if plant.parameters else {}
@@ -162,8 +179,14 @@ def _restore_model(
     f, h = stored(plant.t, plant.x, u, p)
     return Model(
         plant=plant, free=free, outputs=outputs, t=plant.t, x=plant.x, u=u, theta=theta, p=p, constants=constants,
-        f=f, h=h, linear=linear,
+        f=f, h=h, linear=linear, sticks=sticks,
     )  # fmt: skip
+
+
+def fill_parameters(model: Model, p: Any) -> Any:
+    """Return the plant's vector of parameters from the model's; zeros are put in."""
+    known = dict(zip(map(str, ca.vertsplit(model.p)), ca.vertsplit(p), strict=True)) if model.p.numel() else {}
+    return ca.vertcat(*(known.get(name, ca.SX(0)) for name in model.plant.parameters))
 
 
 def depends_on_time(model: Model) -> bool:

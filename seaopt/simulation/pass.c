@@ -130,13 +130,73 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
         for (int j = 0; j < wide; j++) ((vec *)q->z[i])[j] = ((vec *)q->next[i])[j];
 }
 #else
-/* In front of this file stand CasADi's functions
+/* In front of this file stand CasADi's functions, unless whole steps are (STEPPED, below):
      seaopt_rate(t, x, u, du, c) -> f and the nonzeros of f_x, f_p     seaopt_output(t, x, u, du, c) -> the same of h
    and seaopt_rate_chain, seaopt_output_chain, which add f_x Z + f_p to the derivatives of f, and of h. Where DELAYED
    is 2, f_p has a column for the delay, by which the input moves by du each second.
    model: steps, period, older part of the period (fractional delay), first-order hold, then c. */
 #define SETTINGS 4
 
+typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
+
+/* The input at the start and the end of a step, and how fast the delay moves it. */
+typedef struct { double u0[NU], u1[NU], du0[NU], du1[NU]; } line;
+
+#if STEPPED
+/* In front stand, in place of the rates and with the parameters p in place of c,
+     seaopt_step(t, x, u0, u1, p, h) -> x+, dx+/dx, dx+/d[theta, h, u0, u1]      seaopt_plain_step(...) -> x+
+     seaopt_output(t, x, u, p) -> y, dy/dx, dy/dtheta, dy/du                       seaopt_plain_output(...) -> y
+   with matrices column by column. */
+INLINE void chain(const double *a, const double *b, int rows, const double (*restrict z)[NJP], double (*restrict out)[NJP]) {
+    for (int r = 0; r < rows; r++) {
+        for (int j = 0; j < ALL; j++) {
+            vec sum = {0.0, 0.0, 0.0, 0.0};
+            for (int i = 0; i < NX; i++) sum += a[i * rows + r] * ((const vec *)z[i])[j];
+            ((vec *)out[r])[j] = sum;
+        }
+        for (int i = 0; i < NQ; i++) out[r][1 + i] += b[i * rows + r];
+    }
+}
+
+INLINE void one_step(hot *q, double t, const line *in, const double *c, double h, double dh, int wide) {
+    double x[NX], after[NX], a[NX * NX], b[NX * (NQ + 1 + 2 * NU)];
+    hot_columns out;
+    const double *arg[SZ_ARG] = {&t, x, in->u0, in->u1, c, &h};
+    double *res[SZ_RES] = {after, a, b};
+    for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
+    if (wide < ALL) {
+        seaopt_plain_step(arg, res, 0, q->work, 0);
+        for (int i = 0; i < NX; i++) ((vec *)q->z[i])[0] = (vec){after[i], 0.0, 0.0, 0.0};
+        return;
+    }
+    seaopt_step(arg, res, 0, q->work, 0);
+    chain(a, b, NX, (const double (*)[NJP])q->z, out);
+    for (int r = 0; r < NX; r++) {
+        if (DELAYED) {
+            double along = b[NQ * NX + r] * dh;
+            for (int i = 0; i < NU; i++) along += b[(NQ + 1 + i) * NX + r] * in->du0[i] + b[(NQ + 1 + NU + i) * NX + r] * in->du1[i];
+            out[r][1 + NQ] += along;
+        }
+        out[r][0] = after[r];
+    }
+    memcpy(q->z, out, sizeof out);
+}
+
+INLINE void output(hot *q, double t, const double *u, const double *du, const double *c, double (*restrict out)[NJP], int wide) {
+    double x[NX], y[NY], hx[NY * NX], hp[NY * NQ + 1], hu[NY * NU];
+    const double *arg[SZ_ARG] = {&t, x, u, c};
+    double *res[SZ_RES] = {y, hx, hp, hu};
+    for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
+    if (wide < ALL) seaopt_plain_output(arg, res, 0, q->work, 0);
+    else {
+        seaopt_output(arg, res, 0, q->work, 0);
+        chain(hx, hp, NY, (const double (*)[NJP])q->z, out);
+        for (int o = 0; DELAYED && o < NY; o++)
+            for (int i = 0; i < NU; i++) out[o][1 + NQ] += hu[i * NY + o] * du[i];
+    }
+    for (int o = 0; o < NY; o++) out[o][0] = y[o];
+}
+#else
 /* K = [f, f_x Z + f_p] at the state Z. */
 INLINE void slope(hot *q, double t, const double *u, const double *du, const double *c, const double (*restrict z)[NJP],
                   double (*restrict k)[NJP], int wide) {
@@ -149,11 +209,6 @@ INLINE void slope(hot *q, double t, const double *u, const double *du, const dou
     else for (int i = 0; i < NX; i++) ((vec *)k[i])[0] = (vec){0.0, 0.0, 0.0, 0.0};
     for (int i = 0; i < NX; i++) k[i][0] = f[i];
 }
-
-typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
-
-/* The input at the start and the end of a step, and how fast the delay moves it. */
-typedef struct { double u0[NU], u1[NU], du0[NU], du1[NU]; } line;
 
 /* A Runge-Kutta step of order four of the state and its derivatives; the delay moves h itself, by dh. */
 INLINE void one_step(hot *q, double t, const line *in, const double *c, double h, double dh, int wide) {
@@ -182,9 +237,20 @@ INLINE void one_step(hot *q, double t, const line *in, const double *c, double h
     memcpy(q->z, sum, sizeof sum);
 }
 
+INLINE void output(hot *q, double t, const double *u, const double *du, const double *c, double (*restrict out)[NJP], int wide) {
+    double x[NX], y[NY], hx[NNZ_HX + 1], hp[NNZ_HP + 1];
+    const double *arg[SZ_ARG] = {&t, x, u, du, c};
+    double *res[SZ_RES] = {y, wide == ALL ? hx : 0, wide == ALL ? hp : 0};
+    for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
+    seaopt_output(arg, res, 0, q->work, 0);
+    if (wide == ALL) seaopt_output_chain(hx, hp, (const double (*)[NJP])q->z, out);
+    for (int o = 0; o < NY; o++) out[o][0] = y[o];
+}
+#endif
+
 INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP], int wide) {
-    const double *m = a->model;
-    double x[NX], u[NU], du[NU], older[NU], y[NY], c[NNZ_HX + 1], d[NNZ_HP + 1], t = a->t0 + k * m[1];
+    const double *m = a->model, t = a->t0 + k * m[1];
+    double u[NU], du[NU], older[NU];
     const int foh = m[3] > 0.5;
     at(a, k, !foh && m[2] > 0.0 ? a->lag_b : a->lag_a, u);
     at(a, k, a->lag_c, older);
@@ -192,12 +258,7 @@ INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict
         du[i] = foh ? (older[i] - u[i]) / m[1] : 0.0;
         u[i] += m[2] * du[i];
     }
-    const double *arg[SZ_ARG] = {&t, x, u, du, m + SETTINGS};
-    double *res[SZ_RES] = {y, wide == ALL ? c : 0, wide == ALL ? d : 0};
-    for (int i = 0; i < NX; i++) x[i] = q->z[i][0];
-    seaopt_output(arg, res, 0, q->work, 0);
-    if (wide == ALL) seaopt_output_chain(c, d, (const double (*)[NJP])q->z, out);
-    for (int o = 0; o < NY; o++) out[o][0] = y[o];
+    output(q, t, u, du, m + SETTINGS, out, wide);
 }
 
 /* With a fractional delay the older input acts first, for m[2] seconds: u_b held, or the line from u_c to u_a; then u_a

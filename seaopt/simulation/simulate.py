@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +20,7 @@ from seaopt.simulation.passes import Pass, Point, Segment
 from seaopt.simulation.run import run_passes
 
 MAX_SIMULATION_SUBSTEPS = 1024
+ROUNDING = 1e-6  # of an output: below it an error is not held against the output itself
 
 
 def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
@@ -135,7 +137,7 @@ def simulate(
 
 
 def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
-    def run(substeps: int) -> Pass:
+    def run(substeps: int, model: Model = model) -> Pass:
         point = Point(
             theta=np.zeros(0),
             offset=np.zeros(model.ny),
@@ -145,15 +147,19 @@ def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx
         )
         return run_passes(model, segment, point, x0[None], sums=False, outputs=True, states=True)
 
-    result = run(1)
+    result, least = run(1), np.full(model.ny, 1e-300)
     substeps = 1
+    if model.sticks:  # what friction holds moves by rounding alone, which is told by how the plant moves without it
+        moving = run(1, replace(model, sticks=False, memory={}))
+        assert moving.outputs is not None
+        least = np.maximum(least, ROUNDING * np.nan_to_num(np.max(np.abs(moving.outputs), axis=0)))
     while not model.linear:
         substeps *= 2
         finer = run(substeps)
         assert result.outputs is not None and finer.outputs is not None
-        scale = np.maximum(np.max(np.abs(finer.outputs), axis=0), 1e-300)
+        scale = np.maximum(np.max(np.abs(finer.outputs), axis=0), least)
         with np.errstate(invalid="ignore"):
-            error = float(np.max(np.abs(finer.outputs - result.outputs) / scale)) / 15.0  # order four: 2^4 - 1
+            error = float(np.max(np.abs(finer.outputs - result.outputs) / scale)) / (2.0**model.order - 1.0)
         result = finer
         if error <= rtol:
             break

@@ -21,9 +21,9 @@ from typing import Any
 import casadi as ca
 
 from seaopt.plants import Plant
-from seaopt.plants.friction import name_parameters, separate_friction
+from seaopt.plants.friction import name_symbols, separate_friction
 from seaopt.plants.memo import memo
-from seaopt.simulation.integrator import runge_kutta_step
+from seaopt.simulation.runge_kutta import runge_kutta_step
 
 LATEST_STOP = 0.999  # of a step: in what is left of it a force must have an effect that can be divided by
 AT_ONCE = 1e-6  # of a step: a joint that stops before that is at rest
@@ -32,44 +32,64 @@ STILL_S = 1e-13  # a velocity that friction alone takes away in this time is rou
 SWEEPS = 30  # over the forces of several joints that stop at once
 
 
-def can_stick(plant: Plant) -> bool:
-    """Tell whether a plant has a friction that declares its jump."""
-    return any(friction.jump is not None for friction in plant.friction.values())
+def separate_jumps(plant: Plant) -> tuple[Any, Any, Any]:
+    """Return f and h as the plant moves without its friction that jumps, and what holds each joint at rest.
+
+    All are expressions of the plant's own symbols.
+    """
+    joints, arguments = _Joints(plant), [plant.t, plant.x, plant.u, plant.p]
+    levels = joints.levels(*arguments[1:])
+    return joints.rate(*arguments, 0.0 * levels), joints.read(*arguments, 0.0 * levels), levels
 
 
 @memo
 def sticking_step(plant: Plant) -> ca.Function:
     """Return the CasADi function (t, x, u, p, h) -> x+ of one step with friction that jumps, u held."""
+    h = ca.SX.sym("h")
+    after = sticking_line_step(plant)(plant.t, plant.x, plant.u, plant.u, plant.p, h)
+    return ca.Function("step", [plant.t, plant.x, plant.u, plant.p, h], [after])
+
+
+@memo
+def sticking_line_step(plant: Plant) -> ca.Function:
+    """Return the CasADi function (t, x, u0, u1, p, h) -> x+ of one step, u a straight line from u0 to u1."""
     joints = _Joints(plant)
-    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    t, x, u0, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    u1 = ca.SX.sym("u1", u0.numel())
     before = joints.speeds(x, p)
-    signs = joints.signs(t, x, u, p)
+    signs = joints.signs(t, x, u0, p)
 
-    def slide(t: Any, x: Any) -> Any:
-        return joints.rate(t, x, u, p, joints.slide(x, p, signs))
+    # Of the place s in the step, from 0 to 1, so that nothing is divided by its length.
+    def find_input(s: Any) -> Any:
+        return u0 + s * (u1 - u0)
 
-    end = runge_kutta_step(slide, t, x, h)
+    def slide(s: Any, x: Any) -> Any:
+        u = find_input(s)
+        return h * joints.rate(t + s * h, x, u, p, joints.slide(x, u, p, signs))
+
+    end = runge_kutta_step(slide, 0.0, x, 1.0)
     after = joints.speeds(end, p)
     stops = signs * after <= 0.0
     shares = ca.if_else(stops, ca.fmin(ca.fabs(before) / (ca.fabs(before - after) + TINY), LATEST_STOP), 1.0)
     share = ca.mmin(shares)
     # A joint that stops later is found by the next step; not so beside one at rest, which ends every step at its start.
     first = stops * ca.if_else(share < AT_ONCE, 1.0, shares <= share)
-    middle, rest = runge_kutta_step(slide, t, x, share * h), (1.0 - share) * h
+    middle = runge_kutta_step(slide, 0.0, x, share)
 
     def hold(forces: Any) -> Any:
-        def rate(t: Any, x: Any) -> Any:
-            return joints.rate(t, x, u, p, ca.if_else(first, forces, joints.slide(x, p, signs)))
+        def rate(s: Any, x: Any) -> Any:
+            u = find_input(s)
+            return h * joints.rate(t + s * h, x, u, p, ca.if_else(first, forces, joints.slide(x, u, p, signs)))
 
-        return runge_kutta_step(rate, t + share * h, middle, rest)
+        return runge_kutta_step(rate, share, middle, 1.0 - share)
 
-    levels = joints.levels(p)
-    free, pushed = hold(0.0 * levels), [hold(force) for force in joints.units(p)]
+    levels = joints.levels(middle, find_input(share), p)
+    free, pushed = hold(0.0 * levels), [hold(force) for force in _push_each(levels)]
     speeds = joints.speeds(free, p)
     effects = ca.horzcat(*(speeds - joints.speeds(each, p) for each in pushed))
     forces = _find_holding(speeds, effects, first, ca.if_else(levels > 0.0, 1.0, 0.0))
     stopped = free + ca.mtimes(ca.horzcat(*(each - free for each in pushed)), forces)
-    return ca.Function("step", [t, x, u, p, h], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
+    return ca.Function("step", [t, x, u0, u1, p, h], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
 
 
 @memo
@@ -77,10 +97,10 @@ def sticking_output(plant: Plant) -> ca.Function:
     """Return the CasADi function (t, x, u, p) -> y of a plant with friction that jumps."""
     joints = _Joints(plant)
     t, x, u, p = plant.t, plant.x, plant.u, plant.p
-    speeds, levels = joints.speeds(x, p), joints.levels(p)
-    slide = joints.slide(x, p, joints.signs(t, x, u, p))
+    speeds, levels = joints.speeds(x, p), joints.levels(x, u, p)
+    slide = joints.slide(x, u, p, joints.signs(t, x, u, p))
     push = joints.accelerate(t, x, u, p, 0.0 * levels)
-    effects = ca.horzcat(*(push - joints.accelerate(t, x, u, p, force) for force in joints.units(p)))
+    effects = ca.horzcat(*(push - joints.accelerate(t, x, u, p, force) for force in _push_each(levels)))
     still = ca.fabs(speeds) <= STILL_S * ca.fabs(ca.diag(effects))
     free = joints.accelerate(t, x, u, p, ca.if_else(still, 0.0, slide))
     limits = ca.if_else(levels > 0.0, 1.0, 0.0)
@@ -94,8 +114,8 @@ class _Joints:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.jumps = [friction.jump for friction in plant.friction.values() if friction.jump is not None]
-        equations, parameters = separate_friction(plant), name_parameters(plant, plant.p)
+        self.jumps = [(one.jump, one.add_loads) for one in plant.friction.values() if one.jump is not None]
+        equations, spaces = separate_friction(plant), name_symbols(plant, plant.x, plant.u, plant.p)
         chosen: list[Any] = []
         velocities: list[Any] = []
         forces, every = ca.vertsplit(equations.forces), ca.vertsplit(equations.velocities)
@@ -105,7 +125,7 @@ class _Joints:
                 chosen.append(force)
                 velocities.append(velocity)
             else:  # its curve is all there is
-                curve = friction.force(velocity, parameters)
+                curve = friction.force(velocity, friction.add_loads(*spaces))
                 f, h = ca.substitute(f, force, curve), ca.substitute(h, force, curve)
         state, arguments = [plant.x, plant.p], [plant.t, plant.x, plant.u, plant.p, ca.vertcat(*chosen)]
         speeds = ca.vertcat(*velocities)
@@ -114,25 +134,29 @@ class _Joints:
         self.read = ca.Function("read", arguments, [h])
         self.accelerate = ca.Function("accelerate", arguments, [ca.jtimes(speeds, plant.x, f)])
 
-    def slide(self, x: Any, p: Any, signs: Any) -> Any:
+    def slide(self, x: Any, u: Any, p: Any, signs: Any) -> Any:
         """Return the forces of joints that slide in the directions `signs`."""
-        speeds, values = ca.vertsplit(ca.fmax(signs * self.speeds(x, p), 0.0)), name_parameters(self.plant, p)
-        return signs * ca.vertcat(*(jump(speed, values) for jump, speed in zip(self.jumps, speeds, strict=True)))
+        return signs * self._levels(ca.fmax(signs * self.speeds(x, p), 0.0), x, u, p)
 
     def signs(self, t: Any, x: Any, u: Any, p: Any) -> Any:
         """Return the directions in which the joints slide: of one at rest, that in which it is pushed."""
         speeds = self.speeds(x, p)
-        pushed = ca.if_else(self.accelerate(t, x, u, p, 0.0 * self.levels(p)) >= 0.0, 1.0, -1.0)
+        pushed = ca.if_else(self.accelerate(t, x, u, p, 0.0 * speeds) >= 0.0, 1.0, -1.0)
         return ca.if_else(speeds > 0.0, 1.0, ca.if_else(speeds < 0.0, -1.0, pushed))
 
-    def levels(self, p: Any) -> Any:
+    def levels(self, x: Any, u: Any, p: Any) -> Any:
         """Return what holds each joint at rest."""
-        return ca.vertcat(*(ca.SX(jump(0.0, name_parameters(self.plant, p))) for jump in self.jumps))
+        return self._levels(ca.SX.zeros(len(self.jumps)), x, u, p)
 
-    def units(self, p: Any) -> list[Any]:
-        """Return the forces of which each pushes one joint, by its level or, where that is zero, by one."""
-        levels = self.levels(p)
-        return ca.horzsplit(ca.diag(ca.if_else(levels > 0.0, levels, 1.0)))
+    def _levels(self, speeds: Any, x: Any, u: Any, p: Any) -> Any:
+        spaces = name_symbols(self.plant, x, u, p)
+        pairs = zip(self.jumps, ca.vertsplit(speeds), strict=True)
+        return ca.vertcat(*(ca.SX(jump(speed, add_loads(*spaces))) for (jump, add_loads), speed in pairs))
+
+
+def _push_each(levels: Any) -> list[Any]:
+    """Return the forces of which each pushes one joint, by its level or, where that is zero, by one."""
+    return ca.horzsplit(ca.diag(ca.if_else(levels > 0.0, levels, 1.0)))
 
 
 def _find_holding(speeds: Any, effects: Any, held: Any, limits: Any) -> Any:

@@ -79,8 +79,9 @@ def describe_friction(
     """
     values = plant.complete(params)
     flattest = friction_slopes(plant, values)[0][list(plant.friction).index(name)]
-    v = ca.SX.sym("v")
-    curve = ca.Function("friction", [v], [ca.SX(plant.friction[name].force(v, values.by_attribute))]).map(ANGLES)
+    friction, v = plant.friction[name], ca.SX.sym("v")
+    force_at_speed = ca.SX(friction.force(v, friction.add_rated(values.by_attribute)))
+    curve = ca.Function("friction", [v], [force_at_speed]).map(ANGLES)
     theta = (np.arange(ANGLES) + 0.5) * 2 * np.pi / ANGLES
     wave = amplitude[:, None] * np.sin(theta)
     force = np.array(curve(wave.reshape(1, -1))).reshape(wave.shape) - flattest * wave

@@ -20,8 +20,8 @@ from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
-from seaopt.simulation.integrator import runge_kutta_step
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
+from seaopt.simulation.runge_kutta import runge_kutta_step
 from seaopt.simulation.sticking import sticking_output, sticking_step
 
 INSTANT = 1e-9  # of a sample: after it an output shows what the command does at once

@@ -13,9 +13,9 @@ from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
 from seaopt.errors import SimulationError, suggestion
 from seaopt.plants import Plant
+from seaopt.plants.friction import can_stick
 from seaopt.plants.plant import ENERGY
 from seaopt.records import record
-from seaopt.simulation.sticking import can_stick
 
 
 @record(eq=False)

@@ -149,7 +149,7 @@ class FitProblem:
 
     def find_smoothing(self) -> list[int]:
         """Return the unknowns that are speeds over which some plant's friction is smoothed through zero."""
-        plants = [experiment.data.plant for experiment in self.experiments]
+        plants = [experiment.data.plant for experiment in self.experiments if not experiment.model.sticks]
         names = {friction.smoothing for plant in plants for friction in plant.friction.values()}
         return [i for i, name in enumerate(self.unknowns.names[: self.unknowns.shared]) if name in names]
 

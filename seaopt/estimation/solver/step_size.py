@@ -69,19 +69,20 @@ def _choose_first_steps(experiment: FitExperiment, here: Evaluation, most: int) 
         edges = np.array([0, min(segment.samples.n, FIRST_SAMPLES)])
         fine.append(halved.run(segment, z, edges=edges, sums=False, outputs=True))
     error = _measure_output_error(experiment, z, here.passes.by_experiment[experiment.name], fine)
-    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR), most)
+    order = experiment.model.order
+    return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR, order), most)
 
 
 def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
     """Return the problem with steps whose error is small, its evaluation there, and the errors that are known there.
 
-    That of a step that was made finer is not: order four says how fine it must be, and the next minimum is looked at.
+    That of a step that was made finer is not: its order says how fine it must be, and the next minimum is looked at.
     """
     while True:
         checks = check_steps(problem, here, checks)
         substeps = [experiment.count_steps(here.z) for experiment in problem.experiments]
         finer = [
-            _choose_steps(steps, checks[e.name].error, STEP_ERROR_SIGMA)
+            _choose_steps(steps, checks[e.name].error, STEP_ERROR_SIGMA, e.model.order)
             for e, steps in zip(problem.experiments, substeps, strict=True)
         ]
         if finer == substeps:
@@ -123,18 +124,18 @@ def _with_substeps(problem: FitProblem, substeps: Sequence[int]) -> FitProblem:
     return problem.with_values("substeps", {e.name: m for e, m in zip(problem.experiments, substeps, strict=True)})
 
 
-def _choose_steps(steps: int, error: StepError, allowed: float) -> int:
+def _choose_steps(steps: int, error: StepError, allowed: float, order: int) -> int:
     """Return how many steps per sample an error asks for."""
     over = max(error.output / allowed, error.parameter * STEP_ERROR_SIGMA / (STEP_ERROR_PARAMETER * allowed))
     if over <= 1.0 or not np.isfinite(over):
         return steps
-    finer = steps * min(1.1 * over**0.25, MUCH_FINER)  # order four says how much finer
+    finer = steps * min(1.1 * over ** (1.0 / order), MUCH_FINER)
     return min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
 
 
 @np.errstate(all="ignore")
 def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Evaluation) -> StepError:
-    """Return the integration error of an experiment, from steps of half the length (order four: 16/15 of the change).
+    """Return the integration error of an experiment, from the change that steps of half the length bring.
 
     In a parameter it is the move of the minimum, H^-1 (change of the gradient), in standard deviations: an error far
     below the noise can add up over a long log. In an output it is the largest change, in sigma, over each segment's
@@ -154,12 +155,17 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, here: Eva
     inverse, _ = invert(hessian)
     p = problem.unknowns.shared
     std = np.sqrt(np.maximum(np.diag(inverse)[:p], 1e-300))
-    moved = np.abs(inverse @ gradient)[:p] * 16.0 / 15.0 / std
+    moved = np.abs(inverse @ gradient)[:p] * _whole_error(experiment) / std
     return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
 def _halve_steps(experiment: FitExperiment, z: Float[np.ndarray, " n"]) -> FitExperiment:
     return replace(experiment, substeps=2 * experiment.count_steps(z))
+
+
+def _whole_error(experiment: FitExperiment) -> float:
+    """Return an integration error over the change that steps of half the length bring."""
+    return 2.0**experiment.model.order / (2.0**experiment.model.order - 1.0)
 
 
 def _floored_sigma(experiment: FitExperiment) -> Float[np.ndarray, " ny"]:
@@ -175,6 +181,6 @@ def _measure_output_error(
     worst = 0.0
     for one, two in zip(coarse, fine, strict=True):
         assert one.outputs is not None and two.outputs is not None
-        change = float(np.max(np.abs(scale * (one.outputs - two.outputs)))) * 16.0 / 15.0
+        change = float(np.max(np.abs(scale * (one.outputs - two.outputs)))) * _whole_error(experiment)
         worst = max(worst, change if np.isfinite(change) else np.inf)
     return worst

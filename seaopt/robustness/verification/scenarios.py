@@ -16,10 +16,9 @@ from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import find_breakaway, find_dry_friction, take_sliding
+from seaopt.plants.friction import can_stick, find_breakaway, find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
-from seaopt.simulation.sticking import can_stick
 
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
