@@ -63,8 +63,7 @@ METHODS = {
 def case(name: str) -> tuple[so.Experiment, so.ParameterSet, tuple[str, ...]]:
     """Return the experiment, the truth and the free names of a plant."""
     plant, free, changes, outputs = PLANTS[name]
-    truth = plant.complete(so.plants.thor().update(**{k: v for k, v in changes.items() if k in so.plants.thor()}))
-    truth = truth.update(**changes)
+    truth = plant.defaults.update(**changes)
     log = so.virtual_log(plant, truth, (Noise(std=1.0, band_hz=60),), duration_s=12, rate_hz=400, seed=3)
     rng = np.random.default_rng(4)
     channels: dict[str, Any] = {i: log[i] for i in plant.inputs if i in log.signals}

@@ -91,7 +91,8 @@ def rotary() -> None:
     plant = so.plants.rotary()
     model = plant.linearize(plant.defaults)
     figure, axes = new(["torques", "angles"], "magnitude [dB]")
-    for row, (output, axis) in enumerate(zip(plant.outputs, (axes[0], axes[1], axes[1], axes[0]), strict=True)):
+    for row, (output, unit) in enumerate(plant.outputs.items()):
+        axis = axes[0] if unit == "N m" else axes[1]
         axis.semilogx(F, decibel(model, row), linewidth=1.3, label=f"{output}/I")
     for axis in axes:
         axis.legend(frameon=False, fontsize="x-small")

@@ -31,6 +31,7 @@ CHOICES = (
     ("unlumped", "lumped"),
     ("link1", "link2"),
     ("fixed", "mass", "pendulum"),
+    ("free", "locked", "pendulum"),
     ("double", "float"),
     ("zero", "first"),
     ("split", "error"),

@@ -22,7 +22,7 @@ PLANTS = {
     "stand": lambda: so.plants.high_impedance(),
     "swing": lambda: so.plants.moving_output(drive="lumped", parts=["load_cell", "stribeck", "current_loop"]),
     "two links": lambda: so.plants.two_link(link1="mass", link2="pendulum", spring="link2"),
-    "rotary": lambda: so.plants.rotary(),
+    "rotary": lambda: so.plants.rotary("pendulum", spring="link1"),
     "sliding": lambda: friction_states(so.plants.moving_output())["sliding"],
     "of the user": lambda: so.Plant(
         name="cart", states={"x": "m", "v": "m/s"}, inputs={"I": "A"}, outputs={"x": "m"},
@@ -39,7 +39,8 @@ def again(thing):
 
 def run(plant):
     log = so.Log.from_arrays(time=TIME, I=CURRENT)
-    return so.simulate(plant, so.plants.thor().update(f_c=20.0), log)
+    params = plant.defaults if "tau_s" in plant.outputs else so.plants.thor()
+    return so.simulate(plant, params.update(f_c=20.0), log)
 
 
 @pytest.mark.parametrize("name", PLANTS)

@@ -29,6 +29,7 @@ SLIDING, STUCK = "sliding", "stuck"
 STATES = (SLIDING, STUCK)
 # Speeds at which a curve that does not state its slopes is looked at, m/s or rad/s.
 SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
+SMOOTHED = 3.0  # times the speed of its smoothing a curve is within 1 % of what it smooths
 LOW_SPEED = 1.0  # m/s or rad/s: up to here a curve shows its dry friction
 
 
@@ -71,7 +72,8 @@ def name_slope_unit(plant: Plant) -> str:
 def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, float]:
     """Return the effort at the spring that each dry friction takes, by name; what is linear in its velocity is not dry.
 
-    It is the largest force at speeds up to `LOW_SPEED`, less viscous friction of the flattest slope.
+    It is the largest force at speeds up to `LOW_SPEED`, or as far as its smoothing reaches, less viscous friction of
+    the flattest slope.
 
     Examples
     --------
@@ -82,13 +84,14 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
 
     """
     p = params.by_attribute
-    speeds = [sign * float(speed) for speed in SAMPLED_SPEEDS[SAMPLED_SPEEDS <= LOW_SPEED] for sign in (1.0, -1.0)]
     efforts: dict[str, float] = {}
     slopes = zip(*friction_slopes(plant, params), strict=True)
     for (name, friction), (flattest, steepest) in zip(plant.friction.items(), slopes, strict=True):
         if flattest != steepest:
             viscous = max(float(flattest), 0.0)
-            rated = friction.add_rated(p)
+            smoothed = SMOOTHED * params[friction.smoothing].value if friction.smoothing is not None else 0.0
+            low, rated = SAMPLED_SPEEDS[max(LOW_SPEED, smoothed) >= SAMPLED_SPEEDS], friction.add_rated(p)
+            speeds = [sign * float(speed) for speed in low for sign in (1.0, -1.0)]
             level = max(abs(float(friction.force(speed, rated)) - viscous * speed) for speed in speeds)
             efforts[name] = abs(float(friction.effort(p))) * level
     return efforts

@@ -1,11 +1,12 @@
 r"""What real actuators have besides: optional parts that compose, each with its own parameters.
 
-Inside the actuator (of `two_link` and its special cases):
+Inside the actuator, a screw's (`two_link` and its special cases; v is the nut's speed, dq/dt) or a gear's (`rotary`; v
+is the motor's, and the units are N m and rad):
 
 ``stribeck``
     Friction rises at low speed (Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994),
-    smoothed through zero: :math:`F_f = [f_c + (f_s - f_c) e^{-(\dot q/v_{st})^2}] \tanh(\dot q/v_s)`; without it
-    :math:`F_f = f_c \tanh(\dot q/v_s)`. Viscous friction is b_r, in every plant.
+    smoothed through zero: :math:`F_f = [f_c + (f_s - f_c) e^{-(v/v_{st})^2}] \tanh(v/v_s)`; without it
+    :math:`F_f = f_c \tanh(v/v_s)`. Viscous friction is b_r, in every plant.
 ``backlash``
     Play of total width :math:`2 g_b` in series with the spring: the spring sees
     :math:`z(\delta) = \delta + \tfrac12\big(\sqrt{(\delta-g_b)^2+\epsilon^2} - \sqrt{(\delta+g_b)^2+\epsilon^2}\big)`,
@@ -13,10 +14,10 @@ Inside the actuator (of `two_link` and its special cases):
 ``hardening``
     :math:`F = k z + k_3 z^3`.
 ``spring_damping``
-    :math:`F = \dots + c_k \dot\delta`, parallel to spring and play.
+    :math:`F = \dots + c_k \dot\delta`, parallel to spring and play; `rotary` has it without this part, as c_s.
 ``screw_mode``
-    The ball screw is axially elastic: it stretches by s, with stiffness k_b and damping c_b, and moves an effective
-    mass m_n at the nut: with both links fixed and a heavy rotor, a mode at
+    Of a ball screw, which is axially elastic: it stretches by s, with stiffness k_b and damping c_b, and moves an
+    effective mass m_n at the nut: with both links fixed and a heavy rotor, a mode at
     :math:`\tfrac{1}{2\pi}\sqrt{(k + k_b)/(m_l + m_n)}`. The defaults put it at 80 Hz with a damping ratio of 0.03,
     where the paper saw one (between 70 and 80 Hz, with the actuator's length). They leave the static stiffness within
     a tenth, which takes an m_n of 28 kg: an effective mass, much more than the screw's own, which a load cell at link
@@ -29,11 +30,11 @@ Around any plant:
 ``current_loop``
     The motor current lags the command: first order, bandwidth current_loop_hz.
 ``load_cell``
-    F1 and F2 are read through a first-order sensor of bandwidth load_cell_hz.
+    Forces and torques are read through a first-order sensor of bandwidth load_cell_hz.
 ``command_delay``, ``measurement_delay``
-    Dead times T_c before the input and T_m behind F1 and F2, as Padé approximants of order three: the phase is right to
-    one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are for
-    linearisation and continuous-time loops.
+    Dead times T_c before the input and T_m behind the same outputs, as Padé approximants of order three: the phase is
+    right to one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are
+    for linearisation and continuous-time loops.
 """
 
 from __future__ import annotations
@@ -85,12 +86,12 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
         Parameter(name="T_m", value=1e-3, unit="s", min=1e-9, description="delay of the measurement"),
     ),
 }  # fmt: skip
-INSIDE = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
+INSIDE: tuple[Part, ...] = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
 
 
-def parameters(parts: Sequence[str]) -> list[Parameter]:
-    """Return the parameters of the parts that sit inside the actuator."""
-    return [parameter for part in parts if part in INSIDE for parameter in PARTS[part]]
+def parameters(parts: Sequence[str], of_part: Mapping[str, tuple[Parameter, ...]]) -> list[Parameter]:
+    """Return the parameters of the parts that sit inside the actuator, from a screw's or a gear's table."""
+    return [parameter for part in parts if part in INSIDE for parameter in of_part[part]]
 
 
 def check_parts(parts: Sequence[str]) -> None:
@@ -111,19 +112,17 @@ def check_parts(parts: Sequence[str]) -> None:
             raise PlantError(f'part "{part}" is given twice; each part goes on once')
 
 
-def play(compression: Any, p: Any) -> Any:
-    """Return what the spring sees of a compression behind the play."""
-    before = ca.sqrt((compression - p.g_b) ** 2 + p.eps_b**2)
-    return compression + 0.5 * (before - ca.sqrt((compression + p.g_b) ** 2 + p.eps_b**2))
+def play(deflection: Any, p: Any) -> Any:
+    """Return what the spring sees of a deflection behind the play."""
+    before = ca.sqrt((deflection - p.g_b) ** 2 + p.eps_b**2)
+    return deflection + 0.5 * (before - ca.sqrt((deflection + p.g_b) ** 2 + p.eps_b**2))
 
 
-def spring_force(parts: Sequence[str], compression: Any, rate: Any, p: Any) -> Any:
-    """Return the spring's force at a compression (m) and its rate (m/s), N."""
-    z = play(compression, p) if "backlash" in parts else compression
-    force = p.k * z
-    if "hardening" in parts:
-        force += p.k_3 * z**3
-    return force + p.c_k * rate if "spring_damping" in parts else force
+def spring_force(parts: Sequence[str], deflection: Any, k: Any, p: Any) -> Any:
+    """Return the force (N, N m) of a spring of stiffness k at a deflection (m, rad), without its damper's."""
+    z = play(deflection, p) if "backlash" in parts else deflection
+    force = k * z
+    return force + p.k_3 * z**3 if "hardening" in parts else force
 
 
 def stores_in_closed_form(parts: Sequence[str]) -> bool:
@@ -131,34 +130,34 @@ def stores_in_closed_form(parts: Sequence[str]) -> bool:
     return not ("backlash" in parts and "hardening" in parts)
 
 
-def spring_energy(parts: Sequence[str], compression: Any, p: Any) -> Any:
-    """Return the energy that spring and play store at a compression (m), J: the integral of the force without c_k."""
+def spring_energy(parts: Sequence[str], deflection: Any, k: Any, p: Any) -> Any:
+    """Return the energy that spring and play store at a deflection (m, rad), J: the integral of `spring_force`."""
     if "backlash" in parts:
 
         def primitive(a: Any) -> Any:
             root = ca.sqrt(a**2 + p.eps_b**2)
             return 0.5 * (a * root + p.eps_b**2 * ca.asinh(a / p.eps_b))
 
-        before = primitive(compression - p.g_b) + primitive(p.g_b)
-        return p.k * 0.5 * (compression**2 + before - primitive(compression + p.g_b) + primitive(p.g_b))
-    energy = 0.5 * p.k * compression**2
-    return energy + 0.25 * p.k_3 * compression**4 if "hardening" in parts else energy
+        before = primitive(deflection - p.g_b) + primitive(p.g_b)
+        return k * 0.5 * (deflection**2 + before - primitive(deflection + p.g_b) + primitive(p.g_b))
+    energy = 0.5 * k * deflection**2
+    return energy + 0.25 * p.k_3 * deflection**4 if "hardening" in parts else energy
 
 
 def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
-    """Return Coulomb's and, with the part, Stribeck's friction at the screw, N, smoothed through zero."""
+    """Return Coulomb's and, with the part, Stribeck's friction (N, N m), smoothed through zero."""
     return friction_level(parts, speed, p) * ca.tanh(speed / p.v_s)
 
 
 def friction_level(parts: Sequence[str], speed: Any, p: Any) -> Any:
-    """Return what dry friction is without its smoothing, N; at zero speed what holds the screw at rest."""
+    """Return what dry friction is without its smoothing (N, N m); at zero speed what holds the drive at rest."""
     if "stribeck" not in parts:
         return p.f_c
     return p.f_c + (p.f_s - p.f_c) * ca.exp(-((speed / p.v_st) ** 2))
 
 
 def bound_friction_slopes(parts: Sequence[str], p: Any) -> tuple[Any, Any]:
-    """Return bounds of the slope of `dry_friction` over all speeds, N s/m: the flattest and the steepest.
+    """Return bounds of the slope of `dry_friction` over all speeds, N s/m (N m s/rad): the flattest and the steepest.
 
     The smoothing's slope is largest at rest, level/v_s, and never negative; that of (f_s - f_c) exp(-(v/v_st)^2) is
     largest at v_st/sqrt(2), |f_s - f_c| sqrt(2/e)/v_st.
@@ -233,7 +232,7 @@ def wrapped(
     for part in parts:
         if part in INSIDE:
             raise PlantError(
-                f'part "{part}" sits inside a linear actuator; use two_link, high_impedance or moving_output'
+                f'part "{part}" sits inside an actuator; give it to two_link, high_impedance, moving_output or rotary'
             )
     for part in ("current_loop", "command_delay", "load_cell", "measurement_delay"):
         if part not in parts:

@@ -1,19 +1,41 @@
-r"""A rotary series elastic actuator, unlumped: motor, gearbox with the housing's reaction, spring, link."""
+r"""The rotary series elastic actuator: motor, gearbox, spring and link about one axis.
+
+The derivation is in `seaopt.plants.actuator`: here a gear is its transmission, link 1 is the ground, and link 2 the
+actuator's link, held, an inertia about the axis, or a pendulum that hangs from it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal
 
 import casadi as ca
 
+from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
-from seaopt.plants.parts import Part, wrapped
+from seaopt.plants.actuator import (
+    DRIVES,
+    SPRINGS,
+    Actuator,
+    Drive,
+    Link,
+    Spring,
+    Transmission,
+    check_choices,
+    make_plant,
+)
+from seaopt.plants.parts import INSIDE, Part, check_parts
 from seaopt.plants.plant import Plant
-from seaopt.plants.roles import Actuation, Port, Sensing, SeriesSpring
+from seaopt.plants.published import GRAVITY
+from seaopt.plants.roles import Port, Sensing
 
-_PARAMETERS = (
+RotaryLink = Literal["free", "locked", "pendulum"]
+LINKS = ("free", "locked", "pendulum")
+
+_DRIVE = (
     Parameter(name="J_m", value=1e-4, unit="kg m^2", min=1e-15, description="motor inertia", plausible=(1e-10, 10)),
     Parameter(name="b_r", value=1e-4, unit="N m s", min=0.0, description="motor damping", plausible=(0, 100)),
     Parameter(
@@ -22,45 +44,139 @@ _PARAMETERS = (
     Parameter(name="N", value=50.0, unit="-", min=1e-9, description="gear ratio", plausible=(0.02, 10000)),
     Parameter(name="k_s", value=300.0, unit="N m/rad", min=0.0, description="spring stiffness", plausible=(0.01, 1e08)),
     Parameter(name="c_s", value=0.0, unit="N m s/rad", min=0.0, description="spring damping", plausible=(0, 1e06)),
+    Parameter(name="eta", value=1.0, unit="-", min=0.0, description="transmission efficiency", plausible=(0.25, 1.25)),
+    Parameter(
+        name="f_c", value=0.0, unit="N m", min=0.0, description="Coulomb friction at the motor", plausible=(0, 1000)
+    ),
+    Parameter(name="v_s", value=1.0, unit="rad/s", min=1e-9, description="smoothing speed of f_c, at the motor"),
+)
+_HOUSING = Parameter(
+    name="J_h", value=0.0, unit="kg m^2", min=0.0, description="housing inertia about the axis", plausible=(0, 100000)
+)
+_LINK = (
     Parameter(name="J_l", value=0.1, unit="kg m^2", min=1e-15, description="link inertia", plausible=(1e-08, 100000)),
     Parameter(name="d_l", value=0.0, unit="N m s/rad", min=0.0, description="link damping", plausible=(0, 100000)),
 )
+_PENDULUM = (
+    Parameter(name="m", value=3.0, unit="kg", min=0.0, description="pendulum mass", plausible=(0, 10000)),
+    Parameter(name="L", value=0.15, unit="m", min=0.0, description="centre of mass to pivot", plausible=(0, 10)),
+    GRAVITY,
+)
+_PARTS: dict[str, tuple[Parameter, ...]] = {
+    "stribeck": (
+        Parameter(name="f_s", value=0.0, unit="N m", min=0.0, description="breakaway friction at the motor"),
+        Parameter(name="v_st", value=10.0, unit="rad/s", min=1e-9, description="Stribeck speed, at the motor"),
+    ),
+    "backlash": (
+        Parameter(name="g_b", value=5e-4, unit="rad", min=0.0, description="half of the play, at the spring"),
+        Parameter(name="eps_b", value=5e-5, unit="rad", min=1e-12, description="rounding of the play's corners"),
+    ),
+    "hardening": (Parameter(name="k_3", value=0.0, unit="N m/rad^3", min=0.0, description="cubic stiffness"),),
+    "spring_damping": (),  # c_s is there without it
+}
+
+_GEAR = Transmission(
+    coordinate="theta_m",
+    rate="thetad_m",
+    place_unit="rad",
+    effort_unit="N m",
+    direction=1.0,
+    carry=1.0,
+    travel=lambda p: 1.0 / p.N,
+    inertia=lambda p: p.J_m,
+    damping=lambda p: p.b_r,
+    per_ampere=lambda p: p.eta * p.K_tau,
+    sprung=lambda p: 0.0,
+    stiffness="k_s",
+    spring_damping="c_s",
+    friction="tau_f",
+    parameters=_DRIVE,
+    part_parameters=_PARTS,
+)
+# With the spring at link 1 the housing hangs on it, so that its own inertia counts.
+_HANGING_GEAR = replace(_GEAR, sprung=lambda p: p.J_h, parameters=(*_DRIVE, _HOUSING))
+_TURNING = Link(
+    coordinate="theta_l",
+    rate="thetad_l",
+    unit="rad",
+    place=lambda x, p: x.theta_l,
+    kinetic=lambda x, p: 0.5 * p.J_l * x.thetad_l**2,
+    effort="tau_e",
+    parameters=_LINK[:1],
+)
+_FREE = replace(_TURNING, damping=lambda x, p: p.d_l * x.thetad_l, parameters=_LINK)
+_LINK_OF = {
+    "locked": Link(effort="tau_e"),
+    "free": _FREE,
+    "pendulum": replace(
+        _FREE,
+        potential=lambda x, p: p.m * p.g * p.L * (1 - ca.cos(x.theta_l)),
+        parameters=(*_LINK, *_PENDULUM),
+    ),
+    "bare": _TURNING,  # of the probe, whose only parameter is its inertia
+}
+_PAYLOAD = {"free": ("J_l",), "pendulum": ("J_l", "m"), "bare": ("J_l",)}
 
 
 def rotary_parameters() -> tuple[Parameter, ...]:
-    """Return the parameters of `rotary` with their defaults."""
-    return _PARAMETERS
+    """Return the parameters that some `rotary` has, with their defaults."""
+    return (*_DRIVE, _HOUSING, *_LINK, *_PENDULUM, *(item for items in _PARTS.values() for item in items))
 
 
-def rotary(parts: Sequence[Part] = ()) -> Plant:
-    r"""Return a rotary series elastic actuator: the two-mass drive with a gearbox.
+def rotary(
+    link: RotaryLink = "free",
+    drive: Drive = "unlumped",
+    spring: Spring = "link2",
+    parts: Sequence[Part] = (),
+    external: bool = False,
+) -> Plant:
+    r"""Return a rotary series elastic actuator: motor, gearbox, spring and link about one axis.
 
     Parameters
     ----------
+    link : {"free", "locked", "pendulum"}
+        The link turns freely, is held, or hangs from the axis with its centre of mass at L; J_l is its inertia about
+        the axis in every case, the pendulum's m L^2 included.
+    drive : {"unlumped", "lumped"}
+        The rotor turns N times as fast as the output and about the same axis, or its reflected inertia N^2 J_m turns
+        as a mass with the end of the gearbox that hangs on the spring. With the spring at link 2 they move alike and
+        differ in the torque on the housing.
+    spring : {"link2", "link1"}
+        Between gearbox and link, or between housing and ground (a reaction force sensing actuator, whose housing, with
+        the inertia J_h, moves on the spring).
     parts : sequence of str
-        ``current_loop`` and ``command_delay`` on the current, ``load_cell`` and ``measurement_delay`` on tau_s; see
-        `seaopt.plants.parts`.
+        Effects of a real actuator, friction at the motor (N m, rad/s) and play at the spring (rad); every part of
+        `seaopt.plants.parts` but the screw's own mode.
+    external : bool
+        Whether a torque tau_e (N m) on the link is an input of its own, zero where a log leaves it out.
 
     Returns
     -------
     Plant
-        Input I (A); outputs tau_s (N m, the spring's torque on the link), theta_m, theta_l (rad) and tau_h (N m, the
-        torque on the housing).
+        Input I (A); outputs tau_s (N m, the spring's torque), theta_m, theta_l (rad; no theta_l of a locked link),
+        tau_h (N m, the torque on the ground that carries the actuator), deflection (rad), and with the spring at link 1
+        tau_l (N m, the torque on the link).
+
+    Raises
+    ------
+    PlantError
+        An option is unknown.
 
     Notes
     -----
-    With :math:`\tau_s = k_s(\theta_m/N - \theta_l) + c_s(\dot\theta_m/N - \dot\theta_l)`:
+    Spring at link 2, with :math:`\tau_s = k_s(\theta_m/N - \theta_l) + c_s(\dot\theta_m/N - \dot\theta_l)`:
 
-    .. math:: J_m \ddot\theta_m = K_\tau I - b_r \dot\theta_m - \tau_s/N, \qquad
-              J_l \ddot\theta_l = \tau_s - d_l \dot\theta_l
+    .. math:: J_m \ddot\theta_m = \eta K_\tau I - b_r \dot\theta_m - f_c \tanh(\dot\theta_m/v_s) - \tau_s/N, \qquad
+              J_l \ddot\theta_l = \tau_s - d_l \dot\theta_l - m g L \sin\theta_l + \tau_e
 
-    The housing carries the stator, :math:`-(K_\tau I - b_r\dot\theta_m)`, and the gearbox, which turns the torque
-    :math:`\tau_s/N` into :math:`\tau_s`: :math:`\tau_h = -J_m \ddot\theta_m - \tau_s`, so that motor, link and housing
-    together conserve angular momentum except for d_l. The unlumped view matters here as in the paper: the motor's
-    inertia does not turn with the link at :math:`N^2 J_m`, it turns N times as fast (Orekhov et al. 2015, Sec. V).
+    The housing carries the stator and the gearbox, which turns the torque :math:`\tau_s/N` into :math:`\tau_s`:
+    :math:`\tau_h = -J_m \ddot\theta_m - \tau_s`, so that motor, link and housing together conserve angular momentum
+    except for d_l and gravity. The unlumped view matters here as in the paper (Orekhov et al. 2015, Sec. V): the lumped
+    drive has :math:`\tau_h = -N J_m \ddot\theta_m - \tau_s`.
 
     With the motor held the link swings at :math:`\sqrt{k_s/J_l}` (the antiresonance of theta_m, and a clamped flexible
-    link's frequency); free, both swing at :math:`\sqrt{k_s(1/J_l + 1/(N^2 J_m))}`. N = 1 is the two-mass drive.
+    link's frequency); free, both swing at :math:`\sqrt{k_s(1/J_l + 1/(N^2 J_m))}`. N = 1 is the two-mass drive. The
+    derivation, and the spring at link 1, are in `seaopt.plants.actuator`.
 
     Examples
     --------
@@ -68,53 +184,84 @@ def rotary(parts: Sequence[Part] = ()) -> Plant:
     >>> plant = so.plants.rotary()
     >>> model = plant.linearize(plant.defaults)
     >>> model.output_labels
-    ['tau_s', 'theta_m', 'theta_l', 'tau_h']
+    ['tau_s', 'theta_m', 'theta_l', 'tau_h', 'deflection']
 
     """
+    check_choices(("link", link, LINKS), ("drive", drive, DRIVES), ("spring", spring, SPRINGS))
+    if not isinstance(external, bool):
+        raise PlantError(f"external = {external!r} is not true or false; give one of them")
+    check_parts(parts)
+    if "screw_mode" in parts:
+        raise PlantError('part "screw_mode" is the axial mode of a ball screw; a gear\'s elasticity is part of k_s')
+    name = f"rotary({link}, {drive})" if (link, drive) != ("free", "unlumped") else "rotary"
+    return _actuator(name, link, drive, spring, tuple(parts), external)
 
-    def torques(x: Any, u: Any, p: Any) -> tuple[Any, Any]:
-        spring = p.k_s * (x.theta_m / p.N - x.theta_l) + p.c_s * (x.thetad_m / p.N - x.thetad_l)
-        return spring, (p.K_tau * u.I - p.b_r * x.thetad_m - spring / p.N) / p.J_m
 
-    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        spring, motor = torques(x, u, p)
-        link = (spring - p.d_l * x.thetad_l) / p.J_l
-        return {"theta_m": x.thetad_m, "thetad_m": motor, "theta_l": x.thetad_l, "thetad_l": link}
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        spring, motor = torques(x, u, p)
-        return {"tau_s": spring, "theta_m": x.theta_m, "theta_l": x.theta_l, "tau_h": -p.J_m * motor - spring}
-
-    def derived(p: Any) -> dict[str, tuple[Any, str]]:
-        return {
-            "antiresonance_hz": (ca.sqrt(p.k_s / p.J_l) / (2 * math.pi), "Hz"),
-            "resonance_hz": (ca.sqrt(p.k_s * (1 / p.J_l + 1 / (p.N**2 * p.J_m))) / (2 * math.pi), "Hz"),
-        }
-
-    def energy(x: Any, p: Any) -> Any:
-        kinetic = 0.5 * (p.J_m * x.thetad_m**2 + p.J_l * x.thetad_l**2)
-        return kinetic + 0.5 * p.k_s * (x.theta_m / p.N - x.theta_l) ** 2
-
-    plant = Plant(
-        name="rotary",
-        states={"theta_m": "rad", "thetad_m": "rad/s", "theta_l": "rad", "thetad_l": "rad/s"},
-        inputs={"I": "A"},
-        outputs={"tau_s": "N m", "theta_m": "rad", "theta_l": "rad", "tau_h": "N m"},
-        parameters={parameter.name: parameter for parameter in _PARAMETERS},
-        f=f,
-        h=h,
-        derived=derived,
-        energy=energy,
-        actuation=Actuation(input="I", effort=lambda p: p.N * p.K_tau, unit="N m"),
-        sensing=Sensing(
-            regulated=("tau_s",), motor_position="theta_m", motor_speed="thetad_m", link_position="theta_l"
-        ),
-        spring=SeriesSpring(deflection=lambda x, p: x.theta_m / p.N - x.theta_l, unit="rad", stiffness="k_s"),
-        ports=(
-            Port(
-                motion="theta_l", coordinate="theta_l", rate="thetad_l", payload=("J_l",), drive="theta_m",
-                ratio=lambda p: -p.N,
-            ),
-        ),
+def _actuator(name: str, link: str, drive: Drive, spring: Spring, parts: tuple[Part, ...], external: bool) -> Plant:
+    """Return the plant of options that are checked; its link may be the probe's bare one."""
+    actuator = Actuator(
+        transmission=_GEAR if spring == "link2" else _HANGING_GEAR, links=(Link(), _LINK_OF[link]), drive=drive,
+        spring=spring, parts=parts,
     )  # fmt: skip
-    return wrapped(plant, parts)
+    moves = link != "locked"
+    outputs: dict[str, tuple[str, Any]] = {
+        "tau_s": ("N m", lambda motion, x: motion.spring_force),
+        "theta_m": ("rad", lambda motion, x: x.theta_m),
+        **({"theta_l": ("rad", lambda motion, x: x.theta_l)} if moves else {}),
+        "tau_h": ("N m", lambda motion, x: -motion.forces[0]),
+        "deflection": ("rad", lambda motion, x: motion.deflection),
+        **({"tau_l": ("N m", lambda motion, x: motion.forces[1])} if spring == "link1" else {}),
+    }
+    return make_plant(
+        actuator,
+        name=name,
+        outputs=outputs,
+        derived=partial(_derive_figures, link=link, drive=drive, spring=spring),
+        sensing=Sensing(
+            regulated=("tau_s", "tau_l") if spring == "link1" else ("tau_s",),
+            motor_position="theta_m",
+            motor_speed="thetad_m",
+            link_position="theta_l" if moves else None,
+        ),
+        second_order=("reflected_inertia", "reflected_damping"),
+        inputs=("tau_e",) if external else (),
+        ports=(_port(name, link, drive, spring, parts, external),),
+    )
+
+
+def _derive_figures(p: Any, link: str, drive: Drive, spring: Spring) -> dict[str, tuple[Any, str]]:
+    """Return what swings on the spring with the link held, and the frequencies with it free."""
+    inertia, damping = p.N**2 * p.J_m, p.N**2 * p.b_r
+    if spring == "link1":  # a rotor on the housing turns N - 1 times as fast as the housing, backwards
+        inertia = p.J_h + ((p.N - 1) ** 2 * p.J_m if drive == "unlumped" else inertia)
+    figures = {
+        "reflected_inertia": (inertia, "kg m^2"),
+        "reflected_damping": (damping, "N m s/rad"),
+        "natural_frequency_hz": (ca.sqrt(p.k_s / inertia) / (2 * math.pi), "Hz"),
+        "damping_ratio": ((damping + p.c_s) / (2 * ca.sqrt(p.k_s * inertia)), "-"),
+    }
+    if spring == "link2" and link in ("free", "pendulum"):
+        weight = p.m * p.g * p.L if link == "pendulum" else 0.0
+        figures["antiresonance_hz"] = (ca.sqrt((p.k_s + weight) / p.J_l) / (2 * math.pi), "Hz")
+    if spring == "link2" and link == "free":
+        figures["resonance_hz"] = (ca.sqrt(p.k_s * (1 / p.J_l + 1 / inertia)) / (2 * math.pi), "Hz")
+    return figures
+
+
+def _port(name: str, link: str, drive: Drive, spring: Spring, parts: tuple[Part, ...], external: bool) -> Port:
+    """Return the port at the link: of a held one only its probe."""
+    inside: tuple[Part, ...] = tuple(part for part in parts if part in INSIDE)
+    probe = partial(_actuator, f"port of {name}", "bare", drive, spring, inside, True)
+    if link == "locked":
+        return Port(probe=probe)
+    return Port(
+        motion="theta_l",
+        coordinate="theta_l",
+        rate="thetad_l",
+        effort="tau_e" if external else None,
+        payload=_PAYLOAD[link],
+        held=partial(_actuator, f"{name}, link held", "locked", drive, spring, inside, external),
+        drive="theta_m",
+        ratio=lambda p: -p.N,  # the spring's deflection is theta_m/N - theta_l
+        probe=probe,
+    )

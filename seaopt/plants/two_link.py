@@ -1,38 +1,7 @@
-r"""An actuator between two links: the paper's general model (Orekhov et al. 2015, Figs. 3 and 4).
+r"""The ball-screw actuator between two links (Orekhov et al. 2015, Figs. 3 and 4), and its special cases.
 
-Derivation
-----------
-The drive shortens or lengthens the actuator by :math:`q` and the spring of stiffness :math:`k` sits in series with
-it, so that for either spring placement its compression is
-
-.. math:: \delta = q + x_2 - x_1, \qquad V = \tfrac12 k \delta^2 .
-
-The unlumped rack-and-pinion drive has rotary inertia :math:`M = J/r^2` that only :math:`\dot q` turns, and a sprung
-mass :math:`m_l` that moves along x with :math:`x_s`; the lumped drive has no rotary part and :math:`m_k = m_l + M`
-(1) as its sprung mass:
-
-.. math:: T = \tfrac12 M \dot q^2 + \tfrac12 m_s \dot x_s^2 + T_\mathrm{links}
-
-=========  ============  ===========  =======================================================
-drive      spring        m_s          x_s
-=========  ============  ===========  =======================================================
-unlumped   link 1        m_l          q + x_2     (the no-slip condition (5): x_l = q + x_2)
-lumped     link 1        m_k          q + x_2     (x_k)
-unlumped   link 2        m_l          x_1         (the housing rides on link 1)
-lumped     link 2        m_k          x_1 - q     (the mirror: the mass hangs on the spring)
-=========  ============  ===========  =======================================================
-
-The motor works on :math:`q` alone, :math:`Q_q = F_m - b_m \dot q - f_c \tanh(\dot q / v_s)` with
-:math:`F_m = \eta (K_\tau / r) I` (3); in the lumped drive this force acts between the sprung mass and the far link,
-in the unlumped one between the pinion and a virtual ground out of plane. Lagrange's equations in :math:`q` and the
-links' coordinates give the motion. The forces that the links feel, +F1 on link 1 and -F2 on link 2, follow:
-
-.. math::
-    \text{spring at link 1:}\quad F_1 = k\delta,\; F_2 = k\delta + m_s \ddot x_s \qquad
-    \text{spring at link 2:}\quad F_2 = k\delta,\; F_1 = k\delta - m_s \ddot x_s
-
-With spring at link 1 this is (9)-(12) and :math:`m_l \ddot x_l = F_2 - F_1`, :math:`M \ddot q = F_m - b_m\dot q - F_2`
-for the unlumped drive, and :math:`F_2 = F_m - b_m \dot q` for the lumped one.
+The derivation is in `seaopt.plants.actuator`: here a screw is its transmission, and its links are fixed, masses that
+slide along x, or pendulums whose lever arms pull along x.
 """
 
 from __future__ import annotations
@@ -41,29 +10,34 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, Literal
 
 import casadi as ca
 
-from seaopt.errors import PlantError
 from seaopt.plants import parts as part_laws
-from seaopt.plants.parts import Part
+from seaopt.plants.actuator import (
+    DRIVES,
+    SPRINGS,
+    Actuator,
+    Drive,
+    Link,
+    Spring,
+    Transmission,
+    check_choices,
+    make_plant,
+)
+from seaopt.plants.parts import PARTS, Part
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import ACTUATOR, GRAVITY, link_mass, pendulum
-from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring
+from seaopt.plants.roles import Port, Sensing
 from seaopt.records import record
 
-AT_REST = SimpleNamespace(I=0.0, F_f=0.0)  # inputs and friction
-Drive = Literal["unlumped", "lumped"]
-Spring = Literal["link1", "link2"]
-Link = Literal["fixed", "mass", "pendulum"]
+LinkKind = Literal["fixed", "mass", "pendulum"]
 
 
-def _drive_figures(p: Any) -> tuple[Any, Any, Any]:
-    """Return r (2), M = J/r^2 and b_m (4)."""
-    r = p.l / (2 * math.pi * p.N_p)
-    return r, p.J / r**2, p.b_r / r**2
+def _radius(p: Any) -> Any:
+    """Return r (2)."""
+    return p.l / (2 * math.pi * p.N_p)
 
 
 def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[Any, str]]:
@@ -71,11 +45,11 @@ def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[A
 
     Where the housing rides on link 1 (unlumped, spring at link 2), only M = J/r^2 swings then, not m_k.
     """
-    r, rotary, b_m = _drive_figures(p)
-    m_k = p.m_l + rotary
-    swinging = rotary if housing_rides else m_k
+    rotor, b_m = SCREW.inertia(p), SCREW.damping(p)
+    m_k = p.m_l + rotor
+    swinging = rotor if housing_rides else m_k
     return {
-        "r": (r, "m"),
+        "r": (_radius(p), "m"),
         "m_k": (m_k, "kg"),
         "b_m": (b_m, "N s/m"),
         "natural_frequency_hz": (ca.sqrt(p.k / swinging) / (2 * math.pi), "Hz"),
@@ -83,219 +57,126 @@ def derived_figures(p: Any, *, housing_rides: bool = False) -> dict[str, tuple[A
     }
 
 
-def effort_per_current(p: Any) -> Any:
-    """Return F_m of one ampere (3), N/A."""
-    return p.eta * (p.K_tau / _drive_figures(p)[0])
-
-
-@record
-class _LinkModel:
-    """One link: its coordinate (if it moves), position along x, energies and generalised force."""
-
-    coordinate: Any
-    rate: Any
-    position: Any
-    kinetic: Any
-    potential: Any
-    damping: Any
-
-
-def _link_model(kind: Link, index: int, suffix: str, x: Any, p: Any) -> _LinkModel:
-    if kind == "fixed":
-        zero = ca.SX(0)
-        return _LinkModel(coordinate=None, rate=None, position=zero, kinetic=zero, potential=zero, damping=zero)
-    if kind == "mass":
-        y, rate = getattr(x, f"x_{index}"), getattr(x, f"v_{index}")
-        mass = getattr(p, f"m_{index}")
-        zero = ca.SX(0)
-        kinetic = 0.5 * mass * rate**2
-        return _LinkModel(coordinate=y, rate=rate, position=y, kinetic=kinetic, potential=zero, damping=zero)
-    phi, rate = getattr(x, f"phi{suffix}"), getattr(x, f"phid{suffix}")
-    inertia, mass, length, arm, damping = (getattr(p, f"{name}{suffix}") for name in ("I_p", "m", "L", "L_a", "d"))
-    return _LinkModel(
-        coordinate=phi,
-        rate=rate,
-        position=arm * ca.sin(phi),
-        kinetic=0.5 * inertia * rate**2,
-        potential=mass * p.g * length * (1 - ca.cos(phi)),
-        damping=damping * rate,
-    )
-
-
-@record
-class _Motion:
-    """The accelerations and forces of the actuator, as expressions of state, input and parameters."""
-
-    rates: list[tuple[Any, Any]]
-    forces: tuple[Any, Any]
-    links: tuple[_LinkModel, _LinkModel]
-    compression: Any
-    energy: Any
+SCREW = Transmission(
+    coordinate="q",
+    rate="qd",
+    place_unit="m",
+    effort_unit="N",
+    direction=-1.0,
+    carry=0.0,
+    travel=lambda p: 1.0,
+    inertia=lambda p: p.J / _radius(p) ** 2,
+    damping=lambda p: p.b_r / _radius(p) ** 2,
+    per_ampere=lambda p: p.eta * (p.K_tau / _radius(p)),
+    sprung=lambda p: p.m_l,
+    stiffness="k",
+    spring_damping="c_k",
+    friction="F_f",
+    parameters=ACTUATOR,
+    part_parameters=PARTS,
+)
 
 
 @record
 class _Build:
     """What kind of actuator is built: its links with the endings of their names, drive, spring and parts."""
 
-    links: tuple[Link, Link]
+    links: tuple[LinkKind, LinkKind]
     suffixes: tuple[str, str]
     drive: Drive
     spring: Spring
     parts: tuple[Part, ...]
 
 
-def _motion(x: Any, u: Any, p: Any, build: _Build) -> _Motion:
-    """Lagrange's equations of the module docstring."""
-    links = tuple(_link_model(build.links[i], i + 1, build.suffixes[i], x, p) for i in (0, 1))
-    _, rotary, b_m = _drive_figures(p)
-    unlumped, screw = build.drive == "unlumped", "screw_mode" in build.parts
-    moving = [link for link in links if link.coordinate is not None]
-    y = ca.vertcat(x.q, *([x.s] if screw else []), *(link.coordinate for link in moving))
-    yd = ca.vertcat(x.qd, *([x.sd] if screw else []), *(link.rate for link in moving))
+def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
+    if kind == "fixed":
+        return Link(effort=f"Fe{number}")
+    if kind == "mass":
+        coordinate, rate, mass = f"x_{number}", f"v_{number}", f"m_{number}"
+        return Link(
+            coordinate=coordinate,
+            rate=rate,
+            unit="m",
+            place=lambda x, p: getattr(x, coordinate),
+            kinetic=lambda x, p: 0.5 * getattr(p, mass) * getattr(x, rate) ** 2,
+            effort=f"Fe{number}",
+            parameters=(link_mass(number),),
+        )
+    phi, phid = f"phi{suffix}", f"phid{suffix}"
 
-    sprung = p.m_l if unlumped else p.m_l + rotary
-    rotary = rotary if unlumped else 0.0
-    stretch = x.s if screw else 0.0
-    x_1, x_2 = links[0].position, links[1].position
-    if build.spring == "link1":
-        x_n = x_2 + stretch  # the nut
-        x_s, compression = x.q + x_n, x.q + x_n - x_1
-    elif unlumped:
-        x_n = x_1 - x.q + stretch
-        x_s, compression = x_1, x_2 - x_n
-    else:  # the mirror of spring at link 1
-        x_n = x_1 + stretch
-        x_s, compression = x_n - x.q, x_2 - x_n + x.q
+    def own(p: Any, name: str) -> Any:
+        return getattr(p, name + suffix)
 
-    def speed(position: Any) -> Any:
-        return ca.jtimes(position, y, yd)
-
-    nut = p.m_n if screw else 0.0
-    kinetic = 0.5 * (rotary * x.qd**2 + sprung * speed(x_s) ** 2 + nut * speed(x_n) ** 2)
-    kinetic += links[0].kinetic + links[1].kinetic
-    potential = links[0].potential + links[1].potential
-    tension = part_laws.spring_force(build.parts, compression, speed(compression), p)
-    bolt = (p.k_b * x.s + p.c_b * x.sd) if screw else 0.0
-
-    # T = yd' H(y) yd / 2, so that H ydd = Q - dV/dy - (dH/dt yd - dT/dy).
-    inertia, _ = ca.hessian(kinetic, yd)
-    gyroscopic = ca.jtimes(ca.gradient(kinetic, yd), y, yd) - ca.gradient(kinetic, y)
-    motor = effort_per_current(p) * u.I - b_m * x.qd - u.F_f
-    # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
-    external = getattr(u, "Fe1", 0.0) * ca.gradient(x_1, y) + getattr(u, "Fe2", 0.0) * ca.gradient(x_2, y)
-    damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping for link in moving))
-    generalised = external - ca.gradient(potential, y) - damping - tension * ca.gradient(compression, y)
-    generalised[0] += motor
-    ydd = ca.mtimes(ca.inv_minor(inertia), generalised - gyroscopic)
-
-    def thrust(mass: Any, position: Any) -> Any:
-        return mass * (ca.jtimes(speed(position), y, yd) + ca.jtimes(position, y, ydd))
-
-    if build.spring == "link1":
-        forces = (tension, -bolt if screw else tension + thrust(sprung, x_s))
-    else:
-        forces = (tension - thrust(sprung, x_s) - (thrust(nut, x_n) if screw else 0.0), tension)
-    stored = kinetic + potential + part_laws.spring_energy(build.parts, compression, p)
-    return _Motion(
-        rates=[(yd[i], ydd[i]) for i in range(y.numel())], forces=forces, links=(links[0], links[1]),
-        compression=compression, energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
-    )  # fmt: skip
-
-
-def _as_tuple(parts: Sequence[Part]) -> tuple[Part, ...]:
-    part_laws.check_parts(parts)
-    return tuple(parts)
-
-
-def _check_build(build: _Build) -> _Build:
-    for what, choice, known in (
-        ("drive", build.drive, ("unlumped", "lumped")),
-        ("spring", build.spring, ("link1", "link2")),
-        ("link1", build.links[0], ("fixed", "mass", "pendulum")),
-        ("link2", build.links[1], ("fixed", "mass", "pendulum")),
-    ):
-        if choice not in known:
-            raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
-    part_laws.check_parts(build.parts)
-    return build
+    return Link(
+        coordinate=phi,
+        rate=phid,
+        unit="rad",
+        place=lambda x, p: own(p, "L_a") * ca.sin(getattr(x, phi)),
+        kinetic=lambda x, p: 0.5 * own(p, "I_p") * getattr(x, phid) ** 2,
+        potential=lambda x, p: own(p, "m") * p.g * own(p, "L") * (1 - ca.cos(getattr(x, phi))),
+        damping=lambda x, p: own(p, "d") * getattr(x, phid),
+        effort=f"Fe{number}",
+        parameters=tuple(pendulum(suffix)),
+    )
 
 
 def _actuator(name: str, build: _Build, external: bool) -> Plant:
-    """Return the plant of a build: its own states and parameters, then the parts that wrap any plant."""
-    _check_build(build)
-    states = {"q": "m", "qd": "m/s"} | ({"s": "m", "sd": "m/s"} if "screw_mode" in build.parts else {})
-    outputs = {"F1": "N", "F2": "N", "q": "m"}
-    parameters = [*ACTUATOR, *part_laws.parameters(build.parts)]
-    for number, (link, suffix) in enumerate(zip(build.links, build.suffixes, strict=True), start=1):
-        if link == "mass":
-            states |= {f"x_{number}": "m", f"v_{number}": "m/s"}
-            parameters.append(link_mass(number))
-        if link == "pendulum":
-            states |= {f"phi{suffix}": "rad", f"phid{suffix}": "rad/s"}
-            outputs |= {f"phi{suffix}": "rad"}
-            parameters += pendulum(suffix)
-        if link != "fixed":
-            outputs[f"x_{number}"] = "m"
-    if "pendulum" in build.links:
-        parameters.append(GRAVITY)
-
-    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        flat = [rate for pair in _motion(x, u, p, build).rates for rate in pair]
-        return dict(zip(states, flat, strict=True))
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        result = _motion(x, u, p, build)
-        values = {"F1": result.forces[0], "F2": result.forces[1], "q": x.q}
-        for number, link in enumerate(result.links, start=1):
-            values |= {f"x_{number}": link.position, f"phi{build.suffixes[number - 1]}": link.coordinate}
-        return {name: values[name] for name in outputs}
-
-    def energy(x: Any, p: Any) -> Any:
-        return _motion(x, AT_REST, p, build).energy
-
-    def deflection(x: Any, p: Any) -> Any:
-        return _motion(x, AT_REST, p, build).compression
-
-    housing_rides = build.drive == "unlumped" and build.spring == "link2"
-    plant = Plant(
+    """Return the plant of a build."""
+    known = ("fixed", "mass", "pendulum")
+    check_choices(
+        ("drive", build.drive, DRIVES), ("spring", build.spring, SPRINGS), ("link1", build.links[0], known),
+        ("link2", build.links[1], known),
+    )  # fmt: skip
+    part_laws.check_parts(build.parts)
+    links = tuple(_make_link(build.links[i], i + 1, build.suffixes[i]) for i in (0, 1))
+    if "pendulum" in build.links:  # one gravity for both, the last parameter
+        links = (links[0], replace(links[1], parameters=(*links[1].parameters, GRAVITY)))
+    actuator = Actuator(
+        transmission=SCREW, links=(links[0], links[1]), drive=build.drive, spring=build.spring, parts=build.parts
+    )
+    rides = actuator.housing_rides
+    outputs = _list_outputs(build)
+    return make_plant(
+        actuator,
         name=name,
-        states=states,
-        inputs={"I": "A"} | ({"Fe1": "N", "Fe2": "N"} if external else {}),
         outputs=outputs,
-        parameters={parameter.name: parameter for parameter in parameters},
-        f=f,
-        h=h,
-        derived=lambda p: derived_figures(p, housing_rides=housing_rides),
-        optional_inputs=frozenset({"I", "Fe1", "Fe2"}) if external else frozenset(),
-        energy=energy if part_laws.stores_in_closed_form(build.parts) else None,
-        actuation=Actuation(input="I", effort=effort_per_current, unit="N", efficiency="eta"),
+        derived=lambda p: derived_figures(p, housing_rides=rides),
         sensing=Sensing(
             regulated=("F1", "F2"),
             motor_position="q",
             motor_speed="qd",
             link_position="x_2" if "x_2" in outputs else None,
         ),
-        spring=SeriesSpring(
-            deflection=deflection,
-            unit="m",
-            stiffness="k",
-            mass=None if housing_rides else "m_k",
-            damping=None if housing_rides else "b_m",
-        ),
+        second_order=None if rides else ("m_k", "b_m"),
+        inputs=("Fe1", "Fe2") if external else (),
         ports=_ports(name, build, external),
-        friction={
-            "F_f": Friction(
-                velocity=lambda x, p: x.qd,
-                force=lambda v, p: part_laws.dry_friction(build.parts, v, p),
-                unit="N",
-                slopes=lambda p: part_laws.bound_friction_slopes(build.parts, p),
-                jump=lambda speed, p: part_laws.friction_level(build.parts, speed, p),
-                smoothing="v_s",
-            )
-        },
-        mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in build.parts else None,
     )
-    return part_laws.wrapped(plant, [part for part in build.parts if part not in part_laws.INSIDE])
+
+
+def _list_outputs(build: _Build) -> dict[str, tuple[str, Any]]:
+    outputs: dict[str, tuple[str, Any]] = {
+        "F1": ("N", lambda motion, x: motion.forces[0]),
+        "F2": ("N", lambda motion, x: motion.forces[1]),
+        "q": ("m", lambda motion, x: x.q),
+    }
+
+    def angle(name: str) -> Any:
+        return lambda motion, x: getattr(x, name)
+
+    def place(index: int) -> Any:
+        return lambda motion, x: motion.places[index]
+
+    for index, (link, suffix) in enumerate(zip(build.links, build.suffixes, strict=True)):
+        if link == "pendulum":
+            outputs[f"phi{suffix}"] = ("rad", angle(f"phi{suffix}"))
+        if link != "fixed":
+            outputs[f"x_{index + 1}"] = ("m", place(index))
+    return outputs
+
+
+def _as_tuple(parts: Sequence[Part]) -> tuple[Part, ...]:
+    part_laws.check_parts(parts)
+    return tuple(parts)
 
 
 def _ports(name: str, build: _Build, external: bool) -> tuple[Port, ...]:
@@ -330,8 +211,8 @@ def _ports(name: str, build: _Build, external: bool) -> tuple[Port, ...]:
 
 
 def two_link(
-    link1: Link = "fixed",
-    link2: Link = "fixed",
+    link1: LinkKind = "fixed",
+    link2: LinkKind = "fixed",
     drive: Drive = "unlumped",
     spring: Spring = "link1",
     parts: Sequence[Part] = (),
@@ -370,7 +251,7 @@ def two_link(
 
     and the links feel +F1 and -F2: :math:`m_1 \ddot x_1 = F_1 + F_{e1}`, :math:`m_2 \ddot x_2 = -F_2 + F_{e2}`,
     :math:`I_p \ddot\varphi = -F_2 L_a \cos\varphi - m g L \sin\varphi - d \dot\varphi`. The other drives and
-    springs are in `seaopt.plants.two_link`, with the derivation (Orekhov et al. 2015, Figs. 3, 4 and (1)-(12)).
+    springs are in `seaopt.plants.actuator`, with the derivation (Orekhov et al. 2015, Figs. 3, 4 and (1)-(12)).
 
     Examples
     --------

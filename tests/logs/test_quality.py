@@ -52,7 +52,7 @@ def test_no_false_alarm(kind, stand, swing, thor):
             so.plants.two_link(link1="mass", link2="mass"), thor, PAPER_SWING, duration_s=20, rate_hz=400, seed=2
         ),
         "rotary": lambda: so.virtual_log(
-            so.plants.rotary(), thor, PAPER_STAND, duration_s=20, rate_hz=1000, seed=3
+            so.plants.rotary(), so.plants.rotary().defaults, PAPER_STAND, duration_s=20, rate_hz=1000, seed=3
         ),
         "multisine": lambda: so.virtual_log(stand, thor, sine, duration_s=20, rate_hz=400, seed=4, sensors=noise),
         "quiet": lambda: so.virtual_log(stand, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=5),

@@ -64,7 +64,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_simulation_is_dop853s(name, hold, thor):
     plant, changes = CASES[name]
-    params = plant.complete(thor).update(**changes)
+    params = plant.complete(plant.defaults if name == "rotary" else thor).update(**changes)
     rng = np.random.default_rng(5)
     u = rng.normal(size=(40, 1)) * 3
     x0 = {state: 1e-3 * rng.normal() for state in plant.states}
@@ -89,8 +89,8 @@ def test_random_plants_are_dop853s(seed, name, hold):
     plant = CASES[name][0]
     defaults = plant.defaults
     around = {n: v.value * 10 ** rng.uniform(-0.4, 0.4) for n, v in defaults.items() if v.value and n != "g"}
-    if "f_c" in defaults:
-        around |= {"f_c": rng.uniform(0, 30), "v_s": 0.01}
+    at_the_motor = defaults["f_c"].unit == "N m"
+    around |= {"f_c": rng.uniform(0, 0.1), "v_s": 5.0} if at_the_motor else {"f_c": rng.uniform(0, 30), "v_s": 0.01}
     params = defaults.update(**around)
     u = rng.normal(size=(15, len(plant.inputs))) * ([3] + [50] * (len(plant.inputs) - 1))
     log = so.Log.from_arrays(time=np.arange(15) / RATE, **dict(zip(plant.inputs, u.T, strict=True)))

@@ -246,8 +246,8 @@ def test_the_port_wears_the_plants_parts(thor):
 
 
 def test_what_cannot_be_answered_is_refused(thor, stand):
-    with pytest.raises(ControlError, match="port of plant rotary states no probe"):
-        passivity(tuned(), so.plants.rotary(), thor)
+    with pytest.raises(ControlError, match="states no probe"):
+        passivity(tuned(), replace(stand, ports=(replace(stand.port, probe=None),)), thor)
     with pytest.raises(ControlError, match="no port at link 2"):
         passivity(tuned(), replace(stand, ports=()), thor)
     with pytest.raises(ControlError, match="is not a band"):

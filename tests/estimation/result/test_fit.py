@@ -229,10 +229,10 @@ def test_what_cannot_be_told_is_named(stand, short_log, thor):
 
 @pytest.mark.parametrize("start", [{}, {"J_m": 0.01, "b_r": 0.2, "K_tau": 0.3, "k_s": 40.0}, {"J_m": 1e-3, "k_s": 5.0}])
 @pytest.mark.parametrize("J_l", [1e4, 1e6])
-def test_what_a_heavy_link_hides_is_marked_whatever_the_start(J_l, start, thor):
+def test_what_a_heavy_link_hides_is_marked_whatever_the_start(J_l, start):
     """tau_s of a motor against a link that hardly moves has J_m, b_r and k_s over each other, and K_tau alone."""
     plant, free = so.plants.rotary(), ("J_m", "b_r", "K_tau", "k_s")
-    truth = plant.complete(thor).update(J_m=0.0032, b_r=0.588, K_tau=0.867, k_s=16.5, N=1.0, J_l=J_l)
+    truth = plant.defaults.update(J_m=0.0032, b_r=0.588, K_tau=0.867, k_s=16.5, N=1.0, J_l=J_l)
     log = so.virtual_log(plant, truth, (Noise(std=1.0, band_hz=60),), duration_s=10, rate_hz=400, seed=1)
     torque = log["tau_s"] + 0.005 * np.std(log["tau_s"]) * np.random.default_rng(1).normal(size=len(log))
     measured = so.Log.from_arrays(time=log.time, I=log["I"], tau_s=torque)

@@ -164,6 +164,6 @@ def test_bad_input(controller, stand, thor, options, words):
         coupled_stability(controller, stand, thor, **options)
 
 
-def test_a_plant_without_port(controller):
+def test_a_plant_without_port(controller, stand, thor):
     with pytest.raises(ControlError, match="states no probe"):
-        coupled_stability(controller, so.plants.rotary(), so.plants.rotary().defaults)
+        coupled_stability(controller, replace(stand, ports=(replace(stand.port, probe=None),)), thor)

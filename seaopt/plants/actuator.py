@@ -1,0 +1,350 @@
+r"""An actuator between two links: one derivation for the ball screw (Orekhov et al. 2015, Figs. 3 and 4) and the gear.
+
+Derivation
+----------
+Links, housing and the output of the transmission move along one axis: x along a screw, an angle about a gear. The
+motor turns by :math:`\theta` and moves the output against the housing,
+
+.. math:: \sigma (x_o - x_h) = g \theta, \qquad
+          \text{screw: } g = r = \frac{l}{2 \pi N_p} \text{ (2)}, \; \sigma = -1, \qquad
+          \text{gear: } g = 1/N, \; \sigma = +1
+
+(a screw's positive current pulls the links together, a gear's turns link 2 forwards). The spring of stiffness k sits
+between link 1 and the housing ("link1", then :math:`x_o = x_2`) or between the output and link 2 ("link2", then
+:math:`x_h = x_1`). Either way it is deflected by what the drive travels less what the links move apart:
+
+.. math:: \delta = g \theta - \sigma (x_2 - x_1), \qquad V = \tfrac12 k \delta^2 .
+
+The unlumped drive has a rotor J and a sprung mass :math:`m_s` on the housing. The axis of a screw is the direction of
+its motion, so that moving the housing does not turn the rotor, :math:`\kappa = 0`; a gear's rotor turns about the
+housing's own axis and is carried along, :math:`\kappa = 1`. The lumped drive has no rotor: its reflected inertia
+:math:`J/g^2` moves as part of the sprung mass, (1):
+
+.. math:: T = \tfrac12 J (\dot\theta + \kappa \dot x_h)^2 + \tfrac12 m_s \dot x_s^2 + T_\mathrm{links}
+
+=========  ============  =============  ====================================================================
+drive      spring        m_s            x_s
+=========  ============  =============  ====================================================================
+unlumped   link 1        m_l            x_h = x_2 - sigma g theta  (the no-slip condition (5): x_l = q + x_2)
+lumped     link 1        m_l + J/g^2    x_h = x_2 - sigma g theta  (x_k)
+unlumped   link 2        m_l            x_h = x_1                  (the housing rides on link 1)
+lumped     link 2        m_l + J/g^2    x_o = x_1 + sigma g theta  (the mirror: the mass hangs on the spring)
+=========  ============  =============  ====================================================================
+
+The motor works on :math:`\theta` alone, :math:`Q_\theta = \eta K_\tau I - b_r \dot\theta - F_f(\dot\theta)`; in the
+lumped drive this acts between the sprung mass and the far link, in the unlumped one between rotor and housing (of a
+screw, which takes no turning moment along x: between the pinion and a virtual ground out of plane). Lagrange's
+equations in :math:`\theta` and the links' coordinates give the motion. The links feel :math:`-\sigma F_1` and
+:math:`+\sigma F_2`; with the momentum :math:`P = m_s \dot x_s + \kappa J (\dot\theta + \kappa \dot x_h)` of what is
+between them
+
+.. math::
+    \text{spring at link 1:}\quad F_1 = k\delta,\; F_2 = k\delta - \sigma \dot P \qquad
+    \text{spring at link 2:}\quad F_2 = k\delta,\; F_1 = k\delta + \sigma \dot P
+
+The state is :math:`\theta` for a gear and the travel :math:`q = r \theta` for a screw, all of the above divided by r
+as often as it takes: :math:`M = J/r^2`, :math:`b_m = b_r/r^2` (4), :math:`F_m = \eta (K_\tau/r) I` (3) and g = 1. With
+spring at link 1 this is (9)-(12) and :math:`m_l \ddot x_l = F_2 - F_1`, :math:`M \ddot q = F_m - b_m\dot q - F_2` for
+the unlumped drive, and :math:`F_2 = F_m - b_m \dot q` for the lumped one. With a gear, spring at link 2 and link 1 at
+rest it is the two-mass drive :math:`J \ddot\theta = \eta K_\tau I - b_r \dot\theta - \tau_s/N`, and the housing pushes
+the ground with :math:`-F_1 = -J \ddot\theta - \tau_s`, which the lumped drive makes N times as large,
+:math:`-N J \ddot\theta - \tau_s`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import casadi as ca
+
+from seaopt.errors import PlantError
+from seaopt.parameters import Parameter
+from seaopt.plants import parts as part_laws
+from seaopt.plants.parts import Part
+from seaopt.plants.plant import Derived, Plant
+from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring, StateExpression
+from seaopt.records import record
+
+Drive = Literal["unlumped", "lumped"]
+Spring = Literal["link1", "link2"]
+DRIVES: tuple[Drive, ...] = ("unlumped", "lumped")
+SPRINGS: tuple[Spring, ...] = ("link1", "link2")
+
+
+def _nothing(x: Any, p: Any) -> Any:
+    return ca.SX(0)
+
+
+@record(eq=False)
+class Link:
+    """One link: its coordinate and rate (states, if it moves), place along the axis, energies, force of its damper.
+
+    `unit` is the coordinate's, `effort` the input that pushes it along the axis, `parameters` are its own.
+    """
+
+    coordinate: str | None = None
+    rate: str | None = None
+    place: StateExpression = _nothing
+    kinetic: StateExpression = _nothing
+    potential: StateExpression = _nothing
+    damping: StateExpression = _nothing
+    unit: str = ""
+    effort: str | None = None
+    parameters: tuple[Parameter, ...] = ()
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a coordinate."""
+        return self.coordinate is not None
+
+
+@record(eq=False)
+class Transmission:
+    """A screw or a gear, in units of its own coordinate y (q of a screw, theta of a gear's motor).
+
+    Parameters
+    ----------
+    coordinate, rate : str
+        The states y and dy/dt.
+    place_unit, effort_unit : str
+        Along the axis: m and N, or rad and N m.
+    direction, carry : float
+        sigma and kappa.
+    travel, inertia, damping, per_ampere, sprung : callable ``p -> expression``
+        g, J, b_r and eta K_tau as y sees them, and m_l.
+    stiffness, spring_damping : str
+        Names of the spring's parameters.
+    friction : str
+        Name of the dry friction.
+    parameters : tuple of Parameter
+        Of motor, transmission and spring.
+    part_parameters : mapping of part to parameters
+        What the parts inside add.
+
+    """
+
+    coordinate: str
+    rate: str
+    place_unit: str
+    effort_unit: str
+    direction: float
+    carry: float
+    travel: Expression
+    inertia: Expression
+    damping: Expression
+    per_ampere: Expression
+    sprung: Expression
+    stiffness: str
+    spring_damping: str
+    friction: str
+    parameters: tuple[Parameter, ...]
+    part_parameters: Mapping[str, tuple[Parameter, ...]]
+
+
+@record(eq=False)
+class Actuator:
+    """What is between which links: the parts of the derivation that are chosen."""
+
+    transmission: Transmission
+    links: tuple[Link, Link]
+    drive: Drive
+    spring: Spring
+    parts: tuple[Part, ...]
+
+    @property
+    def damped_spring(self) -> bool:
+        """Whether the spring has a damper: a part, or among the transmission's own parameters."""
+        own = {parameter.name for parameter in self.transmission.parameters}
+        return "spring_damping" in self.parts or self.transmission.spring_damping in own
+
+    @property
+    def housing_rides(self) -> bool:
+        """Whether the housing is link 1's, so that with the links fixed only the rotor swings."""
+        return self.drive == "unlumped" and self.spring == "link2"
+
+
+@record
+class Motion:
+    """The accelerations and forces of an actuator, as expressions of state, input and parameters."""
+
+    rates: Mapping[str, Any]
+    forces: tuple[Any, Any]
+    places: tuple[Any, Any]
+    deflection: Any
+    spring_force: Any
+    energy: Any
+
+
+def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
+    """Return Lagrange's equations of the module docstring, solved for the accelerations."""
+    drive, links, parts = actuator.transmission, actuator.links, actuator.parts
+    unlumped, screw = actuator.drive == "unlumped", "screw_mode" in parts
+    moving = [link for link in links if link.moves]
+    names = [(drive.coordinate, drive.rate), *([("s", "sd")] if screw else [])]
+    names += [(str(link.coordinate), str(link.rate)) for link in moving]
+    y = ca.vertcat(*(getattr(x, coordinate) for coordinate, _ in names))
+    yd = ca.vertcat(*(getattr(x, rate) for _, rate in names))
+
+    sigma, travel, inertia = drive.direction, drive.travel(p) * y[0], drive.inertia(p)
+    sprung = drive.sprung(p) if unlumped else drive.sprung(p) + inertia / drive.travel(p) ** 2
+    stretch = x.s if screw else 0.0
+    x_1, x_2 = (link.place(x, p) for link in links)
+    if actuator.spring == "link1":
+        x_n = x_2 + stretch  # the nut
+        x_s = x_h = x_n - sigma * travel
+        deflection = travel - sigma * (x_n - x_1)
+    elif unlumped:
+        x_n = x_1 + sigma * travel + stretch
+        x_s = x_h = x_1
+        deflection = sigma * (x_n - x_2)
+    else:  # the mirror of spring at link 1
+        x_n = x_h = x_1 + stretch
+        x_s = x_n + sigma * travel
+        deflection = travel - sigma * (x_2 - x_n)
+
+    def speed(position: Any) -> Any:
+        return ca.jtimes(position, y, yd)
+
+    turning = yd[0] + drive.carry * speed(x_h)
+    rotor, nut = inertia if unlumped else 0.0, p.m_n if screw else 0.0
+    kinetic = 0.5 * (rotor * turning**2 + sprung * speed(x_s) ** 2 + nut * speed(x_n) ** 2)
+    kinetic += links[0].kinetic(x, p) + links[1].kinetic(x, p)
+    potential = links[0].potential(x, p) + links[1].potential(x, p)
+    stiffness = getattr(p, drive.stiffness)
+    tension = part_laws.spring_force(parts, deflection, stiffness, p)
+    if actuator.damped_spring:
+        tension += getattr(p, drive.spring_damping) * speed(deflection)
+    bolt = (p.k_b * x.s + p.c_b * x.sd) if screw else 0.0
+
+    # T = yd' H(y) yd / 2, so that H ydd = Q - dV/dy - (dH/dt yd - dT/dy).
+    mass, _ = ca.hessian(kinetic, yd)
+    gyroscopic = ca.jtimes(ca.gradient(kinetic, yd), y, yd) - ca.gradient(kinetic, y)
+    motor = drive.per_ampere(p) * u.I - drive.damping(p) * yd[0] - getattr(u, drive.friction)
+    # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
+    external = sum(
+        (getattr(u, link.effort, 0.0) * ca.gradient(place, y) for link, place in zip(links, (x_1, x_2), strict=True)
+         if link.effort is not None), ca.SX(y.numel(), 1),
+    )  # fmt: skip
+    damping = ca.vertcat(0.0, *([bolt] if screw else []), *(link.damping(x, p) for link in moving))
+    generalised = external - ca.gradient(potential, y) - damping - tension * ca.gradient(deflection, y)
+    generalised[0] += motor
+    ydd = ca.mtimes(ca.inv_minor(mass), generalised - gyroscopic)
+
+    def thrust(mass: Any, position: Any) -> Any:
+        return mass * (ca.jtimes(speed(position), y, yd) + ca.jtimes(position, y, ydd))
+
+    between = sigma * (thrust(sprung, x_s) + drive.carry * rotor * (ydd[0] + thrust(drive.carry, x_h)))
+    if actuator.spring == "link1":
+        forces = (tension, -bolt if screw else tension - between)
+    else:
+        forces = (tension + between + (sigma * thrust(nut, x_n) if screw else 0.0), tension)
+    stored = kinetic + potential + part_laws.spring_energy(parts, deflection, stiffness, p)
+    return Motion(
+        rates={name: value for k, pair in enumerate(names) for name, value in zip(pair, (yd[k], ydd[k]), strict=True)},
+        forces=forces, places=(x_1, x_2), deflection=deflection, spring_force=tension,
+        energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
+    )  # fmt: skip
+
+
+def check_choices(*choices: tuple[str, object, tuple[str, ...]]) -> None:
+    """Refuse an option that is not among those known, each given as (name, choice, known).
+
+    Raises
+    ------
+    PlantError
+        It is not; the message names it.
+
+    """
+    for what, choice, known in choices:
+        if choice not in known:
+            raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in known))
+
+
+def make_plant(
+    actuator: Actuator,
+    *,
+    name: str,
+    outputs: Mapping[str, tuple[str, Callable[[Motion, Any], Any]]],
+    derived: Derived,
+    sensing: Sensing,
+    second_order: tuple[str, str] | None = None,
+    inputs: tuple[str, ...] = (),
+    ports: tuple[Port, ...] = (),
+) -> Plant:
+    """Return the plant of an actuator: its equations and roles, then the parts that wrap any plant.
+
+    Parameters
+    ----------
+    actuator : Actuator
+        What it is made of.
+    name : str
+        Of the plant.
+    outputs : mapping of name to (unit, callable ``(motion, x) -> expression``)
+        What can be measured.
+    derived, sensing, ports
+        As in `Plant`.
+    second_order : (str, str), optional
+        The derived figures that are mass and damping of the second-order response with the links fixed.
+    inputs : tuple of str
+        Efforts of the world on the links, which a log may leave out.
+
+    """
+    drive, parts = actuator.transmission, actuator.parts
+    place, effort = drive.place_unit, drive.effort_unit
+    pairs = [(drive.coordinate, drive.rate, place)]
+    pairs += [("s", "sd", place)] if "screw_mode" in parts else []
+    pairs += [(str(link.coordinate), str(link.rate), link.unit) for link in actuator.links if link.moves]
+    parameters = [*drive.parameters, *part_laws.parameters(parts, drive.part_parameters)]
+    parameters += [parameter for link in actuator.links for parameter in link.parameters]
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return solve_motion(actuator, x, u, p).rates
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        motion = solve_motion(actuator, x, u, p)
+        return {output: read(motion, x) for output, (_, read) in outputs.items()}
+
+    at_rest = SimpleNamespace(**{"I": 0.0, drive.friction: 0.0})
+
+    def energy(x: Any, p: Any) -> Any:
+        return solve_motion(actuator, x, at_rest, p).energy
+
+    def deflection(x: Any, p: Any) -> Any:
+        return solve_motion(actuator, x, at_rest, p).deflection
+
+    plant = Plant(
+        name=name,
+        states={state: unit for pair in pairs for state, unit in zip(pair[:2], (pair[2], f"{pair[2]}/s"), strict=True)},
+        inputs={"I": "A"} | dict.fromkeys(inputs, effort),
+        outputs={output: unit for output, (unit, _) in outputs.items()},
+        parameters={parameter.name: parameter for parameter in parameters},
+        f=f,
+        h=h,
+        derived=derived,
+        optional_inputs=frozenset({"I", *inputs}) if inputs else frozenset(),
+        energy=energy if part_laws.stores_in_closed_form(parts) else None,
+        actuation=Actuation(
+            input="I", effort=lambda p: drive.per_ampere(p) / drive.travel(p), unit=effort, efficiency="eta"
+        ),
+        sensing=sensing,
+        spring=SeriesSpring(
+            deflection=deflection, unit=place, stiffness=drive.stiffness,
+            mass=second_order[0] if second_order else None, damping=second_order[1] if second_order else None,
+        ),
+        ports=ports,
+        friction={
+            drive.friction: Friction(
+                velocity=lambda x, p: getattr(x, drive.rate),
+                force=lambda v, p: part_laws.dry_friction(parts, v, p),
+                unit=effort,
+                effort=lambda p: 1.0 / drive.travel(p),
+                slopes=lambda p: part_laws.bound_friction_slopes(parts, p),
+                jump=lambda speed, p: part_laws.friction_level(parts, speed, p),
+                smoothing="v_s",
+            )
+        },
+        mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in parts else None,
+    )  # fmt: skip
+    return part_laws.wrapped(plant, [part for part in parts if part not in part_laws.INSIDE])
