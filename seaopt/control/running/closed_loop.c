@@ -48,6 +48,7 @@ static void run(const seaopt_loop_args *a) {
     const double *arg[SZ_ARG + 9];
     double *res[SZ_RES + 4];
     casadi_int iw[SZ_IW + 1];
+    int lost = 0; /* a state that is not finite stays so: nothing more to integrate */
     memcpy(x, a->x, sizeof x);
     memcpy(z, a->z, NZ * sizeof *z);
     for (long k = 0; k < a->n; k++) {
@@ -61,6 +62,7 @@ static void run(const seaopt_loop_args *a) {
         memcpy(a->states + k * NX, x, sizeof x);
         a->applied[k] = newer[0];
         for (int i = 0; i < NY; i++) a->peak[i] = larger(a->peak[i], fabs(a->y[k * NY + i]));
+        if (lost) continue;
         memcpy(coarse, x, sizeof x);
         memcpy(unused, a->peak, sizeof unused);
         integrate(a, t, u, newer, a->substeps, coarse, unused);
@@ -68,6 +70,7 @@ static void run(const seaopt_loop_args *a) {
         for (int i = 0; i < NX; i++) {
             a->error[i] = larger(a->error[i], fabs(x[i] - coarse[i]));
             a->size[i] = larger(a->size[i], fabs(x[i]));
+            lost |= !isfinite(x[i]);
         }
     }
     memcpy(a->x, x, sizeof x);

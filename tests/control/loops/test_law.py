@@ -206,7 +206,7 @@ def test_a_loop_at_4_khz_that_multiplied_out_polynomials_hide_is_found(thor):
         ])  # fmt: skip
         assert np.max(np.abs(np.linalg.eigvals(closed))) < 1.0
         z = np.exp(2j * np.pi * np.geomspace(0.05, 1999.0, 20_000) / 4000.0)
-        response = np.array([(c @ np.linalg.solve(x * np.eye(len(a)) - a, b) + d)[0, 0] for x in z])
+        response = (c @ np.linalg.solve(z[:, None, None] * np.eye(len(a)) - a, b[None]) + d)[:, 0, 0]
         inner = z[:, None, None] * np.eye(len(law.A)) - law.A
         c_y = -(law.C @ np.linalg.solve(inner, np.broadcast_to(law.B[:, 1:], (z.size, *law.B[:, 1:].shape))))[:, 0, 0]
         sensitivity = np.abs(1 / (1 + response * (c_y - law.D[0, 1])))

@@ -47,7 +47,7 @@ def test_neighbours_of_an_impossible_bandwidth_are_named(bench):
     """Below its resonance this actuator needs the weights: without them only what is well above it is possible."""
     case = bench.Case(bench.ISSUE, 25.0)
     stand, params = so.plants.high_impedance(), so.plants.thor().update(**bench.ISSUE)
-    spec = replace(case.spec, reference_weights="error", max_noise_gain=40.0)
+    spec = replace(case.spec, reference_weights="error", max_noise_gain=40.0, bandwidth_range_hz=(20.0, 46.0))
     controller = so.tune(stand, params, spec)
     assert not controller.feasible
     possible = controller.possible
@@ -57,6 +57,7 @@ def test_neighbours_of_an_impossible_bandwidth_are_named(bench):
         assert so.tune(stand, params, replace(spec, bandwidth_hz=f)).feasible
 
 
+@pytest.mark.slow
 def test_what_misses_its_limits_misses_them_least(bench):
     """With feedback of the error nothing near 10 Hz is good: 4.28 of the worst limit is the least that can be had.
 
