@@ -87,7 +87,10 @@ class Token:
     start: int
 
 
-def parse(text: str, symbols: Mapping[str, Any], place: str, elsewhere: Mapping[str, str] | None = None) -> Any:
+Explain = Callable[[str], str | None]  # why a name may not stand in a text; None of a name that is not known at all
+
+
+def parse(text: str, symbols: Mapping[str, Any], place: str, explain: Explain = lambda name: None) -> Any:
     r"""Return the CasADi expression that a text stands for.
 
     Parameters
@@ -98,8 +101,8 @@ def parse(text: str, symbols: Mapping[str, Any], place: str, elsewhere: Mapping[
         What the text may name, besides the functions and `pi`.
     place : str
         What the text is, for messages, such as "f.omega".
-    elsewhere : mapping of name to text, optional
-        Names that are known but may not stand here, and why, for messages.
+    explain : callable ``name -> text or None``, optional
+        Why a name that is not among the symbols may not stand here, for messages; None where it is not known.
 
     Returns
     -------
@@ -128,7 +131,7 @@ def parse(text: str, symbols: Mapping[str, Any], place: str, elsewhere: Mapping[
     """
     if len(text) > MAX_LENGTH:
         raise PlantError(f"{place} has {len(text)} characters; give at most {MAX_LENGTH}, or use definitions")
-    return _Parser(text, symbols, place, elsewhere or {}).read_all()
+    return _Parser(text, symbols, place, explain).read_all()
 
 
 def list_names(text: str) -> list[str]:
@@ -147,8 +150,8 @@ def list_names(text: str) -> list[str]:
 class _Parser:
     """Reads one text from left to right."""
 
-    def __init__(self, text: str, symbols: Mapping[str, Any], place: str, elsewhere: Mapping[str, str]) -> None:
-        self.text, self.symbols, self.place, self.elsewhere = text, symbols, place, elsewhere
+    def __init__(self, text: str, symbols: Mapping[str, Any], place: str, explain: Explain) -> None:
+        self.text, self.symbols, self.place, self.explain = text, symbols, place, explain
         self.tokens = [
             Token(kind=str(match.lastgroup), text=match[str(match.lastgroup)], start=match.start(str(match.lastgroup)))
             for match in _TOKEN.finditer(text)
@@ -242,7 +245,7 @@ class _Parser:
     def read_call(self, name: Token, depth: int) -> Any:
         """Return a function of the arguments that follow its name."""
         if name.text not in FUNCTIONS:
-            if name.text in (*self.symbols, *self.elsewhere, *CONSTANTS):
+            if name.text in self.symbols or name.text in CONSTANTS or self.explain(name.text):
                 raise self.error(name, f"{_quote(name)} is not a function; write a product with *")
             remedy = _REMEDIES.get(name.text) or suggestion(name.text, FUNCTIONS)
             raise self.error(name, f"unknown function {_quote(name)}; {remedy}")
@@ -285,8 +288,9 @@ class _Parser:
             return ca.SX(CONSTANTS[name.text])
         if name.text in FUNCTIONS:
             raise self.error(name, f"{name.text} is a function; give its argument in brackets")
-        if name.text in self.elsewhere:
-            raise self.error(name, f"{_quote(name)} {self.elsewhere[name.text]}")
+        reason = self.explain(name.text)
+        if reason is not None:
+            raise self.error(name, f"{_quote(name)} {reason}")
         raise self.error(name, f"unknown name {_quote(name)}; {suggestion(name.text, self.symbols)}")
 
     def check_finite(self, value: Any, token: Token) -> Any:

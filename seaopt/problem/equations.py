@@ -23,6 +23,7 @@ from seaopt.problem.schema import AnyPlant, EquationsTable, Formula, FrictionTab
 from seaopt.records import record
 from seaopt.units import factor, si_unit
 
+MAX_NAMES, MAX_ROLES = 500, 20  # of one plant; of its frictions, and of its ports
 TIME, VELOCITY = "t", "v"  # names of their own: in f and h, and in the curves of a friction
 KINDS = {
     "states": "a state", "inputs": "an input", "friction": "a friction", "parameters": "a parameter",
@@ -77,7 +78,7 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
     _check_names(table)
     _check_units(table)
     _check_equations(table)
-    texts = _Texts(table=table, definitions=_sort_definitions(table))
+    texts = _Texts(table=table, definitions=_sort_definitions(table), names=_list_kinds(table))
     equations = {
         what: texts.store(
             lambda read, what=what: {key: read(f"{what}.{key}", text) for key, text in getattr(table, what).items()},
@@ -129,10 +130,21 @@ def _list_texts(content: Any) -> Iterator[str]:
 
 @record
 class _Texts:
-    """A table's formulas as functions; `definitions` in an order in which each uses only earlier ones."""
+    """A table's formulas as functions.
+
+    Parameters
+    ----------
+    table : EquationsTable
+    definitions : list of str
+        Their names, in an order in which each uses only earlier ones.
+    names : mapping of name to text
+        What each name of the plant is, in words.
+
+    """
 
     table: EquationsTable
     definitions: list[str]
+    names: Mapping[str, str]
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -151,8 +163,7 @@ class _Texts:
                 symbols |= {names: one} if isinstance(names, str) else vars(one)
             own = {name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments}
             symbols = self.define(own) | symbols
-            elsewhere = self.explain(symbols)
-            return write(lambda place, text: _read(text, symbols, place, elsewhere))
+            return write(lambda place, text: self.read(place, text, symbols))
 
         return store_function(function, *arguments)
 
@@ -161,26 +172,22 @@ class _Texts:
         known = dict(symbols)
         for name in self.definitions:
             text = self.table.definitions[name]
-            missing = {used for used in list_names(str(text)) if used not in known} & self.names.keys()
-            if not missing:
-                known[name] = _read(text, known, f"definitions.{name}", self.explain(known))
+            if not any(used in self.names and used not in known for used in list_names(str(text))):
+                known[name] = self.read(f"definitions.{name}", text, known)
         return {name: known[name] for name in self.definitions if name in known}
 
-    @property
-    def names(self) -> dict[str, str]:
-        """What each name of the plant is."""
-        kinds = {TIME: "the time"} | dict.fromkeys(self.table.outputs, "an output")
-        for group, kind in KINDS.items():
-            kinds |= dict.fromkeys(getattr(self.table, group), kind)
-        return kinds
+    def read(self, place: str, text: Formula, symbols: Mapping[str, Any]) -> Any:
+        """Return the expression of a formula in which these names may stand."""
+        if not isinstance(text, str):
+            return ca.SX(float(text))
 
-    def explain(self, symbols: Mapping[str, Any]) -> dict[str, str]:
-        """Return why the names of the plant that are not among the symbols may not stand beside them."""
-        return {
-            name: "is an output; write its expression, or make it one of definitions" if kind == "an output"
-            else f"is {kind}, which may not stand here; known: {', '.join(symbols)}"
-            for name, kind in self.names.items() if name not in symbols
-        }  # fmt: skip
+        def explain(name: str) -> str | None:
+            kind = self.names.get(name)
+            if kind == "an output":
+                return "is an output; write its expression, or make it one of definitions"
+            return None if kind is None else f"is {kind}, which may not stand here; known: {', '.join(symbols)}"
+
+        return parse(text, symbols, place, explain)
 
     def of_states(self, place: str, text: Formula | None) -> Any:
         """Return a formula of states and parameters as a function; None where there is none."""
@@ -243,8 +250,12 @@ class _Texts:
         )  # fmt: skip
 
 
-def _read(text: Formula, symbols: Mapping[str, Any], place: str, elsewhere: Mapping[str, str]) -> Any:
-    return parse(text, symbols, place, elsewhere) if isinstance(text, str) else ca.SX(float(text))
+def _list_kinds(table: EquationsTable) -> dict[str, str]:
+    """Return what each name of a plant is, in words."""
+    kinds = {TIME: "the time"} | dict.fromkeys(table.outputs, "an output")
+    for group, kind in KINDS.items():
+        kinds |= dict.fromkeys(getattr(table, group), kind)
+    return kinds
 
 
 def _sense(table: EquationsTable) -> Sensing | None:
@@ -275,6 +286,13 @@ def _sort(uses: Mapping[str, Iterable[str]], what: str) -> list[str]:
 
 
 def _check_names(table: EquationsTable) -> None:
+    for what, count, most in (
+        ("names", sum(len(getattr(table, group)) for group in (*KINDS, "outputs", "derived")), MAX_NAMES),
+        ("frictions", len(table.friction), MAX_ROLES),
+        ("ports", len(table.ports), MAX_ROLES),
+    ):
+        if count > most:
+            raise PlantError(f"has {count} {what}; give at most {most}")
     seen: dict[str, str] = {}
     for group in KINDS:
         for name in getattr(table, group):
