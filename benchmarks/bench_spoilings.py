@@ -12,7 +12,8 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 import scipy.signal
@@ -41,15 +42,21 @@ def integrate(slope: Callable[[np.ndarray, float], np.ndarray], start: np.ndarra
     return rows
 
 
-def stand(current: np.ndarray, p: dict[str, float]) -> Arrays:
-    """Return what load cells read with both links held: (M + m_l) qdd = F_m - b qd - k q - friction."""
+DRIVES = {"zero": "zoh", "first": "foh"}
+
+
+def stand(current: np.ndarray, p: dict[str, float], hold: str = "zero") -> Arrays:
+    """Return what load cells read with both links held: (M + m_l) qdd = F_m - b qd - k q - friction.
+
+    Without friction the current may be joined by lines between samples, hold = "first", as some drives do.
+    """
     r = p["l"] / (2.0 * math.pi * p["N_p"])
     b, moving, gain = p["b_r"] / r**2, p["J"] / r**2 + p["m_l"], p["eta"] * p["K_tau"] / r
     if p["f_c"] == 0.0:
         a = np.array([[0.0, 1.0], [-p["k"] / moving, -b / moving]])
         c = np.array([[p["k"], 0.0], p["m_l"] * a[1] + [p["k"], 0.0]])
         system = (a, np.array([[0.0], [gain / moving]]), c, np.array([[0.0], [p["m_l"] * gain / moving]]))
-        _, y, _ = scipy.signal.dlsim(scipy.signal.cont2discrete(system, 1.0 / RATE_HZ), current)
+        _, y, _ = scipy.signal.dlsim(scipy.signal.cont2discrete(system, 1.0 / RATE_HZ, DRIVES[hold]), current)
         return {"I": current, "F1": y[:, 0], "F2": y[:, 1]}
 
     def slope(x: np.ndarray, u: float) -> np.ndarray:
@@ -123,12 +130,13 @@ class Case:
     bounds: dict[str, float] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     rate: float = RATE_HZ
+    hold: Literal["zero", "first"] = "zero"
 
 
 def make_fit(case: Case, seed: int) -> so.Fit:
     """Return the fit of a case."""
     rng = np.random.default_rng(seed)
-    run = {"stand": stand, "swing": swing}[case.bench]
+    run = {"stand": partial(stand, hold=case.hold), "swing": swing}[case.bench]
     log = run(excite(rng, case.samples), TRUTH | case.truth)
     log["I"] = log["I"].copy()
     for name in ("F1", "F2"):
@@ -145,7 +153,7 @@ def make_fit(case: Case, seed: int) -> so.Fit:
     params = params.free(*case.free)
     for name, low in case.bounds.items():
         params = params.with_parameters(replace(params[name], value=max(params[name].value, low), min=low))
-    experiment = so.Experiment(plant=plants[case.model], log=recorded, outputs=("F1", "F2"), name="log")
+    experiment = so.Experiment(plant=plants[case.model], log=recorded, outputs=("F1", "F2"), name="log", hold=case.hold)
     others = [plant for name, plant in plants.items() if name != case.model]
     return so.fit([experiment], params, alternatives=others, **case.options)
 
@@ -302,13 +310,15 @@ def judge_honest(count: int) -> None:
         case = Case(
             noise=noise, noise_n=float(10 ** rng.uniform(0.0, 2.0)), samples=int(rng.integers(1500, 6000)),
             truth={"J": TRUTH["J"] * rng.uniform(0.5, 2.0), "b_r": TRUTH["b_r"] * rng.uniform(0.5, 2.0)},
+            hold="first" if seed % 5 == 4 else "zero",
         )  # fmt: skip
         fit = make_fit(case, 20_000 + seed)
         worst = [one for one in fit.findings if one.severity != "note"]
         accused.update({f"{noise} {one.severity}" for one in worst} | {one.severity for one in worst})
         for one in worst:
             print(
-                f"  seed {seed}, {noise}, {case.noise_n:.3g} N, {case.samples}: {one.severity} {one.kind}: {one.text}"
+                f"  seed {seed}, {noise}, hold {case.hold}, {case.noise_n:.3g} N, {case.samples}: {one.severity} "
+                f"{one.kind}: {one.text}"
             )
     print(f"{count} honest fits: {dict(accused)}")
 

@@ -22,9 +22,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_p
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.solver.least_squares import minimise
-from seaopt.estimation.solver.settle import Solved, estimate_sigma, sharpen
-from seaopt.estimation.solver.step_size import StepError, choose_first_steps
+from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_roughly, sharpen
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -32,8 +30,6 @@ from seaopt.plants.parts import wrapped
 from seaopt.records import record
 from seaopt.units import unit_after
 
-ITERATIONS, ROUNDS, ROUGH = 15, 2, 1e-2  # of a refit, and how near to its minimum, in squared std
-MOST_SUBSTEPS = 8
 ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that chance does not give
 SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the cause, and others need not be tried
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
@@ -177,7 +173,7 @@ def _refit(minimum: Minimum, candidate: _Candidate) -> Solved | None:
     )  # fmt: skip
     names, z = problem.unknowns.names, problem.unknowns.start.copy()
     if old.predicts:
-        solved = replace(minimum.method, max_iterations=ITERATIONS, search=False).solve(problem, None)
+        solved = replace(minimum.method, max_iterations=ROUGH_ITERATIONS, search=False).solve(problem, None)
         return solved if np.isfinite(solved.solution.evaluation.cost) else None
     known = dict(zip(old.unknowns.names, minimum.z.tolist(), strict=True))
     for i, name in enumerate(names):
@@ -195,25 +191,8 @@ def _refit(minimum: Minimum, candidate: _Candidate) -> Solved | None:
         there = problem.evaluate(other)
         start = there if there.cost < start.cost else start
     # Only the freed parameter's friction is sharpened: what the fit found out already needs no other search.
-    solved = _minimise_roughly(problem, start) if old.find_smoothing() else sharpen(problem, start, _minimise_roughly)
+    solved = settle_roughly(problem, start) if old.find_smoothing() else sharpen(problem, start, settle_roughly)
     return solved if np.isfinite(solved.misfit) else None
-
-
-def _minimise_roughly(problem: FitProblem, start: Evaluation) -> Solved:
-    """Return a minimum that is near enough to tell a cause: sigma is estimated twice, the step chosen once."""
-    problem, here = choose_first_steps(problem, start, MOST_SUBSTEPS)
-    problem = problem.with_each(substeps=min(MOST_SUBSTEPS, *(e.substeps for e in problem.experiments)))
-    unknowns, solution = problem.unknowns, None
-    for _ in range(ROUNDS):
-        problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
-        solution = minimise(
-            problem, problem.evaluate(here.z), unknowns.low, unknowns.high, decrement=ROUGH, max_iterations=ITERATIONS
-        )
-        here = solution.evaluation
-        if not np.isfinite(here.cost):
-            break
-    assert solution is not None
-    return Solved(problem=problem, solution=solution, step_error=StepError())
 
 
 def _compare_gains(problem: FitProblem, z: Float[np.ndarray, " n"], gains: Sequence[str]) -> Float[np.ndarray, " n"]:
@@ -284,13 +263,13 @@ def _list_candidates(
     here = first if poor else fit.parameters
     yield from _swap_channels(fit.experiments, here, poor=poor)
     if poor:
+        for plant in alternatives:  # the right one is soon found, and the wrong one takes long to refit
+            yield from _change_plant(fit.experiments, first, plant)
         yield from _free_gains(fit.experiments, first)
     yield from _free_delays(fit.experiments, here)
     yield from _free_parameters(fit, minimum, suspects)
     yield from _clip_outputs(minimum.problem, residuals, here)
     yield from _filter_outputs(fit.experiments, here)
-    for plant in alternatives if poor else ():
-        yield from _change_plant(fit.experiments, first, plant)
 
 
 def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTest]) -> Iterator[_Candidate]:

@@ -16,7 +16,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import summarise
-from seaopt.estimation.solver.delay_cells import search_delay_cells
+from seaopt.estimation.solver.delay_cells import search_delays
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.parameters import Parameter, ParameterSet
@@ -100,7 +100,7 @@ def fit(
     )  # fmt: skip
     _check_samples(problem)
     _check_stiffness(problem)
-    solved = search_delay_cells(chosen.solve(problem, callback), chosen.max_iterations, callback)
+    solved = search_delays(chosen.solve(problem, callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
     return judge(result, alternatives) if diagnostics else result
 

@@ -39,6 +39,7 @@ LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
 SMALL = 1e-5  # below which a systematic residual is worth no word
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
+APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
 PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
 FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
 RIVAL_SHARE = 0.9  # of what the best cause gains: no reason to prefer one
@@ -65,7 +66,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
     outputs = _score_held_out_shots(fit, _state_shares(fit, shares))
     fit = replace(fit, outputs=outputs)
     findings = [*_find_unexplained(fit, shares), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
-    findings += [*_find_implausible(fit), *_find_few_samples(fit, minimum)]
+    findings += [*_find_implausible(fit), *_find_contradicting_delays(fit), *_find_few_samples(fit, minimum)]
     tests = _run_tests(fit, minimum)
     suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     wrong = bool(suspects) or any(finding.severity != "note" for finding in findings) or fit.status != "converged"
@@ -210,6 +211,32 @@ def _find_implausible(fit: Fit) -> Iterator[FitFinding]:
             text=f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: "
             "check the units of inputs and outputs, such as mA read as A, and the fixed parameters",
         )  # fmt: skip
+
+
+def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:
+    """Yield fitted delays that differ from the one that is known best among the logs of the same plant."""
+    for plant in dict.fromkeys(experiment.plant.name for experiment in fit.experiments):
+        fitted = {
+            e.name: fit.nuisance[e.name]
+            for e in fit.experiments
+            if e.plant.name == plant and "delay_s" in fit.nuisance[e.name].std
+        }
+        if not fitted:
+            continue
+        best = min(fitted, key=lambda name: fitted[name].std["delay_s"])
+        value, std = fitted[best].delay_s, fitted[best].std["delay_s"]
+        for experiment in fit.experiments:
+            own = fitted.get(experiment.name)
+            if own is None or own is fitted[best]:
+                continue
+            apart, own_std = abs(own.delay_s - value), own.std["delay_s"]
+            if apart > max(APART_STDS * math.hypot(own_std, std), APART * experiment.log.period):
+                yield FitFinding(
+                    severity="warning", kind="delay", where=f"{experiment.name}.delay_s",
+                    text=f"a delay of {1e3 * own.delay_s:.4g} ± {1e3 * own_std:.2g} ms contradicts that of {best}, "
+                    f"{1e3 * value:.4g} ± {1e3 * std:.2g} ms: a delay makes up for what the model lacks in one of "
+                    "them, or they were recorded apart; look at both, or give delay_s",
+                )  # fmt: skip
 
 
 def _find_few_samples(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:

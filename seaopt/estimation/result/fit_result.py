@@ -27,6 +27,7 @@ from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
 
 FIT_SCHEMA = "seaopt/fit/2"
+KNOWN_DELAY_S, BETTER = 1e-4, 10.0  # std of a delay that is known; and how many times better another one is
 
 
 @record(eq=False)
@@ -154,9 +155,14 @@ class Fit:
         return self.unknowns + sum(len(own.gain) for own in self.nuisance.values())
 
     def delay_s(self, plant: Plant) -> float:
-        """Return the longest delay of the plant's experiments, fitted or given; of all, where it has none."""
-        own = [one.delay_s for one in self.nuisance.values() if one.plant in ("", plant.name)]
-        return max(own or [one.delay_s for one in self.nuisance.values()], default=0.0)
+        """Return the longest delay of the plant's experiments, fitted or given; of all, where it has none.
+
+        A fitted one that its log hardly tells does not count where another log tells its own ten times better.
+        """
+        own = [one for one in self.nuisance.values() if one.plant in ("", plant.name)] or [*self.nuisance.values()]
+        stds = [one.std["delay_s"] for one in own if "delay_s" in one.std]
+        known = max(KNOWN_DELAY_S, BETTER * min(stds, default=0.0))
+        return max((one.delay_s for one in own if one.std.get("delay_s", 0.0) <= known), default=0.0)
 
     def require_minimum(self, what: str) -> Minimum:
         """Return the minimum, for `what` needs it.

@@ -57,14 +57,14 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     if not np.isfinite(evaluation.cost):
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
     statistics = compute_statistics(problem, z) if diagnostics else None
-    seen_white, seen_robust, unseen = _compute_covariances(problem, evaluation, statistics)
+    seen_white, seen_robust, unseen, variance = _compute_covariances(problem, evaluation, statistics)
     names = unknowns.names[:p]
     known = assess_identifiability(evaluation.hessian, names, z[:p])
     unseen = np.where([name in known.unidentified for name in names], 1.0, unseen)
     white, robust = mark_unseen(seen_white, unseen), mark_unseen(seen_robust, unseen)
     if known.rank < known.free:
         known = replace(known, structural_rank=compute_structural_rank(problem, z))
-    std, variance = np.sqrt(np.diag(robust)), np.diag(invert(evaluation.hessian)[0])
+    std = np.sqrt(np.diag(robust))
     fitted = params.with_parameters(
         *(
             replace(params[name], value=float(z[i]), std=float(std[i]), identified=bool(np.isfinite(std[i])))
@@ -153,24 +153,30 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
-) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"], Float[np.ndarray, " p"], Float[np.ndarray, " n"]]:
     """Return the parameters' covariance for white residuals, for those that there are, and what is unseen.
 
-    Both are over what is seen alone, and the last how much of each parameter is not (0 to 1, squared).
+    Both are over what is seen alone, and the third is how much of each parameter is not (0 to 1, squared). The last are
+    the variances of all unknowns: of parameters, delays and gains for the residuals that there are, of others for white
+    ones.
     """
     p, prior, z = problem.unknowns.shared, problem.unknowns.precision, evaluation.z
     bread = evaluation.hessian if problem.loss.quadratic else compute_bread(problem, z) + np.diag(prior)
-    if not p:
-        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0)
     inverse, unseen = invert(bread)
-    columns = inverse[:, :p]
+    variance = np.diag(inverse).copy()
+    own = [slot.index for e in problem.experiments for slot in (e.slots.delay, *e.slots.gain) if slot.index is not None]
+    stated = [*range(p), *own]
+    if not stated:
+        return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), variance
+    columns = inverse[:, stated]
     known = (columns.T * prior) @ columns
-    white = inverse[:p, :p]
+    white = inverse[np.ix_(stated, stated)]
     if not problem.loss.quadratic:
         sums = statistics if statistics is not None else compute_statistics(problem, z)
         white = columns.T @ compute_white_meat(problem, z, sums) @ columns + known
     robust = white if statistics is None else compute_meat(problem, z, columns, statistics) + known
-    return white, robust, unseen[:p]
+    variance[stated] = np.diag(robust)
+    return white[:p, :p], robust[:p, :p], unseen[:p], variance
 
 
 def _compute_log_likelihood(problem: FitProblem, evaluation: Evaluation) -> float:

@@ -1,4 +1,8 @@
-"""Free delays of outputs that the input reaches at once: the sample in force changes at whole samples of delay.
+"""Free delays, whose cost may have several minima: others are looked for where least squares has ended.
+
+An input that nearly repeats itself fits nearly as well a period late. A delay shifts what is simulated as a whole, so
+that one simulation, held against the log at each whole sample of shift, tells where the cost is less; the search goes
+on from there, or from the delay of another log.
 
 An output with feedthrough jumps with the input. With a held input the cost of a delay d is then smooth between whole
 samples only, in cells (m - 1, m] in which sample k - m is in force at sample k, and least squares ends in the cell in
@@ -15,16 +19,65 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.settle import Solved, settle
 
+FURTHEST = 100  # samples to either side
 INSIDE = 1e-6  # of a sample beyond a whole one: the next cell
 MOST_MOVES = 4  # cells that a delay may be carried on
 
 
-def search_delay_cells(solved: Solved, max_iterations: int, callback: Callback | None = None) -> Solved:
+def search_delays(solved: Solved, max_iterations: int, callback: Callback | None = None) -> Solved:
+    """Return the best of a minimum, those at other delays, and those in the cells beside them."""
+    return _search_cells(_search_further(solved, max_iterations, callback), max_iterations, callback)
+
+
+def _search_further(solved: Solved, max_iterations: int, callback: Callback | None) -> Solved:
+    """Return the best of a minimum and those at delays some samples away, of each free delay in turn."""
+    for experiment in solved.problem.experiments:
+        problem, here = solved.problem, solved.solution.evaluation
+        place, unknowns = experiment.slots.delay.index, problem.unknowns
+        if place is None or not np.isfinite(here.cost):
+            continue
+        others = {e.slots.delay.at(here.z) for e in problem.experiments} - {float(here.z[place])}
+        shift = _find_best_shift(experiment, here.z, unknowns.low[place], unknowns.high[place])
+        best = here
+        for delay in (*others, *([here.z[place] + shift] if shift else [])):
+            z = here.z.copy()
+            z[place] = np.clip(delay, unknowns.low[place], unknowns.high[place])
+            there = problem.evaluate(z)
+            best = there if there.cost < best.cost else best
+        if best is not here:
+            other = settle(problem, best, max_iterations, callback)
+            solved = other if other.misfit < solved.misfit else solved
+    return solved
+
+
+def _find_best_shift(experiment: FitExperiment, z: Float[np.ndarray, " n"], low: float, high: float) -> float:
+    """Return by how many seconds, in whole samples, a simulation is to be shifted to lie nearest to the log."""
+    period, delay = experiment.period, experiment.slots.delay.at(z)
+    reach = min(FURTHEST, experiment.longest // 4)
+    shifts = [s for s in range(-reach, reach + 1) if low <= delay + s * period <= high]
+    squares, counts = np.zeros(len(shifts)), np.zeros(len(shifts))
+    residuals = compute_experiment_residuals(experiment, z)
+    for output in experiment.outputs:
+        for measured, raw in zip(output.measured, residuals.raw_of(output.name), strict=True):
+            model = measured + raw
+            whole = bool(np.all(np.isfinite(model) & np.isfinite(measured)))
+            for i, s in enumerate(shifts):
+                apart = model[max(-s, 0) : model.size - max(s, 0)] - measured[max(s, 0) : measured.size - max(-s, 0)]
+                apart = apart if whole else apart[np.isfinite(apart)]
+                squares[i] += float(apart @ apart) / output.sigma**2
+                counts[i] += apart.size
+    means = np.where(counts > 0, squares / np.maximum(counts, 1.0), np.inf)
+    return shifts[int(np.argmin(means))] * period if shifts else 0.0
+
+
+def _search_cells(solved: Solved, max_iterations: int, callback: Callback | None) -> Solved:
     """Return the best of a minimum and those in the cells beside it, of each free delay in turn."""
     for experiment in solved.problem.experiments:
         if experiment.slots.delay.index is None or not ca.depends_on(experiment.model.h, experiment.model.u):

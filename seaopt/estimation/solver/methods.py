@@ -13,7 +13,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
-from seaopt.estimation.solver.settle import Solved, explains_little, settle
+from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
 from seaopt.estimation.solver.stretches import find_start_on_stretches
 from seaopt.records import record
 
@@ -64,7 +64,10 @@ class OutputError(Method):
         if solved is not None and not (self.search and _is_doubtful(solved, guesses)):
             return solved
         for start in _further_starts(problem, best, guesses, self) if self.search else ():
-            other = settle(problem, problem.evaluate(start), self.max_iterations, callback)
+            here = problem.evaluate(start)
+            if solved is not None and _is_hopeless(settle_roughly(problem, here), solved):
+                continue
+            other = settle(problem, here, self.max_iterations, callback)
             solved = other if solved is None or other.misfit < solved.misfit else solved
             if not _is_doubtful(solved, guesses):
                 break
@@ -176,6 +179,20 @@ def _is_doubtful(solved: Solved, guesses: list[Float[np.ndarray, " n"]]) -> bool
     if guesses and solved.problem.all_linear:
         return False
     return explains_little(solved.problem, evaluation.power)
+
+
+def _is_hopeless(rough: Solved, best: Solved) -> bool:
+    """Tell whether what came of a start explains little and no more than the best: most that has gone astray stays so.
+
+    To find its minimum all the same takes the longest: where nothing is explained the search creeps, and simulations
+    that run away ask for ever finer steps.
+    """
+    evaluation = rough.solution.evaluation
+    return bool(
+        np.isfinite(evaluation.cost)
+        and rough.misfit >= best.misfit
+        and explains_little(rough.problem, evaluation.power)
+    )
 
 
 def _further_starts(

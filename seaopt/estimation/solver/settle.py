@@ -25,6 +25,8 @@ from seaopt.records import record
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
 UNEXPLAINED = 0.2  # of an output's spread: a fit of a nonlinear plant that leaves more looks for another start
 ROUGH = 1.0  # squared standard deviations to the minimum, near enough to tell the sigmas
+ROUGH_ITERATIONS, ROUGH_ROUNDS, ROUGH_SUBSTEPS = 15, 2, 8  # of a minimum that is only to be compared with another
+NEAR = 1e-2  # squared standard deviations that may be left to it
 FALL = 4.0  # of a smoothing speed of friction, in a stage
 TOLD = 2.0  # of the misfit, which is twice a log-likelihood: what sharper friction has to gain
 HALF = 0.5  # of the finest steps, which leaves room to check their error
@@ -132,6 +134,24 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
                 solution = replace(solution, status="stalled", message=message)
             return Solved(problem=problem, solution=solution, step_error=find_worst(check_steps(problem, here, checks)))
     raise AssertionError  # the last attempt returns
+
+
+def settle_roughly(problem: FitProblem, start: Evaluation) -> Solved:
+    """Return a minimum near enough to be compared with others: sigma is estimated twice, the step chosen once."""
+    problem, here = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
+    problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
+    unknowns, solution = problem.unknowns, None
+    for _ in range(ROUGH_ROUNDS):
+        problem = problem.with_sigma(estimate_sigma(problem, here.power, here.z))
+        solution = minimise(
+            problem, problem.evaluate(here.z), unknowns.low, unknowns.high, decrement=NEAR,
+            max_iterations=ROUGH_ITERATIONS,
+        )  # fmt: skip
+        here = solution.evaluation
+        if not np.isfinite(here.cost):
+            break
+    assert solution is not None
+    return Solved(problem=problem, solution=solution, step_error=StepError())
 
 
 def explains_little(problem: FitProblem, power: Mapping[str, ResidualPower]) -> bool:

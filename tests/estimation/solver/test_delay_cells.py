@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, dlsim, lfilter
+from scipy.signal import butter, cont2discrete, dlsim, lfilter
 
 import seaopt as so
 
@@ -91,3 +93,68 @@ def test_a_delay_at_its_bound_is_an_error_where_the_log_wants_it_beyond():
     fit = so.fit([experiment], truth.free("M", "b"))
     assert ("experiment.delay_s", "error") in [(f.where, f.severity) for f in fit.findings if f.kind == "bound"]
     assert not fit.met
+
+
+def test_a_delay_that_is_a_period_off_is_carried_on():
+    """Noise of 22 to 26 Hz nearly repeats itself after 17 samples: 5 samples late there is a minimum, too."""
+    rng = np.random.default_rng(4)
+    b, a = butter(2, (22.0, 26.0), "bandpass", fs=RATE)
+    current = 3.0 * lfilter(b, a, 10.0 * rng.normal(size=1500))
+    plant = np.array([[0.0, 1.0], [-K / M, -B / M]]), np.array([[0.0], [G / M]])
+    system = cont2discrete((*plant, np.array([[K, 0.0]]), np.zeros((1, 1))), 1.0 / RATE)
+    force = dlsim(system, np.concatenate([np.zeros(22), current])[: current.size])[1][:, 0]
+    log = so.Log.from_arrays(
+        time=np.arange(current.size) / RATE, I=current, F1=force + 0.02 * np.std(force) * rng.normal(size=force.size)
+    )
+    delay = so.Parameter(name="delay_s", value=5.0 / RATE, unit="s", free=True, min=0.0, max=0.1)
+    experiment = so.Experiment(plant=drive(), log=log, outputs=("F1",), delay_s=delay)
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    found = so.fit([experiment], truth.free("G"), method=so.OutputError(search=False))
+    assert found.nuisance["experiment"].delay_s * RATE == pytest.approx(22.0, abs=0.1)
+
+
+def test_the_std_of_a_delay_allows_for_coloured_noise():
+    """Of 30 logs with noise of a pole at 0.9 the delays scatter as their stds say, which for white noise do not."""
+    apart, white = [], []
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    delay = so.Parameter(name="delay_s", value=2.4 / RATE, unit="s", free=True, min=0.0, max=0.05)
+    clean = log_of(2.3, 1)
+    for seed in range(30):
+        noise = 5.0 * lfilter([np.sqrt(0.19)], [1.0, -0.9], np.random.default_rng(1000 + seed).normal(size=len(clean)))
+        log = so.Log.from_arrays(time=clean.time, I=clean["I"], F1=clean["F1"] + noise)
+        experiment = so.Experiment(plant=drive(), log=log, outputs=("F1",), delay_s=delay)
+        options = {"method": so.OutputError(search=False)}
+        own = so.fit([experiment], truth.free("M"), **options).nuisance["experiment"]
+        plain = so.fit([experiment], truth.free("M"), diagnostics=False, **options).nuisance["experiment"]
+        apart.append((own.delay_s - 2.3 / RATE) / own.std["delay_s"])
+        white.append((plain.delay_s - 2.3 / RATE) / plain.std["delay_s"])
+    assert np.std(apart) == pytest.approx(1.0, abs=0.3)
+    assert np.std(white) > 1.3
+
+
+def two_logs(late):
+    """Return the fit of two logs of one plant whose delays are 2.3 and so many samples."""
+    delay = so.Parameter(name="delay_s", value=2.0 / RATE, unit="s", free=True, min=0.0, max=0.05)
+    truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
+    experiments = [
+        so.Experiment(plant=drive(), log=log_of(samples, seed), outputs=("F1",), delay_s=delay, name=name)
+        for name, samples, seed in (("one", 2.3, 1), ("other", late, 2))
+    ]
+    return so.fit(experiments, truth.update(M=1.5).free("M"))
+
+
+def test_logs_of_one_plant_that_contradict_each_other_in_their_delay_are_a_finding():
+    assert not two_logs(2.3).findings
+    (said,) = two_logs(3.3).findings
+    assert (said.kind, said.severity) == ("delay", "warning") and "contradicts" in said.text
+
+
+def test_an_ill_determined_delay_is_not_the_controllers():
+    fit = two_logs(2.3)
+    one, other = (replace(fit.nuisance[name], delay_s=d, std={"delay_s": std}) for name, d, std in
+                  (("one", 2.3e-3, 1e-6), ("other", 8.7e-3, 0.27e-3)))  # fmt: skip
+    assert replace(fit, nuisance={"one": one, "other": other}).delay_s(drive()) == 2.3e-3
+    known = replace(other, std={"delay_s": 5e-5})  # a longer one that is known counts
+    assert replace(fit, nuisance={"one": one, "other": known}).delay_s(drive()) == 8.7e-3
+    given = replace(one, delay_s=0.0, std={})  # where nothing else was fitted, it is all there is
+    assert replace(fit, nuisance={"one": given, "other": other}).delay_s(drive()) == 8.7e-3
