@@ -326,7 +326,8 @@ def make_plant(
         optional_inputs=frozenset({"I", *inputs}) if inputs else frozenset(),
         energy=energy if part_laws.stores_in_closed_form(parts) else None,
         actuation=Actuation(
-            input="I", effort=lambda p: drive.per_ampere(p) / drive.travel(p), unit=effort, efficiency="eta"
+            input="I", effort=lambda p: drive.per_ampere(p) / drive.travel(p), unit=effort, efficiency="eta",
+            speed=lambda x, p: drive.travel(p) * getattr(x, drive.rate),
         ),
         sensing=sensing,
         spring=SeriesSpring(

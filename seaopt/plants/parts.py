@@ -25,7 +25,7 @@ is the motor's, and the units are N m and rad):
     unlumped drive with the spring at link 1; with the spring at link 2 the mode is at 84 Hz, and the lumped drive
     damps it away.
 
-Around any plant:
+Around any plant, besides those of `seaopt.plants.drives`:
 
 ``current_loop``
     The motor current lags the command: first order, bandwidth current_loop_hz.
@@ -50,13 +50,15 @@ import casadi as ca
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
+from seaopt.plants import drives
 from seaopt.plants.plant import Plant
-from seaopt.plants.roles import Port
+from seaopt.plants.roles import Friction, Port
 from seaopt.records import record
 
 Part = Literal[
     "stribeck", "backlash", "hardening", "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay",
-    "measurement_delay",
+    "measurement_delay", "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit",
+    "servo_delay",
 ]  # fmt: skip
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
@@ -85,6 +87,8 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "measurement_delay": (
         Parameter(name="T_m", value=1e-3, unit="s", min=1e-9, description="delay of the measurement"),
     ),
+    "servo_delay": (Parameter(name="T_v", value=1e-3, unit="s", min=1e-9, description="delay of the servo's command"),),
+    **drives.PARTS,
 }  # fmt: skip
 INSIDE: tuple[Part, ...] = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
 
@@ -195,6 +199,7 @@ _FILTERS = {
     "load_cell": (_lag, "load_cell_hz", "output", 1),
     "command_delay": (_pade, "T_c", "input", 3),
     "measurement_delay": (_pade, "T_m", "output", 3),
+    "servo_delay": (_pade, "T_v", "input", 3),
 }
 
 
@@ -208,7 +213,7 @@ def wrapped(
     plant : Plant
         The plant inside.
     parts : sequence of str
-        Of current_loop, load_cell, command_delay and measurement_delay, each once.
+        Of current_loop, load_cell, command_delay and measurement_delay, and of `seaopt.plants.drives`, each once.
     source : str, optional
         The input that passes current loop and command delay; the first if left out.
     outputs : sequence of str, optional
@@ -234,8 +239,14 @@ def wrapped(
             raise PlantError(
                 f'part "{part}" sits inside an actuator; give it to two_link, high_impedance, moving_output or rotary'
             )
-    for part in ("current_loop", "command_delay", "load_cell", "measurement_delay"):
+    drives.check(parts)
+    if "voltage_input" in parts or "duty_input" in parts:
+        plant = drives.drive_electrically(plant, parts)
+    for part in ("current_loop", "servo_delay", "position_servo", "command_delay", "load_cell", "measurement_delay"):
         if part not in parts:
+            continue
+        if part == "position_servo":
+            plant = drives.add_servo(plant, parts)
             continue
         where = _FILTERS[part][2]
         if where == "input":
@@ -299,21 +310,19 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return split(t, x, u, p)[1]
 
-    return Plant(
+    def load(friction: Friction) -> Friction:
+        loads = friction.loads
+        if loads is None:
+            return friction
+        return replace(friction, loads=lambda x, u, p: loads(x, SimpleNamespace(**split(0.0, x, u, p)[0]), p))
+
+    return replace(
+        plant,
         name=f"{plant.name} with {part}",
         states={**plant.states, **added},
-        inputs=plant.inputs,
-        outputs=plant.outputs,
         parameters={**plant.parameters, **{parameter.name: parameter for parameter in PARTS[part]}},
         f=f,
         h=h,
-        derived=plant.derived,
-        optional_inputs=plant.optional_inputs,
-        energy=plant.energy,
-        actuation=plant.actuation,
-        sensing=plant.sensing,
-        spring=plant.spring,
         ports=tuple(port_behind(port) for port in plant.ports),
-        friction=plant.friction,
-        mode=plant.mode,
+        friction={name: load(one) for name, one in plant.friction.items()} if where == "input" else plant.friction,
     )

@@ -37,6 +37,8 @@ class Actuation:
         Of the effort: N or N m.
     efficiency : str or None
         The parameter that scales the effort by the losses of the transmission.
+    speed : callable ``(x, p) -> expression``, optional
+        What the effort moves: effort times speed is the power that the motor makes. It gives the back-EMF.
 
     """
 
@@ -44,6 +46,7 @@ class Actuation:
     effort: Expression
     unit: str = "N"
     efficiency: str | None = None
+    speed: StateExpression | None = None
 
 
 @record

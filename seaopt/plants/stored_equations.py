@@ -125,7 +125,9 @@ def store_plant(plant: Any) -> dict[str, Any]:
     content |= {name: store(getattr(plant, name), "t", x, u, p) for name in ("f", "h")}
     content |= {"derived": store(plant.derived, p), "energy": store(plant.energy, x, p)}
     if plant.actuation is not None:
-        content["actuation"] = replace(plant.actuation, effort=store(plant.actuation.effort, p))
+        content["actuation"] = replace(
+            plant.actuation, effort=store(plant.actuation.effort, p), speed=store(plant.actuation.speed, x, p)
+        )
     if plant.spring is not None:
         content["spring"] = replace(plant.spring, deflection=store(plant.spring.deflection, x, p))
     content["ports"] = tuple(store_port(one) for one in plant.ports)

@@ -371,7 +371,10 @@ def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mappi
     parameters = {name: known[name] for name in known if name in declared or name in tables}
     for name, value in tables.items():
         if name not in known:
-            raise ProblemError(f'parameters: unknown parameter "{name}"; {suggestion(name, known)}')
+            remedy = suggestion(name, known)
+            if name.lower().replace("_", "") == "ke":
+                remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
+            raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
         table = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
         parameters[name] = _make_parameter(parameters[name], table)
     return ParameterSet(parameters.values())

@@ -318,12 +318,15 @@ def test_delays_have_the_exact_phase_in_their_band(stand, thor):
         assert abs(np.degrees(np.angle(ratio / np.exp(-3e-3 * s)))) < 1.0
 
 
-def test_every_part_composes_on_every_plant():
+@pytest.mark.parametrize("excluded", [("voltage_input", "duty_input", "inductance"), ("duty_input", "current_loop"),
+                                      ("voltage_input", "current_loop")])  # fmt: skip
+def test_every_part_composes_on_every_plant(excluded):
+    parts = tuple(part for part in PARTS if part not in excluded)
     for plant in (
-        so.plants.high_impedance(parts=tuple(PARTS)),
-        so.plants.moving_output(parts=tuple(PARTS), spring="link2"),
-        so.plants.two_link("mass", "pendulum", parts=tuple(PARTS)),
-        so.plants.rotary(parts=tuple(part for part in PARTS if part != "screw_mode")),
+        so.plants.high_impedance(parts=parts),
+        so.plants.moving_output(parts=parts, spring="link2"),
+        so.plants.two_link("mass", "pendulum", parts=parts),
+        so.plants.rotary(parts=tuple(part for part in parts if part != "screw_mode")),
     ):
         rate, output = numbers(plant, plant.defaults)
         x, u = np.full(len(plant.states), 1e-3), np.ones(len(plant.inputs))

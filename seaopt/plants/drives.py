@@ -1,0 +1,238 @@
+r"""What drives the motor: a voltage or a duty in place of a current, and a firmware that holds a position.
+
+Parts around any plant:
+
+``voltage_input``
+    The input is the motor's voltage V: :math:`V = R I + K_e \omega`. In SI the back-EMF constant K_e is K_tau (V s/rad
+    and N m/A are the same unit), so that it is no parameter of its own: :math:`K_e \omega I` is the power that the
+    motor makes, before the losses of the transmission. The plant's actuation states the speed that this takes.
+``duty_input``
+    The input is the duty of a full bridge on the supply V_s: :math:`V = V_s \min(\max(d, -1), 1)`.
+``inductance``
+    With one of them: :math:`V = R I + L_m \dot I + K_e \omega`; the current is then a state.
+``position_servo``
+    The input is the goal of a position, that of the motor (of the link, where the plant has no other), and
+    :math:`c = g_s (k_p (\mathrm{goal} - \theta) - k_d \dot\theta)` is the input inside: current, voltage or duty. Gains
+    may be those of a firmware's registers; g_s is what one unit of gain and error makes.
+``servo_integral``
+    Adds :math:`g_s k_i \int (\mathrm{goal} - \theta)`; at the limit of c it stands still.
+``servo_limit``
+    c stays within +-c_max.
+``servo_delay``
+    c acts T_v late. A servo that runs at a rate f and takes T to compute acts as late as a delay of
+    :math:`T + 1/(2 f)`.
+
+With one of the first two the current I (A) is among the outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+
+from seaopt.errors import PlantError
+from seaopt.parameters import Parameter
+from seaopt.plants.plant import Plant
+from seaopt.plants.roles import Actuation, Friction, Port
+from seaopt.records import record
+
+_RESISTANCE = Parameter(
+    name="R", value=1.0, unit="ohm", min=1e-9, description="winding resistance", plausible=(1e-3, 1e3)
+)
+PARTS: dict[str, tuple[Parameter, ...]] = {
+    "voltage_input": (_RESISTANCE,),
+    "duty_input": (
+        _RESISTANCE,
+        Parameter(name="V_s", value=24.0, unit="V", min=1e-9, description="supply voltage", plausible=(1.0, 1e3)),
+    ),
+    "inductance": (
+        Parameter(name="L_m", value=1e-3, unit="H", min=1e-12, description="winding inductance", plausible=(1e-7, 1)),
+    ),
+    "position_servo": (
+        Parameter(name="k_p", value=1.0, unit="-", min=0.0, description="gain of the servo, in its own units"),
+        Parameter(name="k_d", value=0.0, unit="s", min=0.0, description="damping of the servo, in its own units"),
+        Parameter(name="g_s", value=1.0, unit="-", min=0.0, description="command of one unit of gain and error"),
+    ),
+    "servo_integral": (
+        Parameter(name="k_i", value=0.0, unit="1/s", min=0.0, description="integral gain of the servo"),
+    ),
+    "servo_limit": (Parameter(name="c_max", value=1.0, unit="-", min=0.0, description="limit of the servo's command"),),
+}
+SERVO = ("position_servo", "servo_integral", "servo_limit")
+INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
+
+
+@record(eq=False)
+class _Drive:
+    """What stands before a plant's first input: its own input, states and outputs with units, and its equations.
+
+    `solve` is (t, x, u, p) -> (what the plant's input is, {state: rate}, {output: value}).
+    """
+
+    name: str
+    input: str
+    unit: str
+    states: Mapping[str, str]
+    outputs: Mapping[str, str]
+    parameters: tuple[Parameter, ...]
+    solve: Callable[[Any, Any, Any, Any], tuple[Any, Mapping[str, Any], Mapping[str, Any]]]
+    effort: Callable[[Any], Any]  # of the parameters: what one unit of the new input is of the plant's, at rest
+
+
+def check(parts: Collection[str]) -> None:
+    """Refuse parts that do not go together.
+
+    Raises
+    ------
+    PlantError
+        One excludes another, or needs one that is not there.
+
+    """
+    electric = [part for part in INPUTS if part in parts]
+    if len(electric) > 1:
+        raise PlantError('parts "voltage_input" and "duty_input" are both given; the motor has one input: give one')
+    if electric and "current_loop" in parts:
+        raise PlantError(f'parts "{electric[0]}" and "current_loop" are both given; a current loop takes a current')
+    needs = {"inductance": tuple(INPUTS), "servo_integral": ("position_servo",), "servo_limit": ("position_servo",),
+             "servo_delay": ("position_servo",)}  # fmt: skip
+    for part, others in needs.items():
+        if part in parts and not any(other in parts for other in others):
+            raise PlantError(f'part "{part}" needs {" or ".join(others)}; add it')
+
+
+def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
+    """Return a plant whose input is the voltage or the duty of its motor.
+
+    Raises
+    ------
+    PlantError
+        The plant does not state its actuation, or not the speed on which its effort works; or has such an input.
+
+    """
+    part = "duty_input" if "duty_input" in parts else "voltage_input"
+    actuation, inductive = plant.actuation, "inductance" in parts
+    if actuation is None or actuation.speed is None:
+        raise PlantError(
+            f'plant {plant.name}: part "{part}" needs the speed on which the motor works; give the role '
+            "actuation = Actuation(input, effort, speed=lambda x, p: ...)"
+        )
+    speed, current, (name, unit) = actuation.speed, actuation.input, INPUTS[part]
+
+    def find_emf(x: Any, p: Any) -> Any:
+        lossless = p if actuation.efficiency is None else SimpleNamespace(**{**vars(p), actuation.efficiency: 1.0})
+        return actuation.effort(lossless) * speed(x, p)
+
+    def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
+        applied = u.V if part == "voltage_input" else p.V_s * ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
+        if inductive:
+            flows = getattr(x, current)
+            return flows, {current: (applied - p.R * flows - find_emf(x, p)) / p.L_m}, {current: flows}
+        flows = (applied - find_emf(x, p)) / p.R
+        return flows, {}, {current: flows}
+
+    own = (*PARTS[part], *(PARTS["inductance"] if inductive else ()))
+    unit_of_current = plant.inputs[current]
+    return _put_before(plant, _Drive(
+        name=part, input=name, unit=unit, states={current: unit_of_current} if inductive else {},
+        outputs={current: unit_of_current}, parameters=own, solve=solve,
+        effort=(lambda p: 1.0 / p.R) if part == "voltage_input" else (lambda p: p.V_s / p.R),
+    ), partial(_drive_again, drive_electrically, tuple(parts)))  # fmt: skip
+
+
+def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
+    """Return a plant whose input is the goal of a position that a firmware holds.
+
+    Raises
+    ------
+    PlantError
+        The plant's sensing names no position.
+
+    """
+    sensing = plant.sensing
+    position = sensing and (sensing.motor_position or sensing.link_position)
+    if not sensing or not position:
+        raise PlantError(
+            f'plant {plant.name}: part "position_servo" needs the position that it holds; give the role '
+            "sensing = Sensing(regulated, motor_position=...)"
+        )
+    rate = sensing.motor_speed if sensing.motor_position else (plant.port.rate if plant.port else None)
+    source = next(iter(plant.inputs))
+    integral, limited = "servo_integral" in parts, "servo_limit" in parts
+
+    def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
+        without = SimpleNamespace(**{**vars(u), source: 0.0})
+        reading = getattr(x, position, None)
+        error = u.goal - (plant.h(t, x, without, p)[position] if reading is None else reading)
+        command = p.g_s * (p.k_p * error - (p.k_d * getattr(x, rate) if rate else 0.0))
+        command += p.g_s * p.k_i * x.error_sum if integral else 0.0
+        held = ca.fmin(ca.fmax(command, -p.c_max), p.c_max) if limited else command
+        winds_up = ca.logic_and(held != command, command * error > 0.0)
+        return held, {"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {}, {}
+
+    own = [
+        item for part in ("position_servo", "servo_integral", "servo_limit") if part in parts for item in PARTS[part]
+    ]
+    unit = plant.outputs.get(position) or plant.states[position]
+    return _put_before(plant, _Drive(
+        name="position_servo", input="goal", unit=unit, states={"error_sum": f"{unit} s"} if integral else {},
+        outputs={}, parameters=tuple(item for item in own if rate or item.name != "k_d"), solve=solve,
+        effort=lambda p: p.g_s * p.k_p,
+    ), partial(_drive_again, add_servo, tuple(parts)))  # fmt: skip
+
+
+def _drive_again(
+    drive: Callable[[Plant, Collection[str]], Plant], parts: Collection[str], make: Callable[[], Plant]
+) -> Plant:
+    return drive(make(), parts)
+
+
+def _put_before(plant: Plant, drive: _Drive, again: Callable[[Callable[[], Plant]], Plant]) -> Plant:
+    """Return a plant behind a drive; `again` puts it before the plants that its ports make, too."""
+    source = next(iter(plant.inputs))
+    taken = {*plant.inputs, *plant.outputs, *plant.states, *plant.parameters} - {source}
+    clash = [name for name in (drive.input, *drive.outputs, *(item.name for item in drive.parameters)) if name in taken]
+    if clash:
+        raise PlantError(f'plant {plant.name}: part "{drive.name}" has "{clash[0]}", which the plant has, too')
+
+    def solve_inside(t: Any, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, Mapping[str, Any], Mapping[str, Any]]:
+        inside, rates, outputs = drive.solve(t, x, u, p)
+        return SimpleNamespace(**{**vars(u), source: inside}), rates, outputs
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        inside, rates, _ = solve_inside(t, x, u, p)
+        return {**plant.f(t, x, inside, p), **rates}
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        inside, _, outputs = solve_inside(t, x, u, p)
+        return {**plant.h(t, x, inside, p), **outputs}
+
+    def load(friction: Friction) -> Friction:
+        loads = friction.loads
+        if loads is None:
+            return friction
+        return replace(friction, loads=lambda x, u, p: loads(x, solve_inside(0.0, x, u, p)[0], p))
+
+    def port(one: Port) -> Port:
+        makers = {name: make for name, make in (("held", one.held), ("probe", one.probe)) if make is not None}
+        return replace(one, **{name: partial(again, make) for name, make in makers.items()})
+
+    before = plant.actuation
+    actuation = before and Actuation(
+        input=drive.input, effort=lambda p: before.effort(p) * drive.effort(p), unit=before.unit,
+        efficiency=before.efficiency,
+    )  # fmt: skip
+    others = {name: unit for name, unit in plant.inputs.items() if name != source}
+    optional = plant.optional_inputs - {source} | ({drive.input} if source in plant.optional_inputs else set())
+    return replace(
+        plant, name=f"{plant.name} with {drive.name}", f=f, h=h, actuation=actuation,
+        states={**plant.states, **drive.states}, inputs={drive.input: drive.unit, **others},
+        outputs={**plant.outputs, **drive.outputs}, optional_inputs=frozenset(optional),
+        parameters={**plant.parameters, **{item.name: item for item in drive.parameters}},
+        friction={name: load(one) for name, one in plant.friction.items()},
+        ports=tuple(port(one) for one in plant.ports),
+    )  # fmt: skip

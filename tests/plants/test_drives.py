@@ -1,0 +1,172 @@
+"""What drives the motor: voltage, duty and a firmware's servo, against equations that are written here again."""
+
+from __future__ import annotations
+
+import pickle
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import seaopt as so
+from seaopt.errors import PlantError
+
+MOTOR = {
+    "J_m": 2e-5, "b_r": 1e-5, "K_tau": 0.05, "N": 60.0, "k_s": 200.0, "c_s": 0.3, "J_l": 0.08, "d_l": 0.1, "eta": 0.8,
+    "R": 0.6, "L_m": 4e-4, "V_s": 12.0,
+}  # fmt: skip
+RATE_HZ = 500.0
+
+
+def values_of(plant, **other):
+    """Return the motor's values of a plant's parameters."""
+    own = {name: value for name, value in (MOTOR | other).items() if name in plant.parameters}
+    return plant.defaults.update(**own)
+
+
+def motion(t, x, current, p):
+    """Return the rates of [theta_m, its rate, theta_l, its rate] of the two-mass drive."""
+    torque = p["k_s"] * (x[0] / p["N"] - x[2]) + p["c_s"] * (x[1] / p["N"] - x[3])
+    return [
+        x[1], (p["eta"] * p["K_tau"] * current - p["b_r"] * x[1] - torque / p["N"]) / p["J_m"],
+        x[3], (torque - p["d_l"] * x[3]) / p["J_l"],
+    ]  # fmt: skip
+
+
+def integrate(rates, size, n):
+    """Return states at n samples, with scipy's integrator sample by sample."""
+    states, x = [np.zeros(size)], np.zeros(size)
+    for k in range(n - 1):
+        run = solve_ivp(
+            lambda t, x, k=k: rates(t, x, k), (0.0, 1.0 / RATE_HZ), x, rtol=1e-9, atol=1e-12, method="LSODA"
+        )
+        x = run.y[:, -1]
+        states.append(x)
+    return np.array(states)
+
+
+@pytest.mark.parametrize("part", ["voltage_input", "duty_input"])
+@pytest.mark.parametrize("inductance", [False, True])
+def test_voltage_and_duty_are_those_of_a_motor_with_back_emf(part, inductance):
+    plant = so.plants.rotary(parts=[part, *(["inductance"] if inductance else [])])
+    n = 200
+    drive = 1.3 * np.sin(np.linspace(0.0, 12.0, n) ** 1.5)  # of the duty, beyond its limit at times
+    volts = 6.0 * drive if part == "voltage_input" else 12.0 * np.clip(drive, -1.0, 1.0)
+
+    def rates(t, x, k):
+        if not inductance:
+            return motion(t, x, (volts[k] - MOTOR["K_tau"] * x[1]) / MOTOR["R"], MOTOR)
+        slope = (volts[k] - MOTOR["R"] * x[4] - MOTOR["K_tau"] * x[1]) / MOTOR["L_m"]
+        return [*motion(t, x, x[4], MOTOR), slope]
+
+    expected = integrate(rates, 5 if inductance else 4, n)
+    name = "V" if part == "voltage_input" else "duty"
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, **{name: 6.0 * drive if name == "V" else drive})
+    run = so.simulate(plant, values_of(plant), log, rtol=1e-9)
+    assert np.allclose(run["theta_m"], expected[:, 0], atol=1e-6 * np.max(np.abs(expected[:, 0])))
+    current = expected[:, 4] if inductance else (volts - MOTOR["K_tau"] * expected[:, 1]) / MOTOR["R"]
+    assert np.allclose(run["I"], current, atol=1e-6 * np.max(np.abs(current)))
+
+
+def test_a_screw_takes_from_the_supply_what_it_heats_and_makes():
+    """V I = R I^2 + F_m qd/eta: the back-EMF is that of K_tau, whatever the losses of the screw."""
+    plant = so.plants.high_impedance(parts=["voltage_input"])
+    params = so.plants.thor().update(eta=0.7).with_parameters(so.Parameter(name="R", value=0.5, unit="ohm"))
+    log = so.Log.from_arrays(time=np.arange(300) / RATE_HZ, V=np.full(300, 2.0))
+    run = so.simulate(plant, params, log)
+    p = {name: parameter.value for name, parameter in plant.complete(params).items()}
+    force = p["K_tau"] / (p["l"] / (2 * np.pi * p["N_p"])) * run["I"]
+    assert np.allclose(2.0 * run["I"], 0.5 * run["I"] ** 2 + force * run["qd"], rtol=1e-9, atol=1e-9)
+
+
+def test_a_servo_with_everything_is_that_of_its_equations():
+    plant = so.plants.rotary(parts=["duty_input", "position_servo", "servo_integral", "servo_limit"])
+    gains = {"k_p": 40.0, "k_d": 0.3, "k_i": 60.0, "g_s": 0.01, "c_max": 0.5}
+    n = 300
+    goal = 3.0 * np.sign(np.sin(np.arange(n) / 45.0))
+
+    def rates(t, x, k):
+        error = goal[k] - x[0]
+        wanted = gains["g_s"] * (gains["k_p"] * error - gains["k_d"] * x[1] + gains["k_i"] * x[4])
+        command = min(max(wanted, -0.5), 0.5)
+        current = (MOTOR["V_s"] * command - MOTOR["K_tau"] * x[1]) / MOTOR["R"]
+        return [*motion(t, x, current, MOTOR), 0.0 if command != wanted and wanted * error > 0 else error]
+
+    expected = integrate(rates, 5, n)
+    run = so.simulate(
+        plant, values_of(plant, **gains), so.Log.from_arrays(time=np.arange(n) / RATE_HZ, goal=goal), rtol=1e-5
+    )
+    assert np.max(np.abs(run["theta_m"] - expected[:, 0])) < 2e-4 * np.max(np.abs(expected[:, 0]))
+
+
+def test_fit_of_a_log_that_holds_goal_and_position_alone():
+    """The servo's gain known, an encoder on the motor tells spring, link and damping behind a firmware loop."""
+    plant = so.plants.rotary(parts=["duty_input", "position_servo"])
+    gains = {"k_p": 1.0, "g_s": 0.05}
+    rng, n = np.random.default_rng(2), 4000
+    t = np.arange(n) / RATE_HZ
+    goal = 0.8 * np.sin(2 * np.pi * (0.3 * t + 0.9 * t**2)) * 2.0
+    truth = values_of(plant, **gains)
+    run = so.simulate(plant, truth, so.Log.from_arrays(time=t, goal=goal))
+    step = 2 * np.pi / 4096 / 4
+    log = so.Log.from_arrays(
+        time=t, goal=goal, theta_m=np.round((run["theta_m"] + 2e-4 * rng.normal(size=n)) / step) * step
+    )
+    start = truth.update(k_s=120.0, J_l=0.05, b_r=3e-5).free("k_s", "J_l", "b_r")
+    fit = so.fit([so.Experiment(plant=plant, log=log, offset=False)], start)
+    assert fit.met, str(fit)
+    for name in ("k_s", "J_l", "b_r"):
+        found = fit.parameters[name]
+        assert abs(found.value - truth[name].value) < 4.0 * found.std < 0.3 * truth[name].value
+
+
+def test_a_torque_controller_commands_the_voltage():
+    plant = so.plants.rotary(link="locked", parts=["voltage_input"])
+    assert plant.actuation.input == "V"
+    effort = plant.actuation.effort(plant.complete(values_of(plant)).by_attribute)
+    assert effort == pytest.approx(60.0 * 0.8 * 0.05 / 0.6)
+    again = pickle.loads(pickle.dumps(plant))
+    assert again.inputs == plant.inputs and again.port.probe is not None
+
+
+def test_loads_of_friction_see_the_current_behind_the_drive():
+    inner = so.Plant(
+        name="hub", states={"q": "rad", "w": "rad/s"}, inputs={"I": "A"}, outputs={"q": "rad"},
+        parameters={"J": "kg m^2", "K": "N m/A", "c": "-"},
+        f=lambda t, x, u, p: {"q": x.w, "w": (p.K * u.I - u.rub) / p.J}, h=lambda t, x, u, p: {"q": x.q},
+        actuation=so.plants.Actuation(input="I", effort=lambda p: p.K, unit="N m", speed=lambda x, p: x.w),
+        friction={"rub": so.plants.Friction(
+            velocity=lambda x, p: x.w, unit="N m", loads=lambda x, u, p: {"load": p.K * u.I}, rated={"load": 1.0},
+            force=lambda v, p: p.c * ca.fabs(p.load) * ca.tanh(v / 1e-3), jump=lambda v, p: p.c * ca.fabs(p.load),
+        )},
+    )  # fmt: skip
+    plant = so.plants.let_stick(so.plants.wrapped(inner, ["voltage_input"]))
+    params = so.ParameterSet.of(J=(1.0, "kg m^2"), K=(0.5, "N m/A"), c=(0.2, "-"), R=(2.0, "ohm"))
+    t = np.arange(500) / RATE_HZ
+    run = so.simulate(plant, params, so.Log.from_arrays(time=t, V=np.ones(500)), rtol=1e-9)
+    rate = (1 - 0.2) * 0.5 / 2.0  # of speed, less what the back-EMF takes
+    decay = (1 - 0.2) * 0.5**2 / 2.0
+    assert np.allclose(run["w"], rate / decay * (1 - np.exp(-decay * t)), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("parts", "word"),
+    [
+        (["voltage_input", "duty_input"], "one input"), (["voltage_input", "current_loop"], "takes a current"),
+        (["inductance"], "needs voltage_input or duty_input"), (["servo_integral"], "needs position_servo"),
+    ],
+)  # fmt: skip
+def test_parts_that_do_not_go_together_are_refused(parts, word):
+    with pytest.raises(PlantError, match=word):
+        so.plants.rotary(parts=parts)
+
+
+def test_plants_without_the_roles_are_refused():
+    free = so.Plant(
+        name="mass", states={"x": "m", "v": "m/s"}, inputs={"F": "N"}, outputs={"x": "m"}, parameters={"m": "kg"},
+        f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.m}, h=lambda t, x, u, p: {"x": x.x},
+    )  # fmt: skip
+    for part, role in (("voltage_input", "speed="), ("position_servo", "motor_position")):
+        with pytest.raises(PlantError, match=role):
+            so.plants.wrapped(free, [part])
