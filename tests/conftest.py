@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import gc
 import inspect
 import os
 import sys
@@ -78,6 +79,11 @@ def check_calls(function):
         return checked(*args, **kwargs)
 
     return call
+
+
+def pytest_collection_finish() -> None:
+    """Keep the garbage collector from what collection made, which stays: it would walk all of it again and again."""
+    gc.freeze()
 
 
 def pytest_runtest_setup() -> None:

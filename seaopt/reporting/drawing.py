@@ -53,6 +53,10 @@ def _take_literally(figure: Figure) -> None:
 
 def _lay_out(figure: Figure) -> None:
     """Lay a figure out, once, and leave it without an engine: for one, even an idle one, `savefig` draws twice."""
+    for axis in figure.axes:
+        for side in (axis.xaxis, axis.yaxis):
+            if not side.label.get_text():  # to place it, all tick labels would be measured
+                side.set_label_coords(0.5, 0.5)
     engine = figure.get_layout_engine()
     if engine is not None:
         figure.set_dpi(DPI)

@@ -263,7 +263,7 @@ def solve_qp(
     import osqp
     from scipy.sparse import csc_matrix
 
-    solver = osqp.OSQP()
+    solver = osqp.OSQP(algebra="builtin")  # else it looks for others at every program
     solver.setup(
         P=csc_matrix(np.triu(quadratic)), q=linear, A=csc_matrix(matrix), l=lower, u=upper, verbose=False, eps_abs=1e-5,
         eps_rel=1e-5, max_iter=500, check_termination=10,

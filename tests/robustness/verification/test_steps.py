@@ -39,14 +39,18 @@ def blind(stand, rubbing):
     return replace(tuned, law=law, design=(stand, rubbing))
 
 
+@pytest.fixture(scope="module")
+def certificate(blind, stand, rubbing):
+    return so.certify(blind, {"stand": stand}, rubbing)
+
+
 def play_independently(controller, params, steps, jump=False):
     mass = Mass.of({name: params[name].value for name in params}, jump=jump)
     reference = np.repeat(np.array(steps)[:, None], 300, axis=1)
     return simulate([mass] * len(steps), [controller.to_dict()] * len(steps), reference, substeps=20)
 
 
-def test_steps_overshoot_as_the_independent_simulator_says(blind, stand, rubbing):
-    certificate = so.certify(blind, {"stand": stand}, rubbing)
+def test_steps_overshoot_as_the_independent_simulator_says(blind, certificate, rubbing):
     assert not any(row.overshoot_by_limit for row in certificate.steps.rows)  # nor is the limit to blame for the others
     rows = {row.scenario: row for row in certificate.steps.rows if not row.saturated}
     names = ["2 % step", "unsaturated step"]
@@ -85,9 +89,9 @@ def test_what_overshoots_only_once_friction_lets_go_is_not_passed(stand, thor):
     assert over.value - 1.0 == pytest.approx(alone.overshoot(step)[0], rel=5e-3)
 
 
-def test_a_sample_at_the_limit_excuses_no_overshoot(blind, stand, rubbing):
+def test_a_sample_at_the_limit_excuses_no_overshoot(blind, certificate, stand, rubbing):
     """One sample of the step saturates, by a hundredth of its current: it overshoots as it does without the limit."""
-    rows = so.certify(blind, {"stand": stand}, rubbing).steps
+    rows = certificate.steps
     row = next(row for row in rows.rows if row.scenario == "unsaturated step")
     tight = replace(blind, spec=replace(SPEC, current_limit_A=0.99 * row.peak_current_A))
     found = verify(tight, {"stand": stand}, rubbing, scenarios=(rows.scenario(row),)).rows[0]
