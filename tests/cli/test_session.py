@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from threading import enumerate as enumerate_threads
 
@@ -160,12 +161,21 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
         Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.5")), folder).run("certify")
 
 
-@pytest.fixture
-def tuned(write, tmp_path):
+@pytest.fixture(scope="module")
+def tuned_once(tmp_path_factory):
     """Return a problem's text without experiments, and the folder of its controller, which ranges shaped."""
     text = CORNERS[: CORNERS.index("[[experiment]]")] + CORNERS[CORNERS.index("[controller]") :]
-    Session(write(text), tmp_path / "out").run("tune")
-    return text, tmp_path / "out"
+    path = tmp_path_factory.mktemp("tuned") / "problem.toml"
+    path.write_text(text, encoding="utf-8")
+    Session(path, path.parent / "out").run("tune")
+    return text, path.parent / "out"
+
+
+@pytest.fixture
+def tuned(tuned_once, tmp_path):
+    """Return the same text, and a copy of that folder for a test to change."""
+    text, folder = tuned_once
+    return text, shutil.copytree(folder, tmp_path / "out")
 
 
 def edit(folder, changes, *, by_hand):
