@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import shutil
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -45,6 +49,42 @@ def test_the_plant_of_the_how_to_works():
     space: dict = {}
     exec(code, space)
     assert list(space["pendulum"].states) == ["theta", "omega"]
+
+
+def test_the_plant_of_the_how_to_as_data_gives_the_same_fit(tmp_path, simulated):
+    """The page's file, and its Python, on a log laid out as the measured one; then the roles that it shows."""
+    problem_file, roles = blocks("howto_own_plant.md", "toml")[:2]
+    (tmp_path / "pendulum.toml").write_text(problem_file, encoding="utf-8")
+    shutil.copy(simulated("ak80") / "data_measured.csv", tmp_path)
+    problem = so.read_problem(tmp_path / "pendulum.toml")
+    own = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
+    space: dict = {}
+    with contextlib.chdir(tmp_path):
+        for code in blocks("howto_own_plant.md", "python"):
+            exec(code, space)
+    for name in ("I_p", "mgL", "d", "tau_c"):
+        one, other = own.parameters[name], space["fit"].parameters[name]
+        assert one.value == pytest.approx(other.value, rel=1e-9) and one.std == pytest.approx(other.std, rel=1e-6)
+    text = problem_file.replace('"d*omega + tau_c*tanh(omega/v_s)"', '"d*omega + tau_f"') + roles
+    (tmp_path / "pendulum.toml").write_text(text, encoding="utf-8")
+    plant = so.read_problem(tmp_path / "pendulum.toml").plants["pendulum"]
+    x, u, p = [0.3, 2.0], [0.5], [0.2, 3.0, 0.1, 0.4, 0.1]
+    rates = [ca.Function("f", [one.x, one.u, one.p], [one.dynamics])(x, u, p) for one in (plant, space["pendulum"])]
+    np.testing.assert_allclose(*map(np.array, rates), rtol=1e-12)
+    assert plant.friction["tau_f"].smoothing == "v_s" and list(plant.derived_values()) == ["natural_frequency_hz"]
+
+
+def test_the_mistake_of_the_how_to_is_shown_as_it_says(tmp_path):
+    problem_file = blocks("howto_own_plant.md", "toml")[0].replace("mgL*sin", "mgl*sin")
+    (tmp_path / "pendulum.toml").write_text(problem_file, encoding="utf-8")
+    out = subprocess.run(
+        [sys.executable, "-m", "seaopt", "fit", "pendulum.toml"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert out.stderr == blocks("howto_own_plant.md", "text")[0] and out.returncode == 2
 
 
 def test_the_export_of_the_docs_works(tmp_path, monkeypatch):

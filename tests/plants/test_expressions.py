@@ -187,3 +187,16 @@ def test_derivatives_are_those_of_the_mathematics():
         assert float(slope(X, Y)) == pytest.approx(
             (value(text, X + 1e-6) - value(text, X - 1e-6)) / 2e-6, rel=1e-6, abs=1e-9
         )
+
+
+def test_slopes_at_a_switch_are_those_that_the_documentation_states():
+    def slope(text, at):
+        return float(
+            ca.Function("s", list(SYMBOLS.values()), [ca.jacobian(parse(text, SYMBOLS, "f"), SYMBOLS["x"])])(at, 0)
+        )
+
+    assert slope("abs(x)", 0.0) == 0.0 and slope("max(x, 0)", 0.0) == 0.5
+    assert (slope("if_else(x > 0, x, 0)", 0.0), slope("if_else(x >= 0, x, 0)", 0.0)) == (0.0, 1.0)
+    for x in (-1.0, 0.0):
+        assert slope("if_else(x > 0, sqrt(x), 0)", x) == slope("if_else(x > 0, log(x), 0)", x) == 0.0
+    assert math.isnan(slope("sqrt(max(x, 0))", -1.0))
