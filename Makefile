@@ -74,12 +74,12 @@ bench: $(READY)
 bench-peers: $(READY)
 	$(BIN)/python benchmarks/peers/run.py $(ARGS)
 
-# Random and mutated CSV, JSON and MAT files, so many seconds each; needs atheris (CPython on Linux).
+# Random and mutated CSV, JSON and MAT files, and plants of problem files, so many seconds each; needs atheris (CPython on Linux).
 FUZZ_SECONDS := 60
 fuzz: $(READY)
 	$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/python -m pip install --quiet --constraint constraints.txt atheris \
 		|| VIRTUAL_ENV=$(VENV) uv pip install --quiet --constraint constraints.txt atheris
-	for target in csv json mat; do $(BIN)/python tools/fuzz.py $$target --seconds $(FUZZ_SECONDS) || exit 1; done
+	for target in csv json mat plant; do $(BIN)/python tools/fuzz.py $$target --seconds $(FUZZ_SECONDS) || exit 1; done
 
 clean:
 	rm -rf $(VENV) $(FLOORS) out

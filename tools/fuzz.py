@@ -1,6 +1,6 @@
-"""Fuzz the readers with atheris: only a SeaoptError may escape.
+"""Fuzz the readers of logs, and of plants written in problem files, with atheris: only a SeaoptError may escape.
 
-python tools/fuzz.py csv|json|mat [--seconds 60] [--corpus FOLDER]; an input that breaks this is left in out/fuzz.
+python tools/fuzz.py csv|json|mat|plant [--seconds 60] [--corpus FOLDER]; an input that breaks this is left in out/fuzz.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import io
 import json
 import sys
 import tempfile
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-SUFFIX = {"csv": ".csv", "json": ".json", "mat": ".mat"}
+SUFFIX = {"csv": ".csv", "json": ".json", "mat": ".mat", "plant": ".toml"}
+INSTRUMENTED = {"plant": ["seaopt.plants", "seaopt.problem"]}  # else "seaopt.logs"
 MEMORY = Path("/dev/shm")  # noqa: S108  (files that live for one try)
 
 
@@ -30,31 +32,10 @@ def main() -> int:
     except ImportError:
         print("fuzzing needs atheris: pip install 'seaopt[fuzz]'; it has wheels for CPython on Linux", file=sys.stderr)  # noqa: T201
         return 2
-    with atheris.instrument_imports(include=["seaopt.logs"]):
-        from seaopt.errors import SeaoptError
-        from seaopt.logs import Column, contents, read_table
-
-        for name in (
-            "json",
-            "mat",
-            "simulink",
-            "text",
-            "text_layout",
-        ):  # otherwise imported later, and not instrumented
-            import_module(f"seaopt.logs.formats.{name}")
     folder = Path(tempfile.mkdtemp(dir=MEMORY if MEMORY.is_dir() else None))
     file = folder / f"log{SUFFIX[given.target]}"
-
-    def one_input(data: bytes) -> None:
-        magic = b"MATLAB 5.0 MAT-file" if given.target == "mat" else b""
-        file.write_bytes(magic + data[len(magic) :])
-        with contextlib.suppress(SeaoptError):
-            read_table(file, digest=False)
-        with contextlib.suppress(SeaoptError):
-            for item in contents(file).fields[:4]:
-                with contextlib.suppress(SeaoptError):
-                    read_table(file, time=Column(column=item.name, unit="s"), channels={}, digest=False)
-
+    with atheris.instrument_imports(include=INSTRUMENTED.get(given.target, ["seaopt.logs"])):
+        one_input = make_plant_reader(file) if given.target == "plant" else make_log_reader(given.target, file)
     corpus = given.corpus or folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     for number, seed in enumerate(seeds(given.target)):
@@ -67,8 +48,53 @@ def main() -> int:
     return 0
 
 
+def make_log_reader(target: str, file: Path) -> Callable[[bytes], None]:
+    """Return what reads an input as a log in every way."""
+    from seaopt.errors import SeaoptError
+    from seaopt.logs import Column, contents, read_table
+
+    for name in ("json", "mat", "simulink", "text", "text_layout"):  # otherwise imported later, and not instrumented
+        import_module(f"seaopt.logs.formats.{name}")
+
+    def one_input(data: bytes) -> None:
+        magic = b"MATLAB 5.0 MAT-file" if target == "mat" else b""
+        file.write_bytes(magic + data[len(magic) :])
+        with contextlib.suppress(SeaoptError):
+            read_table(file, digest=False)
+        with contextlib.suppress(SeaoptError):
+            for item in contents(file).fields[:4]:
+                with contextlib.suppress(SeaoptError):
+                    read_table(file, time=Column(column=item.name, unit="s"), channels={}, digest=False)
+
+    return one_input
+
+
+def make_plant_reader(file: Path) -> Callable[[bytes], None]:
+    """Return what reads an input as one equation, and as a problem file."""
+    import casadi as ca
+
+    from seaopt.errors import SeaoptError
+    from seaopt.plants.equations.expressions import parse
+    from seaopt.problem import read_problem
+
+    symbols = {name: ca.SX.sym(name) for name in ("theta", "omega", "tau", "mgL", "I_p", "tau_f", "d")}
+
+    def one_input(data: bytes) -> None:
+        file.write_bytes(data)
+        with contextlib.suppress(SeaoptError):
+            parse(data.decode("utf-8", "replace"), symbols, "f.omega")
+        with contextlib.suppress(SeaoptError):
+            read_problem(file)
+
+    return one_input
+
+
 def seeds(target: str) -> list[bytes]:
     """Return small valid files to start from."""
+    if target == "plant":
+        whole = (Path(__file__).resolve().parents[1] / "problems" / "pendulum.toml").read_bytes()
+        equation = b"(tau - mgL*sin(theta) - if_else(omega > 0, d, -d)^2*omega - max(tau_f, 1e-3)) / I_p"
+        return [whole, whole[: whole.index(b"[[experiment]]")], equation]
     import numpy as np
 
     rows = [{"time": 0.1 * i, "F": i * 2.5, "v": [i, 2], "imu": {"x": i}} for i in range(4)]

@@ -20,9 +20,9 @@ from jaxtyping import Float
 from seaopt.errors import ParameterError, PlantError, SeaoptError, UnitError, require_number, require_type, suggestion
 from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants.equations.stored_equations import store_plant
 from seaopt.plants.memo import memo
 from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring
-from seaopt.plants.stored_equations import store_plant
 from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 

@@ -16,9 +16,9 @@ import casadi as ca
 
 from seaopt.errors import PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter
-from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, SeriesSpring
-from seaopt.plants.expressions import RESERVED, list_names, parse
-from seaopt.plants.stored_equations import StoredFunction, store_function
+from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, SeriesSpring, wrapped
+from seaopt.plants.equations.expressions import RESERVED, list_names, parse
+from seaopt.plants.equations.stored_equations import StoredFunction, store_function
 from seaopt.problem.schema import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
 from seaopt.records import record
 from seaopt.units import factor, si_unit
@@ -94,11 +94,11 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
         actuation=texts.actuate(), sensing=_sense(table), spring=texts.spring(),
         ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
         friction={key: texts.rub(f"friction.{key}", one) for key, one in table.friction.items()},
-        mode=None if table.mode is None else Mode(**table.mode.model_dump()),
+        mode=None if table.mode is None else Mode(**table.mode.model_dump()), sticks=table.sticks,
     )  # fmt: skip
     _check_outputs(plant)
     _check_held(plant)
-    return plant
+    return wrapped(plant, table.parts)
 
 
 def list_unused(table: EquationsTable) -> list[str]:
@@ -210,7 +210,7 @@ class _Texts:
         role = self.table.actuation
         return None if role is None else Actuation(
             input=role.input, effort=self.of_parameters("actuation.effort", role.effort), unit=role.unit,
-            efficiency=role.efficiency,
+            efficiency=role.efficiency, speed=self.of_states("actuation.speed", role.speed),
         )  # fmt: skip
 
     def spring(self) -> SeriesSpring | None:
@@ -235,18 +235,24 @@ class _Texts:
 
     def rub(self, place: str, role: FrictionTable) -> Friction:
         """Return a friction."""
+        known = (*self.parameters, *role.loads)
 
         def curve(what: str, text: Formula) -> StoredFunction:
-            return self.store(lambda read: read(f"{place}.{what}", text), VELOCITY, self.parameters)
+            return self.store(lambda read: read(f"{place}.{what}", text), VELOCITY, known)
+
+        def load(read: Read) -> dict[str, Any]:
+            return {name: read(f"{place}.loads.{name}", text) for name, text in role.loads.items()}
 
         slopes = role.slopes
         return Friction(
             velocity=self.of_states(f"{place}.velocity", role.velocity), force=curve("force", role.force),
             unit=role.unit, effort=self.of_parameters(f"{place}.effort", role.effort),
             slopes=None if slopes is None else self.store(
-                lambda read: tuple(read(f"{place}.slopes", text) for text in slopes), self.parameters
+                lambda read: tuple(read(f"{place}.slopes", text) for text in slopes), known
             ),
             jump=None if role.jump is None else curve("jump", role.jump), smoothing=role.smoothing,
+            loads=self.store(load, self.states, tuple(self.table.inputs), self.parameters) if role.loads else None,
+            rated=role.rated,
         )  # fmt: skip
 
 
@@ -302,6 +308,8 @@ def _check_names(table: EquationsTable) -> None:
             if name in RESERVED or name == TIME:
                 what = "the time" if name == TIME else "a function or constant"
                 raise PlantError(f"{place} has the name of {what} of the equations; rename it")
+            if any(name in role.loads for role in table.friction.values()):
+                raise PlantError(f"{place} has the name of a friction's load; rename one")
             if name == VELOCITY and table.friction and group in ("parameters", "definitions"):
                 raise PlantError(f"{place} has the name of the velocity in a friction's force and jump; rename it")
             if name in seen:

@@ -40,6 +40,7 @@ from seaopt.problem.schema import (
     ExperimentTable,
     FitTable,
     ParameterTable,
+    PlantTable,
     ProblemTable,
     RobustnessTable,
     SensorsTable,
@@ -350,13 +351,19 @@ def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
         table = tables[name]
         try:
             own = isinstance(table, EquationsTable)
-            plants[name] = (
-                make_plant(name, table, plants) if own else plant_of_kind(table.kind, **(table.model_extra or {}))
-            )
+            plants[name] = make_plant(name, table, plants) if own else _make_plant_of_kind(table)
         except SeaoptError as error:
             text = str(error).removeprefix(f"plant {name}: ")
             raise type(error)(f"plant.{name}: {text}") from error
     return {name: plants[name] for name in tables}
+
+
+def _make_plant_of_kind(table: PlantTable) -> Plant:
+    options = table.model_extra or {}
+    equations = ", ".join(name for name in ("f", "h", "states", "outputs") if name in options)
+    if equations:
+        raise ProblemError(f"a plant has either a kind or {equations} of its own; take one out")
+    return plant_of_kind(table.kind, **options)
 
 
 def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:

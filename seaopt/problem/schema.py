@@ -69,6 +69,7 @@ class ActuationTable(_Strict):
     effort: Formula
     unit: str = "N"
     efficiency: str | None = None
+    speed: Formula | None = None
 
 
 class SensingTable(_Strict):
@@ -105,7 +106,7 @@ class PortTable(_Strict):
 
 
 class FrictionTable(_Strict):
-    """A dissipative force: of v, the velocity that it opposes, and of the parameters."""
+    """A dissipative force: of v, the velocity that it opposes, of the parameters, and of loads that it grows with."""
 
     velocity: Formula
     force: Formula
@@ -114,6 +115,8 @@ class FrictionTable(_Strict):
     slopes: tuple[Formula, Formula] | None = None
     jump: Formula | None = None
     smoothing: str | None = None
+    loads: dict[str, Formula] = {}
+    rated: dict[str, Number] = {}
 
 
 class ModeTable(_Strict):
@@ -143,6 +146,8 @@ class EquationsTable(_Strict):
     ports: list[PortTable] = []
     friction: dict[str, FrictionTable] = {}
     mode: ModeTable | None = None
+    sticks: Flag = False
+    parts: list[str] = []
 
 
 def _choose_plant(table: Any) -> str:

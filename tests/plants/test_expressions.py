@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from seaopt.errors import PlantError, SeaoptError
-from seaopt.plants.expressions import FUNCTIONS, MAX_LENGTH, list_names, parse
+from seaopt.plants.equations.expressions import FUNCTIONS, MAX_LENGTH, list_names, parse
 
 X, Y = 0.7, -1.3
 SYMBOLS = {"x": ca.SX.sym("x"), "y": ca.SX.sym("y")}

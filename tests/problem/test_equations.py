@@ -11,6 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.provenance import digest_sources
 from seaopt.control import passivity
+from seaopt.plants import plant_of_kind
 from seaopt.plants.friction import friction_matrices, friction_slopes
 from seaopt.plants.impacts import catch, release
 from seaopt.plants.plant import deflection_row, dynamics_function, output_function, state_space
@@ -216,6 +217,58 @@ def test_what_is_held_and_probed_is_another_plant_of_the_file(read, thor):
     np.testing.assert_allclose(*states, rtol=1e-9)
 
 
+def test_friction_that_sticks_and_parts_around_are_those_of_the_built_in_plant(read, thor):
+    text = TEXT.replace("[plant.stand]\n", '[plant.stand]\nsticks = true\nparts = ["current_loop"]\n', 1)
+    own = read(text, 'held = "stand"\n', "").plants["stand"]
+    built_in = plant_of_kind("high_impedance", friction="sticking", parts=["current_loop"])
+    log = so.virtual_log(
+        built_in,
+        built_in.complete(thor),
+        (so.Chirp(amplitude=0.2, f0_hz=1, f1_hz=20),),
+        duration_s=1,
+        rate_hz=400,
+        seed=1,
+    )
+    runs = [so.simulate(plant, thor, log) for plant in (own, built_in)]
+    np.testing.assert_allclose(runs[0]["F1"], runs[1]["F1"], rtol=1e-6, atol=1e-6)
+
+
+def test_friction_grows_with_a_load(read):
+    text = """
+schema = 1
+[parameters]
+f_c = 1.0
+K = 0.5
+J = 0.2
+[plant.gear]
+states = { theta = "rad", omega = "rad/s" }
+inputs = { I = "A" }
+outputs = { theta = "rad" }
+parameters = { f_c = "N m", K = "N m/A", J = "kg m^2" }
+f = { theta = "omega", omega = "(K*I - rub)/J" }
+h = { theta = "theta" }
+actuation = { input = "I", effort = "K", unit = "N m", speed = "omega" }
+[plant.gear.friction.rub]
+velocity = "omega"
+force = "(f_c + 0.1*abs(torque))*tanh(v/0.01)"
+slopes = ["0", "(f_c + 0.1*abs(torque))/0.01"]
+jump = "f_c + 0.1*abs(torque)"
+loads = { torque = "K*I" }
+rated = { torque = 2.0 }
+unit = "N m"
+"""
+    problem = read(text)
+    gear = problem.plants["gear"]
+    rates = np.array(dynamics_function(gear)([0.0, 3.0], [4.0], gear.complete(problem.parameters).vector)).ravel()
+    np.testing.assert_allclose(rates, [3.0, (0.5 * 4.0 - 1.2) / 0.2])
+    assert friction_slopes(gear, problem.parameters)[1] == pytest.approx([120.0])  # at the rated load
+    assert pickle.loads(pickle.dumps(gear)).friction["rub"].rated == {"torque": 2.0}
+    with pytest.raises(so.SeaoptError, match="the loads torque, and rated has none"):
+        read(text, "rated = { torque = 2.0 }\n", "")
+    with pytest.raises(so.SeaoptError, match=r"parameters.K has the name of a friction's load"):
+        read(text.replace("torque", "K"))
+
+
 def test_a_partner_alone_is_not_certified(read):
     problem = read(old='held = "stand"\n', new="")
     assert list(problem.certified_plants()) == ["stand", "swing"]
@@ -365,7 +418,7 @@ friction.rub = { velocity = "3*v", force = "f_c*v" }
         ('held = "stand"', 'held = "bare"', r"ports.1.held: plant .* has the states q, qd, x_2, v_2"),
         ('motion = "x_2"', 'motin = "x_2"', r'unknown key plant.swing.ports.1.motin; did you mean "motion"'),
         ('energy = "0.5', 'energy = "I*0.5', r'energy, column 1: "I" is an input'),
-        ("[plant.stand]\n", '[plant.stand]\nkind = "rotary"\n', r'states is not an option of kind "rotary"'),
+        ("[plant.stand]\n", '[plant.stand]\nkind = "rotary"\n', r"either a kind or f, h, .* take one out"),
     ],
 )  # fmt: skip
 def test_mistakes_are_one_clear_line_with_their_place(read, old, new, words):
