@@ -6,7 +6,6 @@ import contextlib
 import re
 import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.cli import main
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.passivity import passivity
 from seaopt.simulation.native import find_compiler
@@ -74,17 +74,14 @@ def test_the_plant_of_the_how_to_as_data_gives_the_same_fit(tmp_path, simulated)
     assert plant.friction["tau_f"].smoothing == "v_s" and list(plant.derived_values()) == ["natural_frequency_hz"]
 
 
-def test_the_mistake_of_the_how_to_is_shown_as_it_says(tmp_path):
+def test_the_mistake_of_the_how_to_is_shown_as_it_says(tmp_path, monkeypatch, capsys):
     problem_file = blocks("howto_own_plant.md", "toml")[0].replace("mgL*sin", "mgl*sin")
     (tmp_path / "pendulum.toml").write_text(problem_file, encoding="utf-8")
-    out = subprocess.run(
-        [sys.executable, "-m", "seaopt", "fit", "pendulum.toml"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert out.stderr == blocks("howto_own_plant.md", "text")[0] and out.returncode == 2
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["seaopt", "fit", "pendulum.toml"])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert capsys.readouterr().err == blocks("howto_own_plant.md", "text")[0]
 
 
 def test_the_export_of_the_docs_works(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.bench import Chirp
 from seaopt.cli.provenance import digest_sources
 from seaopt.control import passivity
 from seaopt.plants import plant_of_kind
@@ -224,7 +225,7 @@ def test_friction_that_sticks_and_parts_around_are_those_of_the_built_in_plant(r
     log = so.virtual_log(
         built_in,
         built_in.complete(thor),
-        (so.Chirp(amplitude=0.2, f0_hz=1, f1_hz=20),),
+        (Chirp(amplitude=0.2, f0_hz=5, f1_hz=20),),
         duration_s=1,
         rate_hz=400,
         seed=1,
