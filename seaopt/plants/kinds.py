@@ -25,10 +25,10 @@ KINDS: dict[str, Callable[..., Plant]] = {
 }
 
 
-def plant_of_kind(kind: str, *, friction: str = "smoothed", **options: Any) -> Plant:
+def plant_of_kind(kind: str, *, sticks: Any = False, **options: Any) -> Plant:
     """Return a plant by the name of its kind, built in or from the entry-point group ``seaopt.plants``.
 
-    With ``friction="sticking"`` it is simulated and fitted with friction that jumps at rest: `let_stick`.
+    With `sticks` it is simulated and fitted with friction that jumps at rest: `let_stick`.
 
     Raises
     ------
@@ -46,14 +46,14 @@ def plant_of_kind(kind: str, *, friction: str = "smoothed", **options: Any) -> P
             make = installed[kind].load()
         except Exception as error:
             raise PlantError(f'kind = "{kind}" cannot be loaded from {installed[kind].value}: {error}') from error
-    if friction not in ("smoothed", "sticking"):
-        raise PlantError(f'friction = "{friction}" is not known; {suggestion(str(friction), ("smoothed", "sticking"))}')
     accepted = list(inspect.signature(make).parameters)
     for name in options:
         if name not in accepted:
             raise PlantError(f'{name} is not an option of kind "{kind}"; {suggestion(name, accepted)}')
+    if not isinstance(sticks, bool):
+        raise PlantError(f"sticks = {sticks!r} is not true or false; give one of them")
     plant = make(**options)
-    return let_stick(plant) if friction == "sticking" else plant
+    return let_stick(plant) if sticks else plant
 
 
 def known_parameters() -> dict[str, Parameter]:

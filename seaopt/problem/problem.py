@@ -51,6 +51,7 @@ from seaopt.records import record
 from seaopt.robustness import place_value
 
 MAX_BYTES = 4 << 20
+OWN = "parameter "  # before the name of a parameter that is read as a channel
 
 
 @record(eq=False)
@@ -209,7 +210,11 @@ class Problem:
 
     def _make_experiment(self, table: ExperimentTable) -> Experiment:
         plant = self.plants[table.plant]
-        log = self._simulate_bench(plant, table.virtual) if table.virtual else self._read_log(table)
+        if table.virtual:
+            own = {name: given for name, given in table.parameters.items() if isinstance(given, float | int)}
+            log = self._simulate_bench(plant, table.virtual, own)
+        else:
+            log = self._read_log(table)
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
         log = _resample(log, table).decimate(table.decimate)
@@ -218,19 +223,42 @@ class Problem:
             if isinstance(column, ColumnTable) and column.sigma is not None:
                 sigma[name] = column.sigma
         measured = tuple(table.outputs) if not table.virtual else _virtual_outputs(plant, table.virtual)
+        own = {name: self._make_own(plant, table, name, log) for name in table.parameters}
         return Experiment(
             plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
             offset=table.offset, gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
             delay_s=_make_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
-            drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask,
+            drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask, parameters=own,
         )  # fmt: skip
+
+    def _make_own(self, plant: Plant, table: ExperimentTable, name: str, log: Log) -> float | Parameter:
+        """Return a parameter of one log alone: a value, a free one, or the constant of a column or the header."""
+        given = table.parameters[name]
+        if isinstance(given, UnknownTable):
+            default = plant.defaults.get(name)
+            made = _make_unknown(name, plant.parameter_unit(name), given)
+            if default is None or not isinstance(made, Parameter):
+                return made
+            low = made.min if given.min is not None else min(default.min, made.value)
+            return replace(made, min=low, max=made.max if given.max is not None else max(default.max, made.value))
+        if not isinstance(given, ColumnTable):
+            return given
+        values = set(log[OWN + name].tolist())
+        if len(values) != 1:
+            raise ProblemError(
+                f'experiment {table.name}: parameters: {name} is not one value throughout column "{given.column}"; '
+                "make it an input"
+            )
+        return values.pop()
 
     def _read_log(self, table: ExperimentTable) -> Log:
         check_links(self.folder, list_log_files(table))
+        read = {OWN + name: given for name, given in table.parameters.items() if isinstance(given, ColumnTable)}
+        channels = {**table.inputs, **table.outputs, **read}
         return read_log(
             [self.folder / name for name in list_log_files(table)],
             time=None if table.time is None else make_column(table.time, self.folder),
-            channels={name: make_column(item, self.folder) for name, item in {**table.inputs, **table.outputs}.items()},
+            channels={name: make_column(item, self.folder) for name, item in channels.items()},
             align=make_rule(table.align),
             window_s=table.window_s,
             counter=None if table.counter is None else Counter(**table.counter.model_dump()),
@@ -238,7 +266,7 @@ class Problem:
             duplicates=table.duplicates,
         )
 
-    def _simulate_bench(self, plant: Plant, table: VirtualTable) -> Log:
+    def _simulate_bench(self, plant: Plant, table: VirtualTable, own: Mapping[str, float]) -> Log:
         parts: list[Chirp | Noise | Multisine] = []
         if table.excitation.chirp:
             parts.append(Chirp(**table.excitation.chirp.model_dump()))
@@ -249,7 +277,7 @@ class Problem:
             parts.append(Multisine(**{name: tuple(values) for name, values in lines.items()}))
         excitation: Excitation = tuple(parts)
         truth = {**plant.complete(self.parameters)}
-        for name, value in table.truth.items():
+        for name, value in {**own, **table.truth}.items():
             if name not in truth:
                 raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, truth)}')
             truth[name] = replace(truth[name], value=value)
@@ -333,7 +361,7 @@ def read_problem(path: Path | str) -> Problem:
     table = _read_table(source)
     try:
         plants = _make_plants(table.plant)
-        parameters = _make_parameters(table.parameters, plants)
+        parameters = _make_parameters(table, plants)
         check_references(table, plants, parameters)
         spec = _make_spec(table)
     except SeaoptError as error:
@@ -366,11 +394,23 @@ def _make_plant_of_kind(table: PlantTable) -> Plant:
     return plant_of_kind(table.kind, **options)
 
 
-def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mapping[str, Plant]) -> ParameterSet:
+def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> ParameterSet:
+    tables = table.parameters
+    for experiment in table.experiment:
+        known = plants[experiment.plant].parameters if experiment.plant in plants else experiment.parameters
+        for name in experiment.parameters:
+            if name not in known:
+                raise ProblemError(
+                    f'experiment {experiment.name}: parameters names "{name}"; {suggestion(name, known)}'
+                )
+    # What each log states for itself need not be stated for all.
+    own = {key: [set(e.parameters) for e in table.experiment if e.plant == key] for key in plants}
     declared = {name: default for plant in plants.values() for name, default in plant.defaults.items()}
-    for plant in plants.values():
+    for key, plant in plants.items():
         for name in plant.parameters:
             if name not in declared:
+                if name not in tables and own[key] and all(name in given for given in own[key]):
+                    continue
                 if name not in tables:
                     raise ProblemError(f"parameters.{name} is missing; plant {plant.name} needs it")
                 declared[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
@@ -382,8 +422,8 @@ def _make_parameters(tables: Mapping[str, float | ParameterTable], plants: Mappi
             if name.lower().replace("_", "") == "ke":
                 remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
             raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
-        table = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
-        parameters[name] = _make_parameter(parameters[name], table)
+        given = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
+        parameters[name] = _make_parameter(parameters[name], given)
     return ParameterSet(parameters.values())
 
 

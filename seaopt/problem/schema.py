@@ -326,6 +326,7 @@ class ExperimentTable(_Strict):
     sigma: dict[str, Number] = {}
     initial_state: Literal["estimate", "rest"] | dict[str, Number] = "estimate"
     offset: Flag | dict[str, Number] = True
+    parameters: dict[str, Number | UnknownTable | ColumnTable] = {}
     delay_s: Number | UnknownTable = 0.0
     gain: dict[str, Number | UnknownTable] = {}
     hold: Literal["zero", "first"] = "zero"

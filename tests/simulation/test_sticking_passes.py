@@ -135,11 +135,11 @@ def test_fit_finds_an_actuator_that_truly_sticks_and_says_met():
 
 def test_what_cannot_stick_and_loads_that_are_not_rated_are_refused():
     with pytest.raises(PlantError, match="jump"):
-        so.plants.let_stick(so.plants.rotary())
+        so.plants.let_stick(make_block(jump=None))
     with pytest.raises(PlantError, match="rated"):
         make_block(loads=lambda x, u, p: {"load": u.F})
     with pytest.raises(PlantError, match="is a parameter"):
         make_block(loads=lambda x, u, p: {"k": u.F}, rated={"k": 1.0})
-    with pytest.raises(PlantError, match="sticking"):
-        so.plants.plant_of_kind("high_impedance", friction="stiction")
-    assert so.plants.plant_of_kind("high_impedance", friction="sticking").sticks
+    with pytest.raises(PlantError, match="true or false"):
+        so.plants.plant_of_kind("high_impedance", sticks="yes")
+    assert so.plants.plant_of_kind("high_impedance", sticks=True).sticks

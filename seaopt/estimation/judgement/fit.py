@@ -173,8 +173,10 @@ def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSe
     """Return every parameter of the plants, in order, and the free ones that no plant has (an error later)."""
     parameters: dict[str, Parameter] = {}
     for experiment in experiments:
-        for name, parameter in experiment.plant.complete(params).items():
-            parameters.setdefault(name, parameter)
+        for name, parameter in experiment.plant.complete(experiment.apply_own(params)).items():
+            parameters.setdefault(name, params.get(name, parameter) if name in experiment.parameters else parameter)
+        for own in experiment.list_own().values():
+            parameters.setdefault(own.name, params.get(own.name, own))
     for name in params.free_names:
         parameters.setdefault(name, params[name])
     return ParameterSet(parameters.values())
@@ -186,7 +188,7 @@ def _check_stiffness(problem: FitProblem) -> None:
         if not experiment.is_too_stiff(problem.unknowns.start):
             continue
         steps, plant = experiment.count_stable_steps(problem.unknowns.start), experiment.data.plant
-        speeds = plant.complete(problem.params)
+        speeds = plant.complete(experiment.data.apply_own(problem.params))
         names = dict.fromkeys(f.smoothing for f in plant.friction.values() if f.smoothing)
         sharp = [
             f"give {n} = {speeds[n].value * steps / MAX_SUBSTEPS:.1e}{unit_after(speeds[n].unit)} or more in place of "

@@ -116,10 +116,13 @@ def find_candidates(problem: FitProblem, fit: Fit) -> tuple[tuple[str, ...], tup
     plain: list[str] = []
     bending: list[str] = []
     for name in fit.parameters:
-        users = [experiment for experiment in problem.experiments if name in experiment.data.plant.parameters]
+        users = [e for e in problem.experiments if name in e.data.plant.parameters and name not in e.data.parameters]
         if name in free or not users:
             continue
-        models = (make_model(e.data.plant, fit.parameters, (*free, name), e.data.outputs) for e in users)
+        models = (
+            make_model(e.data.plant, e.data.apply_own(fit.parameters), (*e.model.free, name), e.data.outputs)
+            for e in users
+        )
         same = all(model.linear == e.model.linear for e, model in zip(users, models, strict=True))
         (plain if same else bending).append(name)
     return tuple(plain), tuple(bending)

@@ -15,12 +15,12 @@ from seaopt.errors import EstimationError, require_number, require_type, suggest
 from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
-from seaopt.parameters import Parameter
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
-from seaopt.units import same_dimension
+from seaopt.units import factor, same_dimension
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
@@ -70,6 +70,9 @@ class Experiment:
     shots : int
         Cut each segment into this many shots, each with its own initial state: for a plant that diverges in
         simulation. The information of the joints is lost.
+    parameters : mapping of name to float or Parameter
+        Parameters of the plant in this log alone, in the plant's units: a payload, a gain of the firmware. A free
+        Parameter is estimated from this log alone, and stands among the fit's parameters as EXPERIMENT.NAME.
 
     Attributes
     ----------
@@ -100,6 +103,7 @@ class Experiment:
     saturation: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     mask: Mask = "auto"
     shots: int = 1
+    parameters: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
     stretches: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -130,9 +134,45 @@ class Experiment:
                     f"experiment {self.name}: output {name} has no finite sample; leave it out of outputs"
                 )
         self._check_units()
+        self._check_parameters()
         object.__setattr__(self, "stretches", tuple(self.log.segments))
         self._check_settings()
         self._mask()
+
+    def list_own(self) -> dict[str, Parameter]:
+        """Return the parameters of this log alone that are free, by their names in the plant."""
+        free = {name: value for name, value in self.parameters.items() if isinstance(value, Parameter) and value.free}
+        return {name: replace(value, name=f"{self.name}.{name}") for name, value in free.items()}
+
+    def apply_own(self, params: ParameterSet) -> ParameterSet:
+        """Return parameters with this log's own in their places; of those that a fit has estimated, their estimates."""
+        if not self.parameters:
+            return params
+        own: list[Parameter] = []
+        for name, given in self.parameters.items():
+            value = params.get(f"{self.name}.{name}", given)
+            value = value.value if isinstance(value, Parameter) else float(value)
+            own.append(Parameter(name=name, value=value, unit=self.plant.parameter_unit(name)))
+        return params.with_parameters(*own)
+
+    def _check_parameters(self) -> None:
+        require_type(self.parameters, Mapping, f"experiment {self.name}: parameters", "give a mapping", EstimationError)
+        for name, value in self.parameters.items():
+            if name not in self.plant.parameters:
+                raise EstimationError(
+                    f'experiment {self.name}: parameters names "{name}", which is not one of {self.plant.name}; '
+                    f"{suggestion(name, self.plant.parameters)}"
+                )
+            unit = self.plant.parameter_unit(name)
+            if not isinstance(value, Parameter):
+                number = require_number(value, f"experiment {self.name}: parameters: {name}", EstimationError)
+                if not np.isfinite(number):
+                    raise EstimationError(f"experiment {self.name}: parameters: {name} = {number} is not finite")
+            elif value.unit != unit and not (same_dimension(value.unit, unit) and factor(value.unit, unit) == 1.0):
+                raise EstimationError(
+                    f"experiment {self.name}: parameters: {name} is in {value.unit}, but {self.plant.name} has it in "
+                    f"{unit or 'no unit'}; convert it"
+                )
 
     def _mask(self) -> None:
         """Make saturated samples missing in the experiment's own log."""

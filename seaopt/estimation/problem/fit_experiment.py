@@ -14,7 +14,7 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import add_gram
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
-from seaopt.estimation.problem.unknowns import Slot, Slots
+from seaopt.estimation.problem.unknowns import Slot, Slots, find_places
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, Pass, Point, Segment, Weights, count_stable_steps, run_passes, stream
 
@@ -289,7 +289,7 @@ def make_fit_experiment(
     band_hz: tuple[float, float] | None, holdout: float,
 ) -> FitExperiment:  # fmt: skip
     """Return an experiment in the unknowns of these names; a sigma that is not given is the output's spread."""
-    theta = [names.index(name) for name in model.free]
+    theta = find_places(data, model, names)
     spread = [measure_spread(data.log[name]) for name in data.outputs]
     sigma = [data.sigma.get(name, size or 1.0) for name, size in zip(data.outputs, spread, strict=True)]
     return FitExperiment(

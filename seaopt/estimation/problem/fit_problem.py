@@ -40,7 +40,7 @@ from seaopt.estimation.problem.fit_experiment import (
 )
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import QuadraticModel, TrustRegionStep, solve_seen
-from seaopt.estimation.problem.unknowns import Unknowns, collect
+from seaopt.estimation.problem.unknowns import Unknowns, collect, find_places
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.simulation import Pass, threads
@@ -229,7 +229,7 @@ class FitProblem:
                 start[place], values[place] = first, value
         rebuilt: list[FitExperiment] = []
         for old, new, (model, slots) in zip(self.experiments, experiments, modelled, strict=True):
-            theta = np.array([unknowns.names.index(name) for name in model.free], dtype=int)
+            theta = np.array(find_places(new, model, unknowns.names), dtype=int)
             segments = make_segments(new, slots, theta.tolist(), old.holdout)
             rebuilt.append(replace(old, data=new, segments=segments, model=model, theta=theta, slots=slots))
         return FitProblem(

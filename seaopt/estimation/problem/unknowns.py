@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -143,7 +143,8 @@ def collect(
         A free parameter belongs to no plant of the experiments.
 
     """
-    used = {name for experiment in experiments for name in experiment.plant.parameters}
+    used = {name for e in experiments for name in e.plant.parameters if name not in e.parameters}
+    used |= {own.name for experiment in experiments for own in experiment.list_own().values()}
     for name in params.free_names:
         if name not in used:
             raise EstimationError(
@@ -153,7 +154,7 @@ def collect(
     for name in params.free_names:
         builder.add(params[name])
     shared = len(builder.entries)
-    models = tuple(make_model(e.plant, params, params.free_names, e.outputs) for e in experiments)
+    models = tuple(_make_model(experiment, params) for experiment in experiments)
     pairs = zip(experiments, models, strict=True)
     modelled = tuple((model, _make_slots(builder, experiment, model, noise, band_hz)) for experiment, model in pairs)
     entries = builder.entries
@@ -167,6 +168,19 @@ def collect(
         shared=shared,
     )
     return unknowns, modelled
+
+
+def _make_model(experiment: Experiment, params: ParameterSet) -> Model:
+    """Return an experiment's model in what is free of its plant, for all logs or for this one."""
+    shared = [name for name in params.free_names if name not in experiment.parameters]
+    own = [name for name, parameter in experiment.list_own().items() if parameter.name in params.free_names]
+    return make_model(experiment.plant, experiment.apply_own(params), (*shared, *own), experiment.outputs)
+
+
+def find_places(experiment: Experiment, model: Model, names: Sequence[str]) -> list[int]:
+    """Return where the free parameters of an experiment's model are among the unknowns of these names."""
+    own = experiment.list_own()
+    return [names.index(own[name].name if name in own else name) for name in model.free]
 
 
 def _make_slots(

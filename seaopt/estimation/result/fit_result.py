@@ -194,7 +194,7 @@ class Fit:
 
         """
         own, in_band = self._find_nuisance(experiment)
-        model = make_model(experiment.plant, self.parameters, (), experiment.outputs)
+        model = make_model(experiment.plant, experiment.apply_own(self.parameters), (), experiment.outputs)
         n = len(experiment.log)
         y = np.full((n, len(experiment.outputs)), np.nan)
         point = Point(

@@ -32,7 +32,7 @@ def estimate_nuisance(
         Fit percent in the band; None without one.
 
     """
-    values = experiment.plant.complete(params)
+    values = experiment.plant.complete(experiment.apply_own(params))
     known = ParameterSet(values.values()).fix()
     problem = pose_problem((experiment,), known, loss=Squares(), band_hz=band_hz)
     solved = settle(problem, problem.evaluate(problem.unknowns.start), ITERATIONS, None)

@@ -267,7 +267,7 @@ def _derive_figures(
     for experiment in experiments:
         plant = experiment.plant
         function, units = _compile_figures(plant)
-        values, slopes = (np.array(array) for array in function(plant.complete(fitted).vector))
+        values, slopes = (np.array(array) for array in function(plant.complete(experiment.apply_own(fitted)).vector))
         names = list(plant.parameters)
         free = [name for name in seen.names if name in names]
         rows = [seen.names.index(name) for name in free]

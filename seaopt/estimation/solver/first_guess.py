@@ -107,7 +107,7 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
     # Dry friction at rest is a damper of f_c/v_s, which is no more there once the actuator moves.
     model = experiment.model
     if not model.linear and data.plant.friction:
-        model = make_model(remove_friction(data.plant), params, model.free, model.outputs)
+        model = make_model(remove_friction(data.plant), data.apply_own(params), model.free, model.outputs)
     model = linearise(model)
     return _Target(
         model=model,
