@@ -221,7 +221,7 @@ def test_what_is_held_and_probed_is_another_plant_of_the_file(read, thor):
 def test_friction_that_sticks_and_parts_around_are_those_of_the_built_in_plant(read, thor):
     text = TEXT.replace("[plant.stand]\n", '[plant.stand]\nsticks = true\nparts = ["current_loop"]\n', 1)
     own = read(text, 'held = "stand"\n', "").plants["stand"]
-    built_in = plant_of_kind("high_impedance", friction="sticking", parts=["current_loop"])
+    built_in = plant_of_kind("high_impedance", sticks=True, parts=["current_loop"])
     log = so.virtual_log(
         built_in,
         built_in.complete(thor),
