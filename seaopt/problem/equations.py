@@ -172,7 +172,8 @@ class _Texts:
         known = dict(symbols)
         for name in self.definitions:
             text = self.table.definitions[name]
-            if not any(used in self.names and used not in known for used in list_names(str(text))):
+            own = self.names.keys() & set(list_names(str(text))) - RESERVED
+            if own <= known.keys():
                 known[name] = self.read(f"definitions.{name}", text, known)
         return {name: known[name] for name in self.definitions if name in known}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import tomllib
 
 import casadi as ca
 import numpy as np
@@ -16,6 +17,7 @@ from seaopt.plants import plant_of_kind
 from seaopt.plants.friction import friction_matrices, friction_slopes
 from seaopt.plants.impacts import catch, release
 from seaopt.plants.plant import deflection_row, dynamics_function, output_function, state_space
+from seaopt.problem import json_schema
 
 # The stand and the swing phase of Orekhov et al. 2015, unlumped, spring at link 1, by eliminating F2 by hand.
 THOR = """
@@ -222,14 +224,8 @@ def test_friction_that_sticks_and_parts_around_are_those_of_the_built_in_plant(r
     text = TEXT.replace("[plant.stand]\n", '[plant.stand]\nsticks = true\nparts = ["current_loop"]\n', 1)
     own = read(text, 'held = "stand"\n', "").plants["stand"]
     built_in = plant_of_kind("high_impedance", sticks=True, parts=["current_loop"])
-    log = so.virtual_log(
-        built_in,
-        built_in.complete(thor),
-        (Chirp(amplitude=0.2, f0_hz=5, f1_hz=20),),
-        duration_s=1,
-        rate_hz=400,
-        seed=1,
-    )
+    chirp = (Chirp(amplitude=0.2, f0_hz=5, f1_hz=20),)
+    log = so.virtual_log(built_in, built_in.complete(thor), chirp, duration_s=0.2, rate_hz=400, seed=1)
     runs = [so.simulate(plant, thor, log) for plant in (own, built_in)]
     np.testing.assert_allclose(runs[0]["F1"], runs[1]["F1"], rtol=1e-6, atol=1e-6)
 
@@ -441,6 +437,28 @@ def test_many_definitions_that_double_each_other_are_read(read):
     plant = problem.plants["stand"]
     effort = plant.actuation.effort(plant.complete(problem.parameters).by_attribute)
     assert float(effort) == pytest.approx(240.33, rel=1e-3)
+
+
+def test_the_json_schema_knows_both_kinds_of_plant():
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = jsonschema.Draft202012Validator(json_schema())
+    content = tomllib.loads(TEXT)
+    assert not list(schema.iter_errors(content))
+    changes = {"f": None}, {"outputs": {"F1": 3}}, {"friction": {"F_f": {"velocity": "qd"}}}, {"h_": {}}
+    for change in changes:
+        wrong = {"stand": {**content["plant"]["stand"], **change}}
+        assert list(schema.iter_errors({**content, "plant": wrong})), change
+
+
+def test_an_output_may_have_the_name_of_a_function(read):
+    text = (
+        TEXT[: TEXT.index("[[experiment]]")]
+        .replace("F1 =", "exp =", 2)
+        .replace('"F1"', '"exp"', 1)
+        .replace('r = "l', 'r = "exp(0)*l', 1)
+    )
+    plant = read(text).plants["stand"]
+    assert next(iter(plant.outputs)) == "exp" and plant.sensing.regulated == ("exp", "F2")
 
 
 def test_a_plant_has_so_many_names(read):
