@@ -63,8 +63,13 @@ Part = Literal[
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "stribeck": (
-        Parameter(name="f_s", value=0.0, unit="N", min=0.0, description="breakaway friction at the screw"),
-        Parameter(name="v_st", value=5e-3, unit="m/s", min=1e-9, description="Stribeck speed"),
+        Parameter(
+            name="f_s", value=0.0, unit="N", min=0.0, description="breakaway friction at the screw",
+            plausible=(0, 100000),
+        ),
+        Parameter(
+            name="v_st", value=5e-3, unit="m/s", min=1e-9, description="Stribeck speed", plausible=(0.00001, 10)
+        ),
     ),
     "backlash": (
         Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play"),

@@ -182,15 +182,18 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
         curvature = float(here.hessian[i, i])
         inward = 1.0 if z[i] - unknowns.low[i] <= unknowns.high[i] - z[i] else -1.0
         push = inward * float(here.gradient[i]) / math.sqrt(max(curvature, 1e-300))
-        bad = push > PUSH
-        remedy = (
-            "the logs want it beyond: widen the bound, or look for what the model lacks"
-            if bad
-            else ("widen the bound, or fix it there and say why")
-        )
+        own = fit.parameters.get(name)
+        away = own is not None and not own.at_bound
+        bad = push > PUSH or away
+        if away:
+            remedy = "which is as far as a fit searches: the logs do not hold it; fix it, or give it a bound or a prior"
+        elif bad:
+            remedy = "the logs want it beyond: widen the bound, or look for what the model lacks"
+        else:
+            remedy = "widen the bound, or fix it there and say why"
         yield FitFinding(
             severity="error" if bad else "note", kind="bound", where=name,
-            text=f"{name} = {z[i]:.4g} lies on its bound; {remedy}",
+            text=f"{name} = {z[i]:.4g} lies on its bound{',' if away else ';'} {remedy}",
         )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,6 +18,7 @@ from seaopt.records import record
 from seaopt.simulation import Model, depends_on_time, make_model
 from seaopt.units import factor
 
+REACH = 1e9  # times its first value, or what is plausible: a parameter without a bound of its own is held there
 NOISE_START, NOISE_PRIOR = math.log(1e-2), 3.0  # of the logarithm of process noise over the state's size
 
 
@@ -157,7 +159,7 @@ def collect(
     models = tuple(_make_model(experiment, params) for experiment in experiments)
     pairs = zip(experiments, models, strict=True)
     modelled = tuple((model, _make_slots(builder, experiment, model, noise, band_hz)) for experiment, model in pairs)
-    entries = builder.entries
+    entries = [*map(_limit, builder.entries[:shared]), *builder.entries[shared:]]
     unknowns = Unknowns(
         names=tuple(entry.name for entry in entries),
         start=np.array([entry.value for entry in entries]),
@@ -181,6 +183,13 @@ def find_places(experiment: Experiment, model: Model, names: Sequence[str]) -> l
     """Return where the free parameters of an experiment's model are among the unknowns of these names."""
     own = experiment.list_own()
     return [names.index(own[name].name if name in own else name) for name in model.free]
+
+
+def _limit(parameter: Parameter) -> Parameter:
+    """Return a parameter with bounds far out where it has none: what has no effect may run away as far as floats go."""
+    size = max(abs(parameter.value), *(abs(end) for end in parameter.plausible or (0.0,)))
+    far = REACH * size if size > 0.0 else math.inf
+    return replace(parameter, min=max(parameter.min, -far), max=min(parameter.max, far))
 
 
 def _make_slots(

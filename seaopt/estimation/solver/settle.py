@@ -61,7 +61,8 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
 
     The sharper friction is, the stiffer is the plant and the less do the logs tell how sharp: a search that went
     straight down would end where nothing can be simulated. Each stage lets a speed fall to a quarter. The last is the
-    one that ends above that, beyond which the next gains no more than chance gives, or takes too fine steps.
+    one that ends above that, beyond which the next gains no more than chance gives, as its slope or its minimum tells,
+    or takes too fine steps.
     """
     places, unknowns = problem.find_smoothing(), problem.unknowns
     if not places:
@@ -80,6 +81,9 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
     solved = solve_stage(problem, start)
     while np.any(solved.solution.z[places] <= solved.problem.unknowns.low[places]):
         if _measure_stiffness(problem, solved.solution.z) > HALF or not np.isfinite(solved.misfit):
+            break
+        here = solved.solution.evaluation  # whose slope by the speeds is that of the best cost, and flattens towards 0
+        if 2.0 * float(here.gradient[places] @ here.z[places]) <= TOLD:
             break
         sharper = solve_stage(solved.problem, solved.solution.evaluation)
         if not solved.misfit - sharper.misfit > TOLD:

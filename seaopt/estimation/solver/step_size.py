@@ -16,6 +16,7 @@ from seaopt.simulation import Pass
 
 STEP_ERROR_SIGMA = 0.01  # integration error allowed in an output, in sigma
 STEP_ERROR_PARAMETER = 0.1  # and in a parameter, in its standard deviations
+TOLERATED = 3.0  # times that, where no finer steps are left: an interval of 95 % then covers 94 %
 FIRST_STEP_ERROR = 0.1  # allowed in an output while sigma is not yet known
 MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trust
 NEARBY = 10.0  # standard deviations, over which a step error does not change
@@ -32,7 +33,7 @@ class StepError:
     @property
     def small(self) -> bool:
         """Whether it may be left out of account."""
-        return self.output <= STEP_ERROR_SIGMA and self.parameter <= STEP_ERROR_PARAMETER
+        return self.output <= STEP_ERROR_SIGMA and self.parameter <= TOLERATED * STEP_ERROR_PARAMETER
 
 
 @record(eq=False)

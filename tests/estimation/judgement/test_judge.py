@@ -173,3 +173,26 @@ def test_findings_are_stored_and_read_again():
     assert content["schema"] == "seaopt/fit/2" and content["met"] is False
     assert so.Fit.from_dict(content).findings == result.findings
     assert {"explained", "explainable"} <= set(content["outputs"]["log"]["F1"])
+
+
+@pytest.mark.parametrize("gain", [2.0, 2e12])
+def test_a_parameter_does_not_run_away(gain):
+    """Of x' = u - x, y = p x + 1e-30 s x^2 + noise, s would be at 1e27, and p may be too large for any unit's sake."""
+    plant = so.Plant(
+        name="lag", states={"x": "m"}, inputs={"u": "m/s"}, outputs={"y": "m"}, parameters={"p": "-", "s": "1/m"},
+        f=lambda t, x, u, p: {"x": u.u - x.x}, h=lambda t, x, u, p: {"y": p.p * x.x + 1e-30 * p.s * x.x**2},
+    )  # fmt: skip
+    rng, t = np.random.default_rng(0), np.arange(1000) / 100.0
+    u = signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=t.size))
+    decay = math.exp(-0.01)
+    x = signal.lfilter([0.0, 1.0 - decay], [1.0, -decay], u)
+    log = so.Log.from_arrays(time=t, u=u, y=gain * (x + 0.01 * rng.normal(size=t.size)))
+    params = so.ParameterSet.of(p=(1.0, "-"), s=(1.0, "1/m")).free("p", "s")
+    result = so.fit([so.Experiment(plant=plant, log=log)], params)
+    assert not result.met and abs(result.parameters["s"].value) <= 1e9
+    if gain < 1e9:
+        assert result.parameters["p"].value == pytest.approx(gain, rel=0.01)
+        assert result.parameters.unidentified_names == ("s",)
+    else:
+        (far,) = (finding for finding in result.findings if finding.where == "p" and finding.kind == "bound")
+        assert far.severity == "error" and "searches" in far.text
