@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from seaopt.errors import UnitError
+from seaopt.records import record
 
 if TYPE_CHECKING:
     import pint
@@ -174,3 +175,60 @@ def bare_name(header: str) -> str:
     """
     match = _HEADER.match(header)
     return match["name"].strip() or header if match else header
+
+
+@record
+class Mechanics:
+    """How a linear or a rotary actuator's quantities are called: its effort (force, N), its inertia (mass, kg).
+
+    Examples
+    --------
+    >>> LINEAR.damping, ROTARY.damping, ROTARY.stiffness, ROTARY.impulse
+    ('N s/m', 'N m s/rad', 'N m/rad', 'N m s')
+
+    """
+
+    word: str
+    unit: str
+    place: str
+    inertia_word: str
+    inertias: str
+    inertia: str
+
+    @property
+    def stiffness(self) -> str:
+        """The unit of effort over place."""
+        return f"{self.unit}/{self.place}"
+
+    @property
+    def damping(self) -> str:
+        """The unit of effort over speed."""
+        return f"{self.unit} s/{self.place}"
+
+    @property
+    def impulse(self) -> str:
+        """The unit of effort times time."""
+        return f"{self.unit} s"
+
+    @property
+    def gain(self) -> str:
+        """The unit of effort over effort."""
+        return f"{self.unit}/({self.unit})" if " " in self.unit else f"{self.unit}/{self.unit}"
+
+
+LINEAR = Mechanics(word="force", unit="N", place="m", inertia_word="mass", inertias="masses", inertia="kg")
+ROTARY = Mechanics(
+    word="torque", unit="N m", place="rad", inertia_word="inertia", inertias="inertias", inertia="kg m^2"
+)
+
+
+def mechanics_of(unit: str) -> Mechanics:
+    """Return how quantities are called where efforts, or places, have a unit: N or m, N m or rad.
+
+    Examples
+    --------
+    >>> mechanics_of("N m").word, mechanics_of("rad").inertia, mechanics_of("N").word
+    ('torque', 'kg m^2', 'force')
+
+    """
+    return ROTARY if unit in (ROTARY.unit, ROTARY.place) else LINEAR

@@ -11,9 +11,9 @@ from seaopt.errors import ControlError
 
 MAX_BANDWIDTHS = 200
 FRONTIER_NOTE = (
-    "noise gain: peak of |F_m/noise on the force|, N/N; Ms: of the worst plant; disturbance: integral of |S| over ln f "
-    "from 0.1 Hz to the bandwidth, worst plant; |S| < -3 dB: up to here; force limit: largest reference at that "
-    "frequency before the current saturates"
+    "noise gain: peak of |F_m/noise on the {word}|, {gain}; Ms: of the worst plant; disturbance: integral of |S| "
+    "over ln f from 0.1 Hz to the bandwidth, worst plant; |S| < -3 dB: up to here; {word} limit: largest reference "
+    "at that frequency before the current saturates"
 )
 
 
@@ -49,4 +49,5 @@ def parse_bandwidths(text: str) -> tuple[float, ...]:
 def print_frontier(frontier: Frontier, console: Console) -> None:
     """Print a row per bandwidth, and what its columns mean."""
     console.print(repr(frontier), highlight=False, markup=False)
-    console.print(FRONTIER_NOTE, style="dim", highlight=False, markup=False)
+    called = frontier.mechanics
+    console.print(FRONTIER_NOTE.format(word=called.word, gain=called.gain), style="dim", highlight=False, markup=False)

@@ -128,7 +128,7 @@ def _describe_drive(pair: Pair, drive: DriveEstimate) -> str:
     form = pair.second_order
     assert form is not None
     return (
-        f"{pair.name} as (16), per newton of motor force: {drive.K.value:.5g}/(s² + {form.a.value:.4g} s + "
+        f"{pair.name} as (16), per unit of what the motor gives: {drive.K.value:.5g}/(s² + {form.a.value:.4g} s + "
         f"{form.b.value:.5g})\n"
         f"  with k known: m_k = {drive.m_k}, b_m = {drive.b_m}, efficiency {drive.efficiency}\n"
         f"  K and b averaged, as the paper does: m_k = {drive.m_k_averaged}, b_m = {drive.b_m_averaged}"

@@ -33,6 +33,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, make_model
+from seaopt.units import LINEAR, Mechanics
 
 MIN_COHERENCE = 0.8  # lines of less coherence are not fitted
 MIN_LINES = 8  # the fewest lines that a fit is made of
@@ -55,12 +56,12 @@ class Uncertain:
 
 @record
 class DriveEstimate:
-    """Parameters that a second-order form implies for a linear actuator with both links fixed and k known.
+    """Parameters that a second-order form implies for an actuator with both links fixed and k known.
 
     Parameters
     ----------
     m_k, b_m : Uncertain
-        Sprung mass (kg) and damping (N s/m) with k/m_k = b.
+        Sprung mass (kg) and damping (N s/m) with k/m_k = b; of a rotary one inertia (kg m^2) and N m s/rad.
     efficiency : Uncertain
         Static gain of F1/F_m, eta.
     m_k_averaged, b_m_averaged : Uncertain
@@ -148,7 +149,7 @@ class SecondOrder:
         """Return the response from input samples to output samples at frequencies in Hz."""
         return sampled_response(_form(), self.values[:3], self.clock, f)[0][:, 0]
 
-    def drive(self, k: float, force_per_input: float, k_std: float = 0.0) -> DriveEstimate:
+    def drive(self, k: float, force_per_input: float, k_std: float = 0.0, called: Mechanics = LINEAR) -> DriveEstimate:
         """Return the actuator's parameters that the form implies.
 
         Parameters
@@ -157,6 +158,8 @@ class SecondOrder:
             Stiffness and its standard deviation, N/m.
         force_per_input : float
             Motor force over input, K_tau/r in N/A by (3); 1 where the input is the force.
+        called : Mechanics
+            The actuator's units.
 
         Examples
         --------
@@ -177,11 +180,11 @@ class SecondOrder:
             return _propagate(of, point, whole, unit)
 
         return DriveEstimate(
-            m_k=figure(lambda v: v[4] / v[2], "kg"),
-            b_m=figure(lambda v: v[1] * v[4] / v[2], "N s/m"),
+            m_k=figure(lambda v: v[4] / v[2], called.inertia),
+            b_m=figure(lambda v: v[1] * v[4] / v[2], called.damping),
             efficiency=figure(lambda v: v[0] / force_per_input / v[2], "-"),
-            m_k_averaged=figure(lambda v: 2 * v[4] / (v[0] / force_per_input + v[2]), "kg"),
-            b_m_averaged=figure(lambda v: 2 * v[1] * v[4] / (v[0] / force_per_input + v[2]), "N s/m"),
+            m_k_averaged=figure(lambda v: 2 * v[4] / (v[0] / force_per_input + v[2]), called.inertia),
+            b_m_averaged=figure(lambda v: 2 * v[1] * v[4] / (v[0] / force_per_input + v[2]), called.damping),
             K=figure(lambda v: v[0] / force_per_input, "1/s^2"),
         )
 

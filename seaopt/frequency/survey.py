@@ -31,6 +31,7 @@ from seaopt.plants import Plant, SeriesSpring
 from seaopt.plants.plant import evaluate
 from seaopt.records import record
 from seaopt.simulation import Clock, linearise, make_model
+from seaopt.units import mechanics_of
 
 MIN_RESPONSE_SAMPLES = 256  # samples
 SMOOTH = 5  # lines of which the median coherence decides where a band ends
@@ -150,7 +151,9 @@ class Survey:
             else self.plant.complete(values.update(**{actuation.efficiency: 1.0}))
         )
         per_input = evaluate(actuation.effort, lossless) * self.gain.get(pair.output, 1.0)
-        return pair.second_order.drive(k.value, per_input, k_std=k.std or k.prior_std or 0.0)
+        return pair.second_order.drive(
+            k.value, per_input, k_std=k.std or k.prior_std or 0.0, called=mechanics_of(actuation.unit)
+        )
 
     def to_dict(self, params: ParameterSet) -> dict[str, Any]:
         """Return one experiment's part of frf.json; `params` are the values that models are drawn with."""

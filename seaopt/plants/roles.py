@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from seaopt.records import record
+from seaopt.units import mechanics_of
 
 Expression = Callable[[Any], Any]  # of the parameters p
 StateExpression = Callable[[Any, Any], Any]  # of the states x and the parameters p
@@ -163,7 +164,7 @@ class Friction:
     @property
     def slope_unit(self) -> str:
         """The unit of the curve's slope: N s/m, or N m s/rad of a torque."""
-        return f"{self.unit} s/{'rad' if self.unit.endswith(' m') else 'm'}"
+        return mechanics_of(self.unit).damping
 
 
 @record(eq=False)

@@ -136,9 +136,9 @@ def _reading(pair: Pair, drive: DriveEstimate, mass: DerivedFigure, damping: Der
     averaged = ""
     if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:
         averaged = (
-            f" The form's static gain is {drive.efficiency.value:.3f} of the motor force, not 1: averaging K and b, as "
-            f"the paper does, would give m_k = {drive.m_k_averaged.value:.4g} kg and "
-            f"b_m = {drive.b_m_averaged.value:.5g} N s/m."
+            f" The form's static gain is {drive.efficiency.value:.3f} of what the motor gives, not 1: averaging K and "
+            f"b, as the paper does, would give m_k = {drive.m_k_averaged.value:.4g} {drive.m_k_averaged.unit} and "
+            f"b_m = {drive.b_m_averaged.value:.5g} {drive.b_m_averaged.unit}."
         )
     return (
         f"Read as (16) with k known, {pair.name} gives m_k = {drive.m_k} and b_m = {drive.b_m}; the fit in time "

@@ -10,12 +10,12 @@ from seaopt.control import Frontier
 
 MET, MISSED = "#0072b2", "#d55e00"
 PANELS = (
-    ("noise_gain", "noise gain [N/N]"),
+    ("noise_gain", "noise gain [{called.gain}]"),
     ("ms", "largest Ms of all plants"),
     ("disturbance", "disturbance: integral of |S| over ln f"),
     ("phase_margin_deg", "phase margin [deg]"),
     ("disk_margin", "disk margin"),
-    ("force_limit_N", "largest force at the bandwidth [N]"),
+    ("force_limit_N", "largest {called.word} at the bandwidth [{called.unit}]"),
 )
 
 
@@ -27,7 +27,7 @@ def frontier_figure(frontier: Frontier) -> Figure:
     for axis, (name, title) in zip(axes.ravel(), PANELS, strict=True):
         values = [getattr(row, name) for row in frontier.rows]
         shown = [(x, y, row.feasible) for x, y, row in zip(f, values, frontier.rows, strict=True) if y is not None]
-        axis.set_title(title, fontsize="medium")
+        axis.set_title(title.format(called=frontier.mechanics), fontsize="medium")
         axis.grid(visible=True, color="#e4e4e4", linewidth=0.5)
         axis.spines[["top", "right"]].set_visible(False)
         axis.plot([x for x, _, _ in shown], [y for _, y, _ in shown], color="#b0b0b0", linewidth=1.0, zorder=1)

@@ -33,7 +33,8 @@ _CAPTIONS = {
     "residual": "Residuals and their correlations; shaded: what one lag of a hundred exceeds by chance",
     "ranking": "Residuals of the fits that are compared, octave by octave",
     "loop": "The closed loop on every plant",
-    "simulation": "Force and current of each scenario; grey: link 2 is held; yellow: the judged window of a failed run",
+    "simulation": "Force or torque, and current, of each scenario; grey: link 2 is held; yellow: the judged window of "
+    "a failed run",
     "bandwidth": "Bandwidth against amplitude",
     "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
     "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
@@ -235,10 +236,10 @@ def _describe_forces(controller: Controller | None) -> str:
     if controller is None or slow is None:
         return ""
     band = controller.spec.bandwidth_hz
-    fast = controller.force_limit(band)
+    fast, unit = controller.force_limit(band), controller.command.effort_unit
     return (
-        f"The current limit of {controller.spec.current_limit_A:g} A allows a reference of {format_number(slow)} N at "
-        f"rest and {format_number(fast)} N at {band:g} Hz, whatever the gains."
+        f"The current limit of {controller.spec.current_limit_A:g} A allows a reference of {format_number(slow)} "
+        f"{unit} at rest and {format_number(fast)} {unit} at {band:g} Hz, whatever the gains."
     )
 
 

@@ -26,7 +26,7 @@ HELD_COLOUR, JUDGED_COLOUR = "#f1f1f1", "#fdf3d8"
 
 
 def verification_figure(verification: Verification, plant: str) -> Figure:
-    """Draw force and current of each scenario on one plant: the run that failed, or has the largest force.
+    """Draw force (torque) and current of each scenario on one plant: the run that failed, or has the largest force.
 
     Of a run that passed the end of the last phase is left out; a run that failed is drawn whole, with the window that
     it is judged in.
@@ -52,7 +52,7 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
         cut = "" if visible.all() else f", {time[-1]:.2g} of {trace.time[-1]:.3g} s"
         verdict = cut if row.passed else ": FAILED"
         left.set_title(f"{row.scenario}{draw}{verdict}", fontsize="medium", loc="left")
-        left.set_ylabel(f"{name} [N]")
+        left.set_ylabel(f"{name} [{verification.mechanics.unit}]")
         right.set_ylabel("current [A]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
@@ -91,13 +91,13 @@ def large_signal_figure(sweeps: Sequence[LargeSignal]) -> Figure:
         for amplitude, gain, hit, shade in zip(sweep.amplitude_N, sweep.gain, sweep.saturated, shades, strict=True):
             colour = (shade * 0.75, 0.30 + shade * 0.55, 0.55 + shade * 0.4)
             size = 20 * np.log10(np.maximum(np.abs(gain), 1e-6))
-            left.semilogx(sweep.frequency_hz, size, color=colour, linewidth=1.3, label=f"{amplitude:.3g} N")
+            left.semilogx(sweep.frequency_hz, size, color=colour, linewidth=1.3, label=f"{amplitude:.3g} {sweep.unit}")
             left.semilogx(sweep.frequency_hz[hit], size[hit], ".", color=colour, markersize=5)
         left.axhline(-3.0103, color="#444444", linestyle=":", linewidth=0.9)
         left.legend(frameon=False, fontsize="small")
         left.set_title(f"{sweep.plant}: |F/F_ref| [dB]; dots: saturated", fontsize="medium", loc="left")
         right.loglog(sweep.frequency_hz, sweep.onset_N, color=MODEL, linewidth=1.3)
-        right.set_title("amplitude at which the current saturates [N]", fontsize="medium", loc="left")
+        right.set_title(f"amplitude at which the current saturates [{sweep.unit}]", fontsize="medium", loc="left")
         for axis in (left.xaxis, right.xaxis, right.yaxis):
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -128,7 +128,9 @@ def bandwidth_figure(sweeps: Sequence[LargeSignal]) -> Figure:
         one.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         one.set_minor_formatter(NullFormatter())
-    axis.set_xlabel("amplitude of the reference [N]; dotted: dry friction; squares: the current saturates in the sweep")
+    unit = " or ".join(dict.fromkeys(sweep.unit for sweep in sweeps))
+    marks = "dotted: dry friction; squares: the current saturates in the sweep"
+    axis.set_xlabel(f"amplitude of the reference [{unit}]; {marks}")
     axis.set_ylabel("bandwidth [Hz]")
     axis.legend(frameon=False, fontsize="small")
     return figure
@@ -153,16 +155,18 @@ def stability_figure(stability: StabilityMap) -> Figure:
         if len(edge):
             axis.plot(edge[:, 0], edge[:, 1], ".", color=PLANT_COLOURS[1], markersize=3)
         share = 100.0 * float(np.mean(stable))
-        axis.set_title(f"damper {damping:g} N s/m: stable in {share:.3g} %", fontsize="medium", loc="left")
+        axis.set_title(
+            f"damper {damping:g} {stability.called.damping}: stable in {share:.3g} %", fontsize="medium", loc="left"
+        )
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.minorticks_off()  # hundreds over these decades, behind the map, and slow to draw
     for axis in axes.ravel()[stability.damping.size :]:
         axis.set_visible(False)
     for axis in axes[-1]:
-        axis.set_xlabel("mass on link 2 [kg]")
+        axis.set_xlabel(f"{stability.called.inertia_word} on link 2 [{stability.called.inertia}]")
     for axis in axes[:, 0]:
-        axis.set_ylabel("spring to ground [N/m]")
+        axis.set_ylabel(f"spring to ground [{stability.called.stiffness}]")
     return figure
 
 

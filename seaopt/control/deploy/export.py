@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from seaopt.control.laws.controller import GAIN_UNITS, Controller
+from seaopt.control.laws.controller import Controller, name_gain_units
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, realise
 from seaopt.control.laws.verdict import join_labels
@@ -39,7 +39,7 @@ RESERVED = (
     "stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype"
 )
 FIGURES = {
-    "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g} N/N",
+    "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g}",
     "gain_margin_db": "gain margin {:.4g} dB", "phase_margin_deg": "phase margin {:.4g} deg",
 }  # fmt: skip
 
@@ -185,6 +185,8 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     return {
         "structure": _strip_markup(stored["structure"]),
         "measured": _strip_markup(stored["spec"].measured),
+        "effort": stored["command"].mechanics.word,
+        "suffix": stored["command"].effort_unit.replace(" ", ""),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         "delay_samples": stored["delay_samples"],
         "feasible": stored["feasible"],
@@ -224,6 +226,7 @@ def _numbers(
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
     rest, transfer_functions = law.rest(), stored["law"].transfer_functions()
+    units = name_gain_units(stored["command"])
     largest = float(LARGEST_NUMBER[precision])
     return {
         "a": [row(values) for values in law.a] or [number(0.0)],
@@ -235,7 +238,7 @@ def _numbers(
         "anti_windup": row(law.anti_windup),
         "rest_reference": row(rest[0]),
         "rest_measurement": row(rest[1]),
-        "force_limit_N": number(min(law.force_limit_N, largest)),
+        "effort_limit": number(min(law.force_limit_N, largest)),
         "current_limit_A": number(min(law.current_limit_A, largest)),
         "per_effort": number(law.per_effort),
         "per_effort_unit": stored["command"].per_effort_unit,
@@ -250,7 +253,7 @@ def _numbers(
         },
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
-            {"name": _identifier(key), "value": number(float(value)), "unit": GAIN_UNITS.get(key, "")}
+            {"name": _identifier(key), "value": number(float(value)), "unit": units.get(key, "")}
             for key, value in stored["gains"].items()
         ],
         "transfer_functions": [

@@ -12,6 +12,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import describe_parameters, evaluate
 from seaopt.records import record
+from seaopt.units import Mechanics, mechanics_of
 
 
 @record
@@ -33,6 +34,11 @@ class Command:
     unit: str
     per_effort: float
     effort_unit: str
+
+    @property
+    def mechanics(self) -> Mechanics:
+        """Units and words of the effort and of what it moves."""
+        return mechanics_of(self.effort_unit)
 
     @property
     def per_effort_unit(self) -> str:

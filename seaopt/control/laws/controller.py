@@ -44,7 +44,7 @@ from seaopt.records import record
 
 FRICTION_MARGIN = "friction_margin"  # among what controller.json says is achieved
 CONTROLLER_SCHEMA = "seaopt/controller/2"
-GAIN_UNITS = {"k_p": "N/N", "k_i": "1/s", "k_d": "s", "T_f": "s", "k_r": "N/N", "c": "", "T_q": "s"}
+GAIN_UNITS = {"k_i": "1/s", "k_d": "s", "T_f": "s", "T_q": "s"}  # besides those of effort over effort
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SAME_POLE = 1e-3  # to which poles that are equal are computed
 NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
@@ -127,8 +127,9 @@ class Controller:
         else:
             filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
         return MeasuredLoop(
-            name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral
-        )
+            name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral,
+            effort_unit=self.command.effort_unit,
+        )  # fmt: skip
 
     def _add_friction(self, loop: MeasuredLoop) -> MeasuredLoop:
         """Return the design plant's loop with its friction margin, where it has friction."""
@@ -184,12 +185,13 @@ class Controller:
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
-        k_d, T_f = self.gains["k_d"], self.gains["T_f"]
+        k_d, T_f, called = self.gains["k_d"], self.gains["T_f"], self.command.mechanics
         if self.spec.level("max_noise_gain") is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
             return ()
         return (
-            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 N of noise on "
-            f"{self.spec.measured} makes up to {self.achieved.noise_gain:.3g} N of motor force; give max_noise_gain",
+            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 {called.unit} of "
+            f"noise on {self.spec.measured} makes up to {self.achieved.noise_gain:.3g} {called.unit} of motor "
+            f"{called.word}; give max_noise_gain",
         )
 
     @property
@@ -359,8 +361,9 @@ class Controller:
 
     def _gain_lines(self) -> list[str]:
         law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
+        units = name_gain_units(self.command)
         lines = [
-            "  " + ", ".join(f"{name} = {value:.5g} {GAIN_UNITS[name]}".rstrip() for name, value in law.items()),
+            "  " + ", ".join(f"{name} = {value:.5g} {units.get(name, '')}".rstrip() for name, value in law.items()),
             "  as current: " + ", ".join(
                 f"{name} = {value:.5g} {unit}" for name, (value, unit) in self.engineering.items()
             ),
@@ -378,13 +381,15 @@ class Controller:
         if slow is None or fast is None:
             return []
         limit, band = self.spec.current_limit_A, self.spec.bandwidth_hz
-        return [f"  {limit:g} A allow a reference of {slow:.4g} N at rest and {fast:.4g} N at {band:g} Hz"]
+        unit = self.command.effort_unit
+        return [f"  {limit:g} A allow a reference of {slow:.4g} {unit} at rest and {fast:.4g} {unit} at {band:g} Hz"]
 
     def _repr_html_(self) -> str:
         head, *_ = repr(self).splitlines()
         current = {name: f"{value:.5g} {unit}" for name, (value, unit) in self.engineering.items()}
+        units = name_gain_units(self.command)
         gains = [
-            (name, f"{value:.5g} {GAIN_UNITS.get(name, '')}".rstrip(), current.get(name, "–"))
+            (name, f"{value:.5g} {units.get(name, '')}".rstrip(), current.get(name, "–"))
             for name, value in self.gains.items()
         ]
         explanation = [] if self.feasible else [self.explanation]
@@ -407,6 +412,11 @@ class Controller:
             ("phase margin", format_figure(a.phase_margin_deg, "deg"), ""),
             ("delay margin", format_figure(a.delay_margin_ms, "ms"), ""),
         ]
+
+
+def name_gain_units(command: Command) -> dict[str, str]:
+    """Return the units of the gains of a law that gives efforts, by name; what is not there has none."""
+    return GAIN_UNITS | dict.fromkeys(("k_p", "k_r"), command.mechanics.gain)
 
 
 def _format_allowed(row: DesignFigure) -> str:

@@ -54,6 +54,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
+from seaopt.units import LINEAR, ROTARY, mechanics_of
 
 Curve = Callable[[Frequencies], Any]
 LOWEST_PASSIVE_HZ = 0.01
@@ -84,6 +85,8 @@ class Passivity:
         Re Z/abs(Z) there, from -1 to 1.
     limit_hz : float or None
         From here the fed-back force and the force at the port oppose each other; None where they never do.
+    unit : str
+        Of the damping: N s/m, or N m s/rad at a port that turns.
 
     """
 
@@ -96,6 +99,7 @@ class Passivity:
     least_hz: float
     least_cosine: float
     limit_hz: float | None
+    unit: str = LINEAR.damping
 
     def holds(self, band_hz: tuple[float, float]) -> bool:
         """Tell whether Re Z >= 0 throughout a band.
@@ -126,10 +130,11 @@ class Passivity:
         if self.violated_hz is not None:
             lines.append(
                 f"  violated from {self.violated_hz:.4g} Hz, most at {self.least_hz:.4g} Hz: Re Z = "
-                f"{self.least_damping_N_s_per_m:.4g} N s/m, {self.least_cosine:.3g} of |Z|"
+                f"{self.least_damping_N_s_per_m:.4g} {self.unit}, {self.least_cosine:.3g} of |Z|"
             )
         if self.limit_hz is not None:
-            lines.append(f"  from {self.limit_hz:.4g} Hz the fed-back force opposes the force at the port")
+            word = ROTARY.word if self.unit == ROTARY.damping else LINEAR.word
+            lines.append(f"  from {self.limit_hz:.4g} Hz the fed-back {word} opposes the {word} at the port")
         return "\n".join(lines)
 
 
@@ -197,6 +202,7 @@ def passivity(
         least_hz=float(f[least]),
         least_cosine=float(np.real(z[least]) / max(abs(z[least]), TINY)),
         limit_hz=_find_limit(port, f),
+        unit=mechanics_of(port.place_unit).damping,
     )
 
 

@@ -10,6 +10,7 @@ from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.records import record
+from seaopt.units import LINEAR
 
 Frequencies = Float[np.ndarray, " m"]
 Response = Complex[np.ndarray, " m"]
@@ -52,6 +53,8 @@ class PortModel:
         The inertia on the port (kg or kg m^2), which is taken off again.
     delay_s : float
         Of the motor, besides the controller's.
+    place_unit : str
+        Of the port's motion: m or rad.
 
     """
 
@@ -62,6 +65,7 @@ class PortModel:
     speed: int
     mass: float
     delay_s: float = 0.0
+    place_unit: str = LINEAR.place
 
     def response(self, f: Frequencies) -> PortResponse:
         """Return the responses to motor force and to motion, F_e being what that motion takes.
@@ -127,13 +131,13 @@ def probe_of(plant: Plant) -> Plant:
     """
     if plant.port is None:
         raise ControlError(
-            f"plant {plant.name} has no port at link 2; use high_impedance, moving_output or two_link, or give "
+            f"plant {plant.name} has no port at link 2; use high_impedance, moving_output, two_link or rotary, or give "
             "ports = (Port(..., probe=...),)"
         )
     if plant.port.probe is None:
         raise ControlError(
             f"the port of plant {plant.name} states no probe, by which its impedance is known; give Port(probe=...), "
-            "or use high_impedance, moving_output or two_link"
+            "or use high_impedance, moving_output, two_link or rotary"
         )
     return plant.port.probe()
 
@@ -164,6 +168,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
         speed=list(probe.states).index(port.rate),
         mass=values[port.inertia].value,
         delay_s=read_conditions(plant, params).get(DELAY, 0.0),
+        place_unit=probe.states[port.coordinate],
     )
 
 

@@ -56,6 +56,7 @@ from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
+from seaopt.units import mechanics_of
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
@@ -418,12 +419,13 @@ class ForceMPC:
 
     def __repr__(self) -> str:
         s, slew = self.spec, self.spec.current_slew_A_per_s
+        unit = self.design[0].outputs[s.measured]
         limits = f"{s.current_limit_A:g} A" + ("" if slew is None else f", {slew:g} A/s")
         verdict = "every limit met" if self.feasible else f"NOT FEASIBLE: {join_labels(self.broken)}"
         lines = [
             f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
             f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
-            f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} N",
+            f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} {unit}",
             f"  bandwidth {format_number(self.achieved.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}) "
             f"while no limit of the current is active; horizon {1e3 * s.horizon_s:g} ms, "
             f"{self.prediction.knots.size} free currents",
@@ -544,9 +546,11 @@ def _drive(plant: Plant) -> str:
 
 def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
     """Return N/A of the measured force, or say why it cannot be controlled so."""
+    unit = plant.outputs[spec.measured]
+    word = mechanics_of(unit).word
     if np.max(np.abs(np.linalg.eigvals(digital.a))) > 1.0 - 1e-9:
         raise ControlError(
-            f"{plant.name} does not come to rest by itself, so that no current belongs to a force; design on the stand"
+            f"{plant.name} does not come to rest by itself, so that no current belongs to a {word}; design on the stand"
         )
     gain = float(digital.c @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
     if abs(gain) < 1e-9:
@@ -554,12 +558,12 @@ def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
     if digital.d != 0.0:
         raise ControlError(
             f"{spec.measured} of {plant.name} follows the current at once (d = {digital.d:.3g}); "
-            "control the spring's force"
+            f"control the spring's {word}"
         )
     largest = abs(gain) * spec.current_limit_A
     if spec.largest_force_N is not None and spec.largest_force_N > largest:
         raise ControlError(
-            f"current_limit_A = {spec.current_limit_A:g} holds {largest:.4g} N, less than largest_force_N = "
+            f"current_limit_A = {spec.current_limit_A:g} holds {largest:.4g} {unit}, less than largest_force_N = "
             f"{spec.largest_force_N:g}; raise the one or lower the other"
         )
     return gain

@@ -21,6 +21,7 @@ from seaopt.errors import ControlError
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
+from seaopt.units import LINEAR
 
 Runs = Float[np.ndarray, " runs"]
 
@@ -35,6 +36,8 @@ class Equilibrium:
         Of plant, law and waiting commands.
     reference, force, current_A, energy_J : arrays, shape (runs,)
         F_ref and the measured output (N); the current; what the plant stores, zero where it declares no energy.
+    unit : str
+        Of reference and force: N, or N m of a torque.
 
     """
 
@@ -43,10 +46,11 @@ class Equilibrium:
     force: Runs
     current_A: Runs
     energy_J: Runs
+    unit: str = LINEAR.unit
 
     def __repr__(self) -> str:
         rows = zip(self.force, self.current_A, strict=True)
-        return "Equilibrium at " + ", ".join(f"{force:.4g} N, {current:.4g} A" for force, current in rows)
+        return "Equilibrium at " + ", ".join(f"{force:.4g} {self.unit}, {current:.4g} A" for force, current in rows)
 
 
 def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
@@ -86,15 +90,16 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
             continue
         y = np.array(observe(x, u, values.vector)).ravel()
         force = float(y[names.index(loop.measured)])
-        inner, reference = _law_at_rest(law, force, float(u[0]))
+        inner, reference = _law_at_rest(law, force, float(u[0]), plant.outputs[loop.measured])
         z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])
         figures[run] = reference, force, u[0], y[-1]
     reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
-    return Equilibrium(state=state, reference=reference, force=force, current_A=current, energy_J=energy)
+    unit = plant.outputs[loop.measured]
+    return Equilibrium(state=state, reference=reference, force=force, current_A=current, energy_J=energy, unit=unit)
 
 
-def _law_at_rest(law: RunnableLaw, force: float, current_A: float) -> tuple[Float[np.ndarray, " n"], float]:
+def _law_at_rest(law: RunnableLaw, force: float, current_A: float, unit: str) -> tuple[Float[np.ndarray, " n"], float]:
     """Return the law's state and the reference at which it commands a current, unlimited, under a constant force."""
     n = law.c.size
     left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
@@ -105,8 +110,8 @@ def _law_at_rest(law: RunnableLaw, force: float, current_A: float) -> tuple[Floa
         rest = np.full(n + 1, np.nan)
     if not np.all(np.isfinite(rest)):
         raise ControlError(
-            f"no reference makes the law command the {current_A:.4g} A that rest takes at {force:.4g} N; its reference "
-            "path is blocked at 0 Hz"
+            f"no reference makes the law command the {current_A:.4g} A that rest takes at {force:.4g} {unit}; its "
+            "reference path is blocked at 0 Hz"
         )
     return rest[:-1], float(rest[-1])
 

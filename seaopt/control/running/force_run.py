@@ -27,6 +27,7 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import output_function
 from seaopt.records import record
+from seaopt.units import LINEAR, mechanics_of
 
 State = TypeVar("State")
 FIRST_SUBSTEPS = 2  # coarse steps per sample to begin with
@@ -47,6 +48,8 @@ class ForceRun:
         Estimated integration error of the worst sample, over the state's largest value until then.
     substeps : int
         Integration steps per sample, at the end.
+    unit : str
+        Of reference and force: N, or N m of a torque.
 
     """
 
@@ -58,6 +61,7 @@ class ForceRun:
     state: Float[np.ndarray, "n nx"]
     error: float
     substeps: int
+    unit: str = LINEAR.unit
 
     @property
     def overshoot(self) -> float:
@@ -66,10 +70,11 @@ class ForceRun:
         return max(float(np.max((self.force - self.reference[-1]) / step)), 0.0)
 
     def __repr__(self) -> str:
+        unit, word = self.unit, mechanics_of(self.unit).word
         return (
-            f"ForceRun of {self.time.size} samples, {self.time[-1]:.4g} s: reference to {self.reference[-1]:.4g} N, "
-            f"force up to {np.max(np.abs(self.force)):.4g} N and {self.force[-1]:.4g} N at the end, current up to "
-            f"{np.max(np.abs(self.current)):.4g} A"
+            f"ForceRun of {self.time.size} samples, {self.time[-1]:.4g} s: reference to {self.reference[-1]:.4g} "
+            f"{unit}, {word} up to {np.max(np.abs(self.force)):.4g} {unit} and {self.force[-1]:.4g} {unit} at the end, "
+            f"current up to {np.max(np.abs(self.current)):.4g} A"
         )
 
     def settling_time_s(self, band: float = 0.02) -> float:
@@ -164,7 +169,7 @@ def close_loop(
         x = integrator.advance(time_s[k] + rest_s, x, inputs(k, k - newer), p, sample_time_s - rest_s)
     return ForceRun(
         time=time_s, reference=reference, force=force, current=current, law_time_s=law_time_s, state=states,
-        error=integrator.error, substeps=2 * integrator.substeps,
+        error=integrator.error, substeps=2 * integrator.substeps, unit=plant.outputs[measured],
     )  # fmt: skip
 
 

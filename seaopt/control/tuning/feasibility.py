@@ -121,5 +121,5 @@ def check_current(spec: ControllerSpec, k_ff: float, command: Command, friction:
     if spec.step_N is not None and spec.step_N > held:
         raise ControlError(
             f"step_N = {spec.step_N:g} takes {limit * spec.step_N / held:.4g} A at rest, more than current_limit_A = "
-            f"{limit:g}: no controller makes it; ask for {held:.4g} N at most"
+            f"{limit:g}: no controller makes it; ask for {held:.4g} {unit} at most"
         )

@@ -22,6 +22,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
+from seaopt.units import LINEAR, Mechanics
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
 MOST_ROWS = 1000
@@ -86,6 +87,11 @@ class Frontier:
     rows: tuple[FrontierRow, ...]
     controllers: tuple[Controller, ...]
 
+    @property
+    def mechanics(self) -> Mechanics:
+        """Units and words of what the controllers command."""
+        return self.controllers[0].command.mechanics if self.controllers else LINEAR
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of frontier.json (schema seaopt/frontier/1)."""
         return {
@@ -95,11 +101,13 @@ class Frontier:
         }
 
     def __repr__(self) -> str:
-        head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin", "force limit")
+        head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin")
+        called = self.mechanics
+        head = (*head, f"{called.word} limit")
         sticks = any(row.without_sticking for row in self.rows)
         cells = [
             [
-                *_cells(row),
+                *_cells(row, called.unit),
                 *([_friction_cost(row)] if sticks else []),
                 shorten_blocked(row.blocked_by) if row.blocked_by else "",
             ]
@@ -193,7 +201,7 @@ def _worst_disturbance(task: Task, x: LawNumbers) -> float:
     return max(disturbance(task.loop(x, i), task.spec.bandwidth_hz) for i in range(len(task.plants)))
 
 
-def _cells(row: FrontierRow) -> list[str]:
+def _cells(row: FrontierRow, unit: str) -> list[str]:
     """Return a row of the table."""
     return [
         f"{row.bandwidth_hz:g}",
@@ -203,7 +211,7 @@ def _cells(row: FrontierRow) -> list[str]:
         format_number(row.disturbance),
         format_figure(row.sensitivity_bandwidth_hz, "Hz", 3),
         MISSING if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg",
-        format_figure(row.force_limit_N, "N"),
+        format_figure(row.force_limit_N, unit),
     ]
 
 

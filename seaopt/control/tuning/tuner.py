@@ -196,8 +196,8 @@ def make_task(
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
         raise ControlError(
-            f"measured = {spec.measured}: the static gain of {plant.name} from motor force is {static:g}, which "
-            "feedforward cannot invert; tune on the stand and name this plant in robust_to"
+            f"measured = {spec.measured}: the static gain of {plant.name} from what the motor gives is {static:g}, "
+            "which feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
     names = tuple(name for name, _ in pairs)
     nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None

@@ -447,8 +447,8 @@ class Certificate:
         if not any(each.friction == "sticking" for chosen in self.runs.scenarios.values() for each in chosen):
             return ()
         return (
-            "steps were simulated with an ideal sensor: noise can free a joint that sticks, so that the force wanders; "
-            "call with_simulation(sensors=...), or give the problem file sensors",
+            "steps were simulated with an ideal sensor: noise can free a joint that sticks, so that what is regulated "
+            "wanders; call with_simulation(sensors=...), or give the problem file sensors",
         )
 
     def _worst_dict(self, name: str) -> dict[str, Any]:

@@ -277,7 +277,9 @@ def _format_large(sweep: LargeSignal) -> str:
     if sweep.friction_N:  # stuck, widest, saturated; the others are in the report
         widest = max(pairs, key=lambda pair: pair[1] or 0.0)
         pairs = [pair for pair in pairs if pair in (pairs[0], widest, pairs[-1])]
-    return ", ".join(f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.4g} N" for amplitude, hz in pairs)
+    return ", ".join(
+        f"{'–' if hz is None else f'{hz:.3g} Hz'} at {amplitude:.4g} {sweep.unit}" for amplitude, hz in pairs
+    )
 
 
 def _format_bands(port: Passivity) -> str:
@@ -286,14 +288,17 @@ def _format_bands(port: Passivity) -> str:
     bands = ", ".join(format_band(band, "Hz") for band in port.bands_hz) or "nowhere"
     if port.violated_hz is None:
         return bands
-    return f"{bands}; everywhere with a damper of {-port.least_damping_N_s_per_m:.3g} N s/m"
+    return f"{bands}; everywhere with a damper of {-port.least_damping_N_s_per_m:.3g} {port.unit}"
 
 
 def _format_environments(environments: StabilityMap) -> str:
     if environments.everywhere:
-        return f"stable against all of {environments.stable.size} masses on springs and dampers"
+        return f"stable against all of {environments.stable.size} {environments.called.inertias} on springs and dampers"
     shares = ", ".join(
         f"{np.count_nonzero(stable)} at {damping:g}"
         for damping, stable in zip(environments.damping, environments.stable, strict=True)
     )
-    return f"of {environments.stable[0].size} masses on springs, stable by damping (N s/m): {shares}"
+    called = environments.called
+    return (
+        f"of {environments.stable[0].size} {called.inertias} on springs, stable by damping ({called.damping}): {shares}"
+    )

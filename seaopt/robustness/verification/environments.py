@@ -1,5 +1,7 @@
 r"""Stability of the loop against an environment: mass, spring and damper on the plant's port, its other links held.
 
+On a port that turns the mass is an inertia (kg m^2), and spring and damper are N m/rad and N m s/rad.
+
 .. math:: F_{e2} = -k_e x_2 - d_e \dot x_2, \qquad m_2 \ddot x_2 = -F_2 + F_{e2}
 
 The plant with its environment is sampled exactly and closed with hold, delay and law. Its eigenvalues decide on
@@ -12,6 +14,7 @@ sampling are left out); this map does not, so that the two can differ near the N
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, TypeVar
@@ -29,21 +32,22 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
 Value = TypeVar("Value", float, Float[np.ndarray, " n"])
 
-MASSES_KG = (0.1, 1000.0)
-STIFFNESSES_N_PER_M = (1e1, 1e8)
-DAMPINGS_N_S_PER_M = (0.0, 10.0, 100.0, 1000.0)
+MASSES = {LINEAR: (0.1, 1000.0), ROTARY: (1e-4, 10.0)}
+STIFFNESSES = {LINEAR: (1e1, 1e8), ROTARY: (1e-2, 1e6)}
+DAMPINGS: Mapping[Mechanics, tuple[float, ...]] = {LINEAR: (0.0, 10.0, 100.0, 1000.0), ROTARY: (0.0, 0.01, 0.1, 1.0)}
 MAP_POINTS = 25
 EDGE_BISECTIONS = 30
-SPRING = Parameter(name="environment_stiffness", value=0.0, unit="N/m", min=0.0, description="k_e")
-DAMPER = Parameter(name="environment_damping", value=0.0, unit="N s/m", min=0.0, description="d_e")
+SPRING = Parameter(name="environment_stiffness", value=0.0, unit=LINEAR.stiffness, min=0.0, description="k_e")
+DAMPER = Parameter(name="environment_damping", value=0.0, unit=LINEAR.damping, min=0.0, description="d_e")
 
 
 @record
 class Environment:
-    """A mass m_2 (kg) on link 2, tied to the ground by k_e (N/m) and d_e (N s/m), and the loop against it.
+    """A mass m_2 on link 2, tied to the ground by k_e and d_e, and the loop against it, in the map's units.
 
     Parameters
     ----------
@@ -72,14 +76,17 @@ class StabilityMap:
     Parameters
     ----------
     mass, stiffness, damping : arrays, shapes (m,), (k,) and (d,)
-        The grid: kg, N/m, N s/m.
+        The grid: kg, N/m, N s/m, or kg m^2, N m/rad, N m s/rad.
     spectral_radius : array, shape (d, m, k)
     boundary : tuple of arrays, shape (n, 2), one per damping
-        Points (kg, N/m) of the edge of the stable region, each between two neighbours of the grid, by bisection.
+        Points (mass, stiffness) of the edge of the stable region, each between two neighbours of the grid, by
+        bisection.
     worst : Environment
         The environment of the grid with the fastest growth, or the least decay.
     fixed_stable : bool
         Whether the loop is stable with the link fixed.
+    called : Mechanics
+        Units and words of what is on the port.
 
     """
 
@@ -90,6 +97,7 @@ class StabilityMap:
     boundary: tuple[Float[np.ndarray, "_ 2"], ...]
     worst: Environment
     fixed_stable: bool
+    called: Mechanics = LINEAR
 
     @property
     def stable(self) -> Bool[np.ndarray, "d m k"]:
@@ -116,17 +124,20 @@ class StabilityMap:
         }
 
     def __repr__(self) -> str:
-        verdict = "stable" if self.everywhere else "NOT STABLE everywhere"
+        verdict, called = "stable" if self.everywhere else "NOT STABLE everywhere", self.called
         lines = [
-            f"Coupled stability at link 2: {verdict}, masses of {self.mass[0]:.3g} to {self.mass[-1]:.3g} kg on "
-            f"springs of {self.stiffness[0]:.3g} to {self.stiffness[-1]:.3g} N/m"
+            f"Coupled stability at link 2: {verdict}, {called.inertias} of {self.mass[0]:.3g} to {self.mass[-1]:.3g} "
+            f"{called.inertia} on springs of {self.stiffness[0]:.3g} to {self.stiffness[-1]:.3g} {called.stiffness}"
         ]
         for damping, stable in zip(self.damping, self.stable, strict=True):
-            lines.append(f"  damper {damping:g} N s/m: stable in {np.count_nonzero(stable)} of {stable.size}")
+            lines.append(
+                f"  damper {damping:g} {called.damping}: stable in {np.count_nonzero(stable)} of {stable.size}"
+            )
         w = self.worst
         growth = "which dies out" if w.doubling_s is None else f"which doubles in {w.doubling_s:.3g} s"
         lines.append(
-            f"  worst: {w.m_2:.4g} kg, {w.k_e:.4g} N/m, {w.d_e:.4g} N s/m, at {w.frequency_hz:.4g} Hz, {growth}"
+            f"  worst: {w.m_2:.4g} {called.inertia}, {w.k_e:.4g} {called.stiffness}, {w.d_e:.4g} {called.damping}, "
+            f"at {w.frequency_hz:.4g} Hz, {growth}"
         )
         return "\n".join([*lines, f"  link 2 fixed: {'stable' if self.fixed_stable else 'NOT STABLE'}"])
 
@@ -148,7 +159,11 @@ def attach_environment(plant: Plant) -> Plant:
     port = bare_port(probe)
     command, unit = next(iter(probe.inputs.items()))
     taken = {*probe.states, *probe.inputs, *probe.parameters, *probe.friction}
-    spring, damper = (_rename(parameter, taken) for parameter in (SPRING, DAMPER))
+    called = mechanics_of(probe.states[port.coordinate])
+    spring, damper = (
+        _rename(replace(parameter, unit=unit), taken)
+        for parameter, unit in ((SPRING, called.stiffness), (DAMPER, called.damping))
+    )
 
     def pull(x: Any, u: Any, p: Any) -> Any:
         force = -getattr(p, spring.name) * getattr(x, port.coordinate)
@@ -180,9 +195,9 @@ def coupled_stability(
     plant: Plant,
     parameters: ParameterSet,
     *,
-    masses_kg: tuple[float, float] = MASSES_KG,
-    stiffnesses_N_per_m: tuple[float, float] = STIFFNESSES_N_PER_M,
-    dampings_N_s_per_m: tuple[float, ...] = DAMPINGS_N_S_PER_M,
+    masses_kg: tuple[float, float] | None = None,
+    stiffnesses_N_per_m: tuple[float, float] | None = None,
+    dampings_N_s_per_m: tuple[float, ...] | None = None,
     points: int = MAP_POINTS,
 ) -> StabilityMap:
     """Map where a controller is stable against a mass on a spring and a damper at link 2.
@@ -193,10 +208,11 @@ def coupled_stability(
         The law.
     plant, parameters
         The actuator, sliding where it has friction; the environment's mass replaces its own link 2.
-    masses_kg, stiffnesses_N_per_m : (low, high)
-        Ranges, logarithmic. They exclude zero mass, where the actuator's own link moves freely.
-    dampings_N_s_per_m : tuple of float
-        Each has a map of its own.
+    masses_kg, stiffnesses_N_per_m : (low, high), optional
+        Ranges, logarithmic; kg m^2 and N m/rad of a port that turns. They exclude zero mass, where the actuator's own
+        link moves freely. `MASSES` and `STIFFNESSES` if left out.
+    dampings_N_s_per_m : tuple of float, optional
+        Each has a map of its own; N m s/rad of a port that turns. `DAMPINGS` if left out.
     points : int
         Points of the grid in each direction.
 
@@ -219,11 +235,14 @@ def coupled_stability(
     ((1, 5, 5), True)
 
     """
-    _check_grid(masses_kg, stiffnesses_N_per_m, dampings_N_s_per_m, points)
     coupled = attach_environment(take_sliding(plant, parameters))
-    values = coupled.complete(parameters).drop_conditions()
-    mass, stiffness = (np.geomspace(*ends, points) for ends in (masses_kg, stiffnesses_N_per_m))
-    damping = np.array(dampings_N_s_per_m, dtype=float)
+    values, called = _take_bare(coupled, parameters), mechanics_of(coupled.states[str(coupled.ports[0].coordinate)])
+    masses = MASSES[called] if masses_kg is None else masses_kg
+    stiffnesses = STIFFNESSES[called] if stiffnesses_N_per_m is None else stiffnesses_N_per_m
+    dampings = DAMPINGS[called] if dampings_N_s_per_m is None else dampings_N_s_per_m
+    _check_grid(masses, stiffnesses, dampings, points)
+    mass, stiffness = (np.geomspace(*ends, points) for ends in (masses, stiffnesses))
+    damping = np.array(dampings, dtype=float)
     d, m, k = np.meshgrid(damping, mass, stiffness, indexing="ij")
     radius = _compute_radii(controller, coupled, values, m.ravel(), k.ravel(), d.ravel()).reshape(d.shape)
     at = np.unravel_index(int(np.argmax(radius)), radius.shape)
@@ -234,8 +253,16 @@ def coupled_stability(
             for value, stable in zip(damping, radius <= GROWING, strict=True)
         ),
         worst=close_on_environment(controller, coupled, values, float(m[at]), float(k[at]), float(d[at])),
-        fixed_stable=_is_stable_fixed(controller, coupled, values),
+        fixed_stable=_is_stable_fixed(controller, coupled, values), called=called,
     )  # fmt: skip
+
+
+def _take_bare(coupled: Plant, parameters: ParameterSet) -> CompletedParameters:
+    """Return a coupled plant's values; the inertia on its port is the environment's, without the link's own bounds."""
+    (name,) = coupled.ports[0].payload
+    bare = Parameter(name=name, value=1.0, unit=coupled.parameter_unit(name))
+    given = parameters.given if isinstance(parameters, CompletedParameters) else parameters
+    return coupled.complete(given.with_parameters(bare)).drop_conditions()
 
 
 def close_on_environment(

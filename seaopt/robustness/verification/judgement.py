@@ -207,7 +207,7 @@ def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int,
     if np.max(current) > most * (1 + 1e-9):
         findings.add("current", f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
     for what, value, allowed, unit in (
-        (controller.spec.measured, force, scenario.max_force_N, "N"),
+        (controller.spec.measured, force, scenario.max_force_N, controller.command.effort_unit),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
         if allowed is not None and not value <= allowed:
@@ -260,7 +260,8 @@ def _judge_outbreak(
     before, after = max(float(np.max(off[:half])), float(np.max(alone))), float(np.max(off[half:]))
     allowed = OUTBREAK * before + OUTLIER * view.force_std()
     if not after <= allowed:
-        end = f"{after:.4g} N in the end, without noise by {np.max(alone):.4g} N"
+        unit = stage.controller.command.effort_unit
+        end = f"{after:.4g} {unit} in the end, without noise by {np.max(alone):.4g} {unit}"
         findings.add("outbreak", f"{name} is off by up to {end}")
 
 
@@ -287,7 +288,8 @@ def _judge_oscillation(
         if line is not None and (line.sustained or line.growing):
             findings.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
             what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
-            text = f"an oscillation of {line.amplitude:.3g} N at {line.frequency_hz:.4g} Hz {what}"
+            unit = stage.controller.command.effort_unit
+            text = f"an oscillation of {line.amplitude:.3g} {unit} at {line.frequency_hz:.4g} Hz {what}"
             findings.add("oscillation", text, line.amplitude)
             return
 
@@ -351,7 +353,7 @@ def _judge_step(
     """Judge a step from rest by its largest force, between samples too, and by when it has settled."""
     if scenario.settling_s is None:
         return
-    step, last = scenario.phases[-1].force_N, trace.last
+    step, last, unit = scenario.phases[-1].force_N, trace.last, stage.controller.command.effort_unit
     response, largest = _respond(stage, scenario, trace, run), _find_peak(stage, scenario, trace, run)
     outside = np.flatnonzero(np.abs(response[last] - 1.0) > SETTLED)
     settled = outside.size == 0 or outside[-1] + 1 < last.stop - last.start
@@ -363,20 +365,20 @@ def _judge_step(
         findings.figures.update(overshoot_by_limit=by_limit)
         if not by_limit:
             over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
-            text = f"a step of {step:.3g} N overshoots by {over}, {most} are allowed"
+            text = f"a step of {step:.3g} {unit} overshoots by {over}, {most} are allowed"
             if scenario.friction == "sticking":  # with the integral that has grown until friction lets go
                 text += '; tune with reference_weights = "measurement" or objective = "noise", whose integral is slower'
             findings.add("overshoot", text, largest, allowed)
     if settling_s > scenario.settling_s:
         when = f"after {settling_s:.3g} s" if settled else "not at all"
-        text = f"a step of {step:.3g} N settles {when}, {scenario.settling_s:.3g} s are allowed"
+        text = f"a step of {step:.3g} {unit} settles {when}, {scenario.settling_s:.3g} s are allowed"
         findings.add("settling", text, settling_s, scenario.settling_s)
 
 
 def _judge_final_error(
     stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, findings: _Findings
 ) -> None:
-    last, name = trace.last, stage.controller.spec.measured
+    last, name, called = trace.last, stage.controller.spec.measured, stage.controller.command.mechanics
     end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
     error, alone = (float(np.mean(_error(scenario, one, run, one.outputs[name][run])[end])) for one in (trace, twin))
     findings.figures["final_error_N"] = error
@@ -385,7 +387,10 @@ def _judge_final_error(
         if scenario.final_error is not None and not abs(value) <= scenario.final_error + more:
             allowed = scenario.final_error + more
             side = "below" if value > 0.0 else "above"
-            text = f"the force ends {abs(value):.4g} N {side} its reference{what}, {allowed:.4g} N are allowed"
+            word, unit = called.word, called.unit
+            text = (
+                f"the {word} ends {abs(value):.4g} {unit} {side} its reference{what}, {allowed:.4g} {unit} are allowed"
+            )
             findings.add("steady error", text, abs(value), allowed)
             return
 

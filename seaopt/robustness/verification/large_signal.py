@@ -31,6 +31,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import find_dry_friction, take_sliding
 from seaopt.records import record
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
+from seaopt.units import LINEAR
 
 MEASURED_PERIODS, SETTLING_PERIODS = 6, 12
 LEAST_SETTLING_S = 0.6
@@ -66,6 +67,8 @@ class LargeSignal:
         The same by describing functions.
     friction_N : float
         The dry friction, as an effort at the spring; zero where there is none.
+    unit : str
+        Of the amplitudes: N, or N m.
 
     """
 
@@ -78,6 +81,7 @@ class LargeSignal:
     bandwidth_hz: tuple[float | None, ...]
     predicted_hz: tuple[float | None, ...]
     friction_N: float
+    unit: str = LINEAR.unit
 
     def to_dict(self) -> dict[str, Any]:
         """Return amplitudes, bandwidths and the saturation map, for robustness.json."""
@@ -91,7 +95,7 @@ class LargeSignal:
         }
 
     def __repr__(self) -> str:
-        dry = f", dry friction {self.friction_N:.4g} N" if self.friction_N else ""
+        dry = f", dry friction {self.friction_N:.4g} {self.unit}" if self.friction_N else ""
         lines = [f"Bandwidth against amplitude on {self.plant}{dry}"]
         for amplitude, band, predicted, hit in zip(
             self.amplitude_N, self.bandwidth_hz, self.predicted_hz, self.saturated, strict=True
@@ -99,7 +103,7 @@ class LargeSignal:
             bandwidth = "not within the sweep" if band is None else f"{band:.4g} Hz"
             bandwidth += "" if predicted is None else f" (predicted {predicted:.4g} Hz)"
             from_hz = f", saturates from {self.frequency_hz[np.argmax(hit)]:.4g} Hz" if np.any(hit) else ""
-            lines.append(f"  {amplitude:.4g} N: {bandwidth}{from_hz}")
+            lines.append(f"  {amplitude:.4g} {self.unit}: {bandwidth}{from_hz}")
         return "\n".join(lines)
 
     _repr_html_ = html_text
@@ -189,7 +193,7 @@ def large_signal(
         plant=plant.name, frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
         bandwidth_hz=tuple(_find_bandwidth(f, np.abs(row), static, plant.moves) for row in gain),
         predicted_hz=tuple(_find_bandwidth(dense, row, static, plant.moves) for row in predicted),
-        friction_N=friction,
+        friction_N=friction, unit=controller.command.effort_unit,
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ and commands at rest, a reference of zero. What is left after many periods has f
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from seaopt.robustness.verification.judgement import NOMINAL
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.play_cycles import predict_play_cycles
 from seaopt.robustness.verification.verification import Verification
+from seaopt.units import LINEAR
 
 PUSH = 1.5  # times the predicted cycle, where a run starts
 PERIODS, LEAST_S, LONGEST_S = 60.0, 1.0, 30.0  # of the predicted cycle, that a run lasts
@@ -47,6 +48,8 @@ class FoundCycle:
         Why there is no simulation; empty where there is one.
     found_by : str
         Where the simulation started: there, or with which step.
+    unit : str
+        Of the amplitudes: N, or N m.
 
     """
 
@@ -56,6 +59,7 @@ class FoundCycle:
     runs_away: bool = False
     found_by: str = "there"
     not_simulated: str = ""
+    unit: str = LINEAR.unit
 
     @property
     def lasts(self) -> bool:
@@ -85,14 +89,16 @@ class FoundCycle:
         parts: list[str] = []
         if self.predicted is not None:
             kind = "a stable" if self.predicted.stable else "an unstable"
-            size = f"{self.predicted.force_N:.3g} N at {self.predicted.frequency_hz:.3g} Hz"
+            size = f"{self.predicted.force_N:.3g} {self.unit} at {self.predicted.frequency_hz:.3g} Hz"
             parts.append(f"the describing function predicts {kind} oscillation of {size}")
         if self.not_simulated:
             parts.append(f"its simulation failed: {self.not_simulated}")
         elif self.runs_away:
             parts.append(f"simulated from {self.found_by} it grows without end")
         elif self.simulated_N is not None:
-            parts.append(f"simulated from {self.found_by}: {self.simulated_N:.3g} N at {self.simulated_hz:.3g} Hz")
+            parts.append(
+                f"simulated from {self.found_by}: {self.simulated_N:.3g} {self.unit} at {self.simulated_hz:.3g} Hz"
+            )
         else:
             parts.append(f"simulated from {self.found_by} it dies out")
         return "; ".join(parts)
@@ -107,7 +113,8 @@ def seek_limit_cycles(
     """
     predicted = () if shown else predict_limit_cycles(controller, plant, params)
     predicted += predict_play_cycles(controller, plant, params)
-    return tuple(_simulate(controller, plant, params, cycle) for cycle in predicted)
+    unit = controller.command.effort_unit
+    return tuple(replace(_simulate(controller, plant, params, cycle), unit=unit) for cycle in predicted)
 
 
 def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
@@ -118,6 +125,7 @@ def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
             simulated_N=row.limit_cycle_N,
             simulated_hz=row.limit_cycle_hz,
             found_by=f"the {row.scenario}",
+            unit=runs.mechanics.unit,
         )
         for row in runs.rows
         if row.plant == plant and row.draw == NOMINAL and row.limit_cycle_N is not None

@@ -19,6 +19,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_breakaway, find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
+from seaopt.units import LINEAR, Mechanics
 
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
@@ -137,13 +138,12 @@ class Scenario:
                 f'scenario "{self.name}": friction = "{self.friction}" is not known; use "smooth" or "sticking"'
             )
 
-    @property
-    def size(self) -> str:
-        """Its magnitudes as text: forces, blows, loads and initial state.
+    def describe_size(self, called: Mechanics = LINEAR) -> str:
+        """Return its magnitudes as text: forces (or torques), blows, loads and initial state.
 
         Examples
         --------
-        >>> Scenario(name="knock", phases=(Phase(duration_s=1.0, force_N=50.0), Phase(duration_s=1.0))).size
+        >>> Scenario(name="knock", phases=(Phase(duration_s=1.0, force_N=50.0), Phase(duration_s=1.0))).describe_size()
         '50 N'
 
         """
@@ -151,7 +151,8 @@ class Scenario:
         waves = [wave.amplitude for phase in self.phases for wave in phase.excitation if isinstance(wave, Chirp)]
         blows = [abs(phase.impulse_Ns) for phase in self.phases if phase.impulse_Ns]
         loads = {n: f for phase in reversed(self.phases) for n, f in phase.scale.items()}
-        parts = [f"{max(sizes):.4g} {unit}" for sizes, unit in ((forces + waves, "N"), (blows, "N s")) if sizes]
+        quantities = ((forces + waves, called.unit), (blows, called.impulse))
+        parts = [f"{max(sizes):.4g} {unit}" for sizes, unit in quantities if sizes]
         parts += [f"{factor:.3g} {name}" for name, factor in loads.items()]
         parts += [f"{name} = {value:.4g}" for name, value in self.initial_state.items()]
         return ", ".join(parts)

@@ -19,6 +19,7 @@ from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
+from seaopt.units import LINEAR, Mechanics
 
 ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
 TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
@@ -61,6 +62,12 @@ class Verification:
     scenarios: Mapping[str, tuple[Scenario, ...]]
     draws: Mapping[str, tuple[ParameterSet, ...]]
     follows_hz: Mapping[str, tuple[float, float] | None]
+
+    @property
+    def mechanics(self) -> Mechanics:
+        """Units and words of what the controller commands."""
+        stage = next(iter(self.stages.values()), None)
+        return LINEAR if stage is None else stage.controller.command.mechanics
 
     def scenario(self, row: Outcome) -> Scenario:
         """Return the scenario of a row."""
@@ -138,7 +145,8 @@ class Verification:
             sizes = [self.scenario(row).phases[-1].force_N for row in rows]
             settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
             ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
-            lines.append(f"steps on {plant}, {ends} N: overshoot up to {100 * over:.3g} %{limited}, {settled}")
+            unit = self.mechanics.unit
+            lines.append(f"steps on {plant}, {ends} {unit}: overshoot up to {100 * over:.3g} %{limited}, {settled}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:
@@ -336,16 +344,19 @@ def describe_witness(row: Outcome) -> str:
 
 
 def _format_worst(verification: Verification) -> list[str]:
+    called = verification.mechanics
+    unit = called.unit
     head = (
-        "plant", "scenario", "size", "", "force N", "overshoot", "settles s", "current A", "angle deg", "energy J",
-        "at limit", "ends off N", "allowed N", "draw",
+        "plant", "scenario", "size", "", f"{called.word} {unit}", "overshoot", "settles s", "current A", "angle deg",
+        "energy J", "at limit", f"ends off {unit}", f"allowed {unit}", "draw",
     )  # fmt: skip
     cells: list[tuple[str, ...]] = []
     for row in verification.worst():
         angle = None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad)
         scenario = verification.scenario(row)
         cells.append((
-            row.plant, row.scenario, scenario.size, "passed" if row.passed else "FAILED", f"{row.peak_force_N:.4g}",
+            row.plant, row.scenario, scenario.describe_size(called), "passed" if row.passed else "FAILED",
+            f"{row.peak_force_N:.4g}",
             "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %", format_number(row.settling_s, 3, ""),
             *(format_number(value, 3, "") for value in (row.peak_current_A, angle, row.peak_energy_J)),
             f"{100 * row.saturated:.3g} %", format_number(row.final_error_N, 3, ""),

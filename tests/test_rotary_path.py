@@ -1,0 +1,206 @@
+"""A rotary actuator and the ball screw that moves like it go the whole way and come to the same figures.
+
+With a lead of 2 pi metres a screw travels as far as its motor turns, so that a screw with N^2 J_m, N^2 b_r, N K_tau,
+N f_c and v_s/N, spring at link 2, is the rotary one with x_2 = -theta_l: every figure of the linear path, which has
+references of its own, is one for the rotary path, in N m and rad.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, replace
+from html import unescape
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.bench import Noise
+from seaopt.control import MPCSpec, export, force_mpc, passivity
+from seaopt.control.laws.limit_cycles import describe_friction
+from seaopt.control.loops.loop import LoopFigures
+from seaopt.control.running.equilibrium import equilibrium
+from seaopt.estimation import Limits, Multisines, design_experiment
+from seaopt.robustness import coupled_stability
+from seaopt.robustness.bounds.bracket import Budget
+from seaopt.robustness.verification.large_signal import large_signal
+
+N = 100.0
+ROTARY = {"J_m": 2.4e-5, "b_r": 3e-4, "K_tau": 0.0369, "N": N, "k_s": 300.0, "eta": 0.7, "f_c": 0.0, "v_s": 1.0}
+LINEAR = {
+    "J": N**2 * ROTARY["J_m"], "b_r": N**2 * ROTARY["b_r"], "K_tau": N * ROTARY["K_tau"], "k": ROTARY["k_s"],
+    "eta": ROTARY["eta"], "l": 2 * np.pi, "N_p": 1.0, "v_s": ROTARY["v_s"] / N, "f_c": 0.0,
+}  # fmt: skip
+FRICTION = 0.004  # N m at the motor
+WRONG_UNIT = re.compile(r"(?<![A-Za-z_])N(?! m\b|_|\))(?=[\s/\]),;:]|$)|\bforces?\b|N s/m\b|\bN/m\b|\bkg\b(?! m\^2)")
+
+
+class Path:
+    """One of the two: its plants and values, and how its quantities compare with the linear one's."""
+
+    def __init__(self, stand, swing, values, link, scale):
+        self.stand, self.swing, self.scale = stand, swing, scale
+        self.params = swing.defaults.update(**values, **{link: 0.25})
+        self.link, self.measured = link, stand.sensing.regulated[0]
+
+    def rubbing(self):
+        return self.params.update(f_c=FRICTION * self.scale)
+
+
+@pytest.fixture(scope="module")
+def paths():
+    linear = Path(
+        so.plants.high_impedance(spring="link2"), so.plants.two_link("fixed", "mass", spring="link2"), LINEAR, "m_2", N
+    )
+    return linear, Path(so.plants.rotary("locked"), so.plants.rotary("free"), ROTARY, "J_l", 1.0)
+
+
+@pytest.fixture(scope="module")
+def controllers(paths):
+    return [tune(path, path.params) for path in paths]
+
+
+def tune(path, params, **asked):
+    options = {"bandwidth_hz": 15.0, "max_sensitivity": 1.6, "max_noise_gain": 60.0, "current_limit_A": 9.0}
+    spec = so.ControllerSpec(measured=path.measured, **options | asked)
+    return so.tune(path.stand, params, spec, robust_to={"swing": path.swing})
+
+
+def certify(path, controller, params, **options):
+    plants = {"stand": path.stand, "swing": path.swing}
+    return so.certify(controller, plants, params, samples=40, ranges={path.link: (0.15, 0.5)}, **options)
+
+
+def check_words(*texts):
+    for text in texts:
+        wrong = WRONG_UNIT.search(text)
+        assert wrong is None, text[max(0, wrong.start() - 60) : wrong.end() + 40]
+
+
+def test_the_controller_is_the_same(controllers):
+    linear, rotary = controllers
+    assert rotary.feasible and rotary.gains == pytest.approx(linear.gains, rel=1e-6)
+    for field in fields(LoopFigures):
+        one, other = getattr(linear.achieved, field.name), getattr(rotary.achieved, field.name)
+        assert other == (None if one is None else pytest.approx(one, rel=1e-6)), field.name
+    assert rotary.command == replace(linear.command, effort_unit="N m")
+    check_words(repr(rotary), unescape(rotary._repr_html_()))
+
+
+@pytest.mark.parametrize("structure", ["pd", "pid_dob"])
+def test_other_structures_are_the_same(paths, structure):
+    linear, rotary = (tune(path, path.params, structure=structure) for path in paths)
+    assert rotary.feasible == linear.feasible and rotary.gains == pytest.approx(linear.gains, rel=1e-4)
+
+
+def test_the_certificate_is_the_same(paths, controllers):
+    first, second = (
+        certify(path, controller, path.params, bounds=Budget(boxes=20)).with_simulation()
+        for path, controller in zip(paths, controllers, strict=True)
+    )
+    assert second.monte_carlo.failures == first.monte_carlo.failures
+    assert [(row.name, row.met) for row in second.requirements] == [(row.name, row.met) for row in first.requirements]
+    for one, other in zip(first.requirements, second.requirements, strict=True):
+        assert other.value == pytest.approx(one.value, rel=1e-4, abs=1e-9), one.name
+    rows = zip(first.simulated.verification.rows, second.simulated.verification.rows, strict=True)
+    for one, other in rows:
+        assert (one.plant, one.scenario, one.passed) == (other.plant, other.scenario, other.passed)
+        for name in ("peak_force_N", "peak_current_A", "peak_energy_J", "final_error_N", "settling_s"):
+            a, b = getattr(one, name), getattr(other, name)
+            assert (a is None and b is None) or b == pytest.approx(a, rel=1e-4, abs=1e-6), (one.scenario, name)
+    assert {row.scenario for row in second.simulated.verification.rows} >= {"impact", "payload", "contact"}
+    assert not any("environments" in what for what in second.simulated.left_out)
+    check_words(repr(second), repr(second.simulated.verification))
+
+
+def test_friction_at_the_motor_is_friction_at_the_screw(paths):
+    """Margins in slopes of either side's friction, predicted and simulated amplitudes, steps that stick."""
+    margins, amplitudes, sweeps, texts = [], [], [], []
+    for path in paths:
+        params = path.rubbing()
+        controller = tune(path, params)
+        margins.append(controller.friction.least_slope / path.scale**2)
+        velocities = np.array([0.01, 0.1, 1.0]) / path.scale * N
+        name = next(iter(path.stand.friction))
+        amplitudes.append(describe_friction(path.stand, params, name, velocities) / path.scale**2)
+        sweeps.append(large_signal(controller, path.stand, params, frequencies_hz=(4.0, 12.0)))
+        texts += [repr(controller), repr(sweeps[-1]), repr(certify(path, controller, params))]
+    assert margins[1] == pytest.approx(margins[0], rel=1e-4)
+    np.testing.assert_allclose(amplitudes[1], amplitudes[0], rtol=1e-6)
+    np.testing.assert_allclose(sweeps[1].amplitude_N, sweeps[0].amplitude_N, rtol=1e-4)
+    np.testing.assert_allclose(np.abs(sweeps[1].gain), np.abs(sweeps[0].gain), rtol=1e-3, atol=1e-4)
+    check_words(*texts[len(texts) // 2 :])
+
+
+def test_port_and_environments_are_the_same(paths, controllers):
+    grid = {"masses_kg": (0.01, 10.0), "stiffnesses_N_per_m": (1.0, 1e5), "dampings_N_s_per_m": (0.0, 0.1), "points": 4}
+    ports, maps = [], []
+    for path, controller in zip(paths, controllers, strict=True):
+        ports.append(passivity(controller, path.stand, path.params))
+        maps.append(coupled_stability(controller, path.stand, path.params, **grid))
+    np.testing.assert_allclose(ports[1].bands_hz, ports[0].bands_hz, rtol=1e-6)
+    assert ports[1].least_damping_N_s_per_m == pytest.approx(ports[0].least_damping_N_s_per_m, rel=1e-6)
+    np.testing.assert_allclose(maps[1].spectral_radius, maps[0].spectral_radius, rtol=1e-8)
+    assert maps[1].fixed_stable == maps[0].fixed_stable
+    bounded = paths[1].params.with_parameters(replace(paths[1].swing.defaults["J_l"], value=0.25, min=0.1, max=1.0))
+    own = coupled_stability(controllers[1], paths[1].swing, bounded, points=3)
+    assert own.mass[-1] == 10.0  # kg m^2: the link's own bounds are not the environment's
+    check_words(repr(ports[1]), repr(maps[1]), repr(own))
+
+
+def test_predictive_control_is_the_same(paths):
+    laws = [force_mpc(path.stand, path.params, MPCSpec(current_limit_A=9.0, measured=path.measured, bandwidth_hz=15.0))
+            for path in paths]  # fmt: skip
+    units = dict(zip(laws[1].kalman.names, laws[1].kalman.units, strict=True))
+    assert (units["spring_deflection"], units["tau_s"], units["thetad_m"]) == ("rad", "N m", "rad/s")
+    steps = [law.step(law.start, reference_N=5.0, measurement_N=0.1) for law in laws]
+    assert steps[1].current_A == pytest.approx(steps[0].current_A, rel=1e-6)
+    check_words(repr(laws[1]).replace("ForceMPC", ""))
+
+
+def test_the_exported_code_has_the_same_numbers(controllers, tmp_path):
+    texts = []
+    for number, controller in enumerate(controllers):
+        export(controller, tmp_path / str(number))
+        texts.append({path.name: path.read_text(encoding="utf-8") for path in (tmp_path / str(number)).iterdir()})
+    for name in ("force_law.c", "force_law_gains.h"):
+        numbers = [[float(x) for x in re.findall(r"-?\d+\.\d+(?:e-?\d+)?", text[name])] for text in texts]
+        np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-4, atol=1e-9)
+    assert "/* A/(N m) */" in texts[1]["force_law_gains.h"] and "reference_Nm" in texts[1]["force_law.h"]
+    check_words(*(text.replace("force_law", "") for text in texts[1].values()))
+
+
+def test_a_fit_and_its_design_are_the_same(paths):
+    """Two free parameters from a wrong start, on the same torque; what to record next."""
+    found, designs = [], []
+    names = (("J", "b_r"), ("J_m", "b_r"))
+    for path, free in zip(paths, names, strict=True):
+        sensors = so.Sensors(noise_std={path.measured: 0.05})
+        excitation = (Noise(std=1.0, band_hz=40.0),)
+        log = so.virtual_log(path.stand, path.params, excitation, duration_s=5, rate_hz=500, seed=3, sensors=sensors)
+        start = path.params.update(**{name: 3.0 * path.params[name].value for name in free}).free(*free)
+        fit = so.fit([so.Experiment(plant=path.stand, log=log, outputs=(path.measured,))], start)
+        found.append([(fit.parameters[name].value, fit.parameters[name].std) for name in free])
+        limits = Limits(current_limit_A=2.0, duration_s=5.0, rate_hz=500.0)
+        signal = Multisines(lines=10, starts=1)
+        designs.append(design_experiment(path.stand, fit.parameters.free(*free), limits, sigma={path.measured: 0.05},
+                                         signal=signal))  # fmt: skip
+    np.testing.assert_allclose(np.array(found[1]) * N**2, found[0], rtol=1e-3)
+    assert repr(designs[1]).count("\n") == repr(designs[0]).count("\n")
+    check_words(repr(designs[1]))
+
+
+def test_a_raised_shank_rests_where_gravity_is_held(controllers, paths):
+    from seaopt.control.laws.realisation import runnable
+    from seaopt.control.running.closed_loop import SampledLoop
+
+    knee = so.plants.rotary("pendulum")
+    values = {"m": 4.0, "L": 0.2, "J_l": 0.25}
+    params = knee.defaults.update(**ROTARY, **values)
+    raised = params.with_parameters(so.Parameter(name="theta_l", value=0.5, unit="rad"))
+    loop = SampledLoop(plant=knee, law=runnable(controllers[1]), measured="tau_s", delay_samples=1)
+    rest = equilibrium(loop, [knee.complete(raised)])
+    torque = 4.0 * 9.81 * 0.2 * np.sin(0.5)
+    assert rest.force[0] == pytest.approx(torque, rel=1e-9)
+    assert rest.current_A[0] == pytest.approx(torque / (N * 0.7 * 0.0369), rel=1e-9)
+    check_words(repr(rest))
