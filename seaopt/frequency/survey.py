@@ -28,6 +28,7 @@ from seaopt.frequency.second_order import (
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, SeriesSpring
+from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import evaluate
 from seaopt.records import record
 from seaopt.simulation import Clock, linearise, make_model
@@ -124,8 +125,11 @@ class Survey:
     pairs: tuple[Pair, ...]
 
     def model(self, pair: Pair, params: ParameterSet) -> ResponseFunction:
-        """Return the plant's response as the sensors see it, linearised at rest, as a function of frequencies in Hz."""
-        model = linearise(make_model(self.plant, params, (), (pair.output,)))
+        """Return the plant's response as the sensors see it, linearised at rest, as a function of frequencies in Hz.
+
+        A plant with dry friction slides: what moves enough to be measured does, and at rest it would be a damper.
+        """
+        model = linearise(make_model(take_sliding(self.plant, params), params, (), (pair.output,)))
         clock = replace(self.clock, delay_free=False)
         source, gain = list(self.plant.inputs).index(pair.source), self.gain.get(pair.output, 1.0)
 

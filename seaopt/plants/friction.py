@@ -29,7 +29,7 @@ SLIDING, STUCK = "sliding", "stuck"
 STATES = (SLIDING, STUCK)
 # Speeds at which a curve that does not state its slopes is looked at, m/s or rad/s.
 SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
-SMOOTHED = 3.0  # times the speed of its smoothing a curve is within 1 % of what it smooths
+SMOOTHED = 10.0  # times the speed of its smoothing a curve is what it smooths
 LOW_SPEED = 1.0  # m/s or rad/s: up to here a curve shows its dry friction
 
 

@@ -19,11 +19,11 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_breakaway, find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
-from seaopt.units import LINEAR, Mechanics
+from seaopt.units import LINEAR, ROTARY, Mechanics
 
 FALL_DEG = 120.0
 LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
-NOMINAL_FORCE_N = 100.0
+NOMINAL_EFFORT = {LINEAR: 100.0, ROTARY: 1.0}  # where no limit and no friction sizes the steps
 STEP_SHARES = (0.02, 0.1, 0.5)  # of the force that the current limit can hold at rest
 LEAST_STEP = 1e-4  # of the force that the current limit can hold at rest: a smaller one is of a run that diverges
 UNSATURATED = 0.9  # of the step that just reaches the current limit
@@ -190,7 +190,7 @@ def default_scenarios(
 
     Forces are multiples of two: that of the step that just reaches the current limit (at its first samples, where the
     law differentiates), and that which the limit can hold at rest. Without `current_limit_A` nothing saturates: the
-    scenarios of saturation are left out, and the others are of 100 N, or of the steps of `step_scenarios`.
+    scenarios of saturation are left out, and the others are of 100 N (1 N m), or of the steps of `step_scenarios`.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def default_scenarios(
     """
     step, rest = find_step_limit(controller), controller.force_limit(0.01)
     band = controller.spec.bandwidth_hz
-    small = 0.5 * step if step is not None else NOMINAL_FORCE_N
+    small = 0.5 * step if step is not None else NOMINAL_EFFORT[controller.command.mechanics]
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
     scenarios = list(step_scenarios(controller, plant, sets))
     if step is not None and rest is not None:
@@ -238,10 +238,10 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     """Return the steps by which a plant is judged as its user sees it: small, middling and large.
 
     With a current limit they are 2, 10 and 50 % of the force that it can hold at rest, and the largest step that does
-    not saturate; without one a fifth to 25 times the dry friction of the design plant, or 100 N where it has none.
-    Where no link moves the force must keep the specification's reference peak with a grace of 10 %, settle, and end at
-    its reference; a moving link gives way, so that there the force goes back to zero and only what every scenario
-    requires is required.
+    not saturate; without one a fifth to 25 times the dry friction of the design plant, or 100 N (1 N m) where it has
+    none. Where no link moves the force must keep the specification's reference peak with a grace of 10 %, settle, and
+    end at its reference; a moving link gives way, so that there the force goes back to zero and only what every
+    scenario requires is required.
 
     Dry friction that can stick is simulated in both ways: each step comes again with friction that sticks. Where the
     law has an integral there are steps of 0.1, 0.3 and 0.7 times the friction besides, in which it has to grow until
@@ -329,7 +329,7 @@ def _size_steps(controller: Controller) -> dict[str, float]:
     plant, params = _require_design(controller)
     friction = sum(find_dry_friction(plant, plant.complete(params)).values())
     if not friction:
-        return {"step": NOMINAL_FORCE_N}
+        return {"step": NOMINAL_EFFORT[controller.command.mechanics]}
     return {f"step of {share:g} times the friction": share * friction for share in FRICTION_STEPS}
 
 
@@ -366,8 +366,9 @@ def find_step_limit(controller: Controller) -> float | None:
         measured=controller.spec.measured,
         delay_samples=controller.delay_samples,
     )
-    run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), NOMINAL_FORCE_N))
-    step, held = NOMINAL_FORCE_N * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.01)
+    tried = NOMINAL_EFFORT[controller.command.mechanics]
+    run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
+    step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.01)
     assert held is not None
     return step if step > LEAST_STEP * held else held  # with play it may run away where the loop at rest is stable
 
