@@ -17,13 +17,13 @@ import casadi as ca
 from seaopt.errors import PlantError, UnitError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants import Actuation, Friction, Mode, Plant, Port, Sensing, SeriesSpring, wrapped
-from seaopt.plants.equations.expressions import RESERVED, list_names, parse
+from seaopt.plants.equations.expressions import MAX_LENGTH, RESERVED, list_names, parse
 from seaopt.plants.equations.stored_equations import StoredFunction, store_function
 from seaopt.problem.schema import AnyPlant, EquationsTable, Formula, FrictionTable, PortTable
 from seaopt.records import record
 from seaopt.units import factor, si_unit
 
-MAX_NAMES, MAX_ROLES = 500, 20  # of one plant; of its frictions, and of its ports
+MAX_NAMES, MAX_ROLES, MAX_TEXT = 500, 20, 50_000  # of one plant; its frictions, and its ports; characters
 TIME, VELOCITY = "t", "v"  # names of their own: in f and h, and in the curves of a friction
 KINDS = {
     "states": "a state", "inputs": "an input", "friction": "a friction", "parameters": "a parameter",
@@ -79,17 +79,21 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
     _check_units(table)
     _check_equations(table)
     texts = _Texts(table=table, definitions=_sort_definitions(table), names=_list_kinds(table))
-    equations = {
-        what: texts.store(
-            lambda read, what=what: {key: read(f"{what}.{key}", text) for key, text in getattr(table, what).items()},
-            TIME, texts.states, (*table.inputs, *table.friction), texts.parameters,
-        )
-        for what in ("f", "h")
-    }  # fmt: skip
+    everything = (TIME, texts.states, (*table.inputs, *table.friction), texts.parameters)
+
+    def write_rates(read: Read) -> dict[str, Any]:
+        for definition in table.definitions:  # those that nothing uses are to be right, too
+            read(f"definitions.{definition}", definition)
+        return {key: read(f"f.{key}", text) for key, text in table.f.items()}
+
+    def write_outputs(read: Read) -> dict[str, Any]:
+        return {key: read(f"h.{key}", text) for key, text in table.h.items()}
+
     plant = Plant(
         name=name, states=table.states, inputs=table.inputs, outputs=table.outputs,
         parameters={key: _declare(key, declared) for key, declared in table.parameters.items()},
-        f=equations["f"], h=equations["h"], derived=texts.derive(), energy=texts.of_states("energy", table.energy),
+        f=texts.store(write_rates, *everything), h=texts.store(write_outputs, *everything),
+        derived=texts.derive(), energy=texts.of_states("energy", table.energy),
         optional_inputs=frozenset(table.optional_inputs),
         actuation=texts.actuate(), sensing=_sense(table), spring=texts.spring(),
         ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
@@ -161,21 +165,27 @@ class _Texts:
             symbols: dict[str, Any] = {}
             for names, one in zip(arguments, given, strict=True):
                 symbols |= {names: one} if isinstance(names, str) else vars(one)
-            own = {name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments}
-            symbols = self.define(own) | symbols
-            return write(lambda place, text: self.read(place, text, symbols))
+            known = {name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments}
+
+            def read(place: str, text: Formula) -> Any:
+                self.define(known, text)
+                return self.read(place, text, known | symbols)
+
+            return write(read)
 
         return store_function(function, *arguments)
 
-    def define(self, symbols: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the definitions that use no other names of the plant than these."""
-        known = dict(symbols)
+    def define(self, known: dict[str, Any], text: Formula) -> None:
+        """Add the definitions that a formula needs to what is known, if they use nothing else of the plant."""
+        needed = set(list_names(str(text)))
+        for name in reversed(self.definitions):
+            if name in needed:
+                needed |= set(list_names(str(self.table.definitions[name])))
         for name in self.definitions:
-            text = self.table.definitions[name]
-            own = self.names.keys() & set(list_names(str(text))) - RESERVED
-            if own <= known.keys():
-                known[name] = self.read(f"definitions.{name}", text, known)
-        return {name: known[name] for name in self.definitions if name in known}
+            if name in needed and name not in known:
+                own = self.names.keys() & set(list_names(str(self.table.definitions[name]))) - RESERVED
+                if own <= known.keys():
+                    known[name] = self.read(f"definitions.{name}", self.table.definitions[name], known)
 
     def read(self, place: str, text: Formula, symbols: Mapping[str, Any]) -> Any:
         """Return the expression of a formula in which these names may stand."""
@@ -293,7 +303,10 @@ def _sort(uses: Mapping[str, Iterable[str]], what: str) -> list[str]:
 
 
 def _check_names(table: EquationsTable) -> None:
+    # A text that is too long by itself is refused where it is read, with its place.
+    characters = sum(min(len(text), MAX_LENGTH) for text in _list_texts(table.model_dump()))
     for what, count, most in (
+        ("characters of text", characters, MAX_TEXT),
         ("names", sum(len(getattr(table, group)) for group in (*KINDS, "outputs", "derived")), MAX_NAMES),
         ("frictions", len(table.friction), MAX_ROLES),
         ("ports", len(table.ports), MAX_ROLES),

@@ -461,6 +461,12 @@ def test_an_output_may_have_the_name_of_a_function(read):
     assert next(iter(plant.outputs)) == "exp" and plant.sensing.regulated == ("exp", "F2")
 
 
+def test_a_plant_has_so_much_text(read):
+    sums = "".join(f'b{n} = "{"+k" * 4500}"\n' for n in range(6))
+    with pytest.raises(so.SeaoptError, match=r"plant.stand: has 5\d+ characters of text; give at most 50000"):
+        read(TEXT, "[plant.stand.definitions]", f"[plant.stand.definitions]\n{sums}")
+
+
 def test_a_plant_has_so_many_names(read):
     with pytest.raises(so.SeaoptError, match=r"plant.stand: has 60[0-9] names; give at most 500"):
         read(
