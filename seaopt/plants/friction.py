@@ -72,8 +72,7 @@ def name_slope_unit(plant: Plant) -> str:
 def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, float]:
     """Return the effort at the spring that each dry friction takes, by name; what is linear in its velocity is not dry.
 
-    It is the largest force at speeds up to `LOW_SPEED`, or as far as its smoothing reaches, less viscous friction of
-    the flattest slope.
+    It is the largest force at low speeds, less viscous friction of the flattest slope.
 
     Examples
     --------
@@ -89,9 +88,8 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
     for (name, friction), (flattest, steepest) in zip(plant.friction.items(), slopes, strict=True):
         if flattest != steepest:
             viscous = max(float(flattest), 0.0)
-            smoothed = SMOOTHED * params[friction.smoothing].value if friction.smoothing is not None else 0.0
-            low, rated = SAMPLED_SPEEDS[max(LOW_SPEED, smoothed) >= SAMPLED_SPEEDS], friction.add_rated(p)
-            speeds = [sign * float(speed) for speed in low for sign in (1.0, -1.0)]
+            rated = friction.add_rated(p)
+            speeds = [sign * speed for speed in _list_low_speeds(friction, params) for sign in (1.0, -1.0)]
             level = max(abs(float(friction.force(speed, rated)) - viscous * speed) for speed in speeds)
             efforts[name] = abs(float(friction.effort(p))) * level
     return efforts
@@ -100,7 +98,7 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
 def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     """Return the effort at the spring that is needed to let every joint that can stick slide, N or N m.
 
-    It is the largest force of each friction that declares its jump, at speeds up to `LOW_SPEED`.
+    It is the largest force of each friction that declares its jump, at low speeds.
 
     Examples
     --------
@@ -111,12 +109,19 @@ def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     30.0
 
     """
-    p, speeds = params.by_attribute, [float(speed) for speed in SAMPLED_SPEEDS[SAMPLED_SPEEDS <= LOW_SPEED]]
+    p = params.by_attribute
     return sum(
-        abs(float(friction.effort(p))) * max(float(friction.jump(speed, friction.add_rated(p))) for speed in speeds)
+        abs(float(friction.effort(p)))
+        * max(float(friction.jump(speed, friction.add_rated(p))) for speed in _list_low_speeds(friction, params))
         for friction in plant.friction.values()
         if friction.jump is not None
     )
+
+
+def _list_low_speeds(friction: Friction, params: CompletedParameters) -> list[float]:
+    """Return the speeds up to `LOW_SPEED`, or as far as the smoothing reaches, that of a motor before its gear."""
+    smoothed = SMOOTHED * params[friction.smoothing].value if friction.smoothing is not None else 0.0
+    return [float(speed) for speed in SAMPLED_SPEEDS if speed <= max(LOW_SPEED, smoothed)]
 
 
 def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, " n"]:

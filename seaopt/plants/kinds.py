@@ -56,7 +56,13 @@ def plant_of_kind(kind: str, *, sticks: Any = False, **options: Any) -> Plant:
     return let_stick(plant) if sticks else plant
 
 
-def known_parameters() -> dict[str, Parameter]:
-    """Return every parameter that some built-in plant has, by name (a problem file may name any of them)."""
-    parts = [parameter for items in PARTS.values() for parameter in items]
-    return {parameter.name: parameter for parameter in (*all_parameters(), *rotary_parameters(), *parts)}
+def known_parameters(*, rotary_first: bool = False) -> dict[str, Parameter]:
+    """Return every parameter that some built-in plant has, by name (a problem file may name any of them).
+
+    Of a name that linear and rotary plants have in different units it is the linear one's, unless the rotary comes
+    first.
+    """
+    linear = [*all_parameters(), *(parameter for items in PARTS.values() for parameter in items)]
+    turning = list(rotary_parameters())
+    every = (*linear, *turning) if rotary_first else (*turning, *linear)
+    return {parameter.name: parameter for parameter in every}

@@ -14,7 +14,7 @@ from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_l
 from seaopt.control import ControllerSpec, Notch
 from seaopt.control import draw as draw_values
 from seaopt.documents import check_table
-from seaopt.errors import ProblemError, SeaoptError, require_type, suggestion
+from seaopt.errors import ProblemError, SeaoptError, UnitError, require_type, suggestion
 from seaopt.estimation import (
     Experiment,
     Fit,
@@ -49,6 +49,7 @@ from seaopt.problem.schema import (
 )
 from seaopt.records import record
 from seaopt.robustness import place_value
+from seaopt.units import ROTARY, factor
 
 MAX_BYTES = 4 << 20
 OWN = "parameter "  # before the name of a parameter that is read as a channel
@@ -414,7 +415,10 @@ def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Parame
                 if name not in tables:
                     raise ProblemError(f"parameters.{name} is missing; plant {plant.name} needs it")
                 declared[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
-    known = known_parameters() | declared  # a plant of the file may use a built-in plant's name for something else
+    _check_units(plants)
+    turns = any(plant.actuation is not None and plant.actuation.unit == ROTARY.unit for plant in plants.values())
+    # A plant of the file may use a built-in plant's name for something else.
+    known = known_parameters(rotary_first=turns) | declared
     parameters = {name: known[name] for name in known if name in declared or name in tables}
     for name, value in tables.items():
         if name not in known:
@@ -423,13 +427,30 @@ def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Parame
                 remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
             raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
         given = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
-        parameters[name] = _make_parameter(parameters[name], given)
+        try:
+            parameters[name] = _make_parameter(parameters[name], given)
+        except UnitError as error:
+            raise UnitError(f"parameters.{name}: {error}") from error
     return ParameterSet(parameters.values())
 
 
-def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
-    from seaopt.units import factor
+def _check_units(plants: Mapping[str, Plant]) -> None:
+    """Refuse plants of which one has a parameter in N, say, and another one of the same name in N m."""
+    first: dict[str, tuple[str, str]] = {}
+    for key, plant in plants.items():
+        for name in plant.parameters:
+            unit = plant.parameter_unit(name)
+            other, known = first.setdefault(name, (key, unit))
+            try:
+                factor(unit, known)
+            except UnitError as error:
+                raise ProblemError(
+                    f"parameters.{name} is in {known} for plant.{other} and in {unit} for plant.{key}; "
+                    "give each a problem file of its own"
+                ) from error
 
+
+def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
     scale = factor(table.unit, default.unit) if table.unit is not None else 1.0
     prior = None if table.prior_std is None else table.prior_std * scale
     free = table.free if table.free is not None else prior is not None

@@ -42,3 +42,42 @@ def test_the_knee_runs_with_everything_met(tmp_path):
     for name, value in TRUTH.items():
         fitted = stored["fit"]["parameters"][name]
         assert abs(fitted["value"] - value) < 4 * fitted["std"]
+
+
+SCREW = '[plant.screw]\nkind = "high_impedance"\n[plant.swing]'
+
+
+@pytest.mark.parametrize(
+    ("line", "mistake", "words"),
+    [
+        ('unit = "N m/rad", free', 'unit = "N/m", free', ("parameters.k_s", '"N/m" is not one of N m/rad')),
+        ('value = 0.002, unit = "N m"', 'value = 0.002, unit = "N"', ("parameters.f_c", '"N" is not one of N m')),
+        ("eta = 0.7", "eta = 0.7\nK_e = 0.05", ('"K_e"', "give K_tau alone")),
+        ("[plant.swing]", SCREW, ("parameters.f_c is in N m for plant.stand and in N for plant.screw",)),
+        ('measured = "tau_s"', 'measured = "F1"', ('controller.measured = "F1"', "known: tau_s")),
+        ('measured = "tau_s"\n', "", ('controller.measured = "F1"', "known: tau_s")),
+        ("{ noise_std = { tau_s = 0.05 } }", "{ noise_std = { F1 = 2.0 } }", ('"F1"', "known: tau_s")),
+        ("noise_std = { tau_s = 0.05, theta_m = 2e-3 }", "noise_std = { theta_l = 1e-3 }", ('"theta_l"', "theta_m")),
+        ('link = "locked"', 'link = "fixed"', ('link = "fixed"', '"locked"')),
+        ('link = "locked"', 'link = "locked"\nparts = ["screw_mode"]', ("screw_mode", "k_s")),
+    ],
+)
+def test_mistakes_are_one_line_with_a_remedy(tmp_path, line, mistake, words):
+    text = KNEE.read_text(encoding="utf-8")
+    assert line in text
+    path = tmp_path / "knee.toml"
+    path.write_text(text.replace(line, mistake).replace("duration_s = 30", "duration_s = 0.1"), encoding="utf-8")
+    with pytest.raises(so.SeaoptError) as caught:
+        so.read_problem(path).experiments()
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_parameters_of_the_other_kind_are_kept(tmp_path):
+    """A rotary file's f_s is in N m also where its plants have no Stribeck friction; a linear one's is in N."""
+    path = tmp_path / "knee.toml"
+    more = 'eta = 0.7\nk = 655000\nf_s = { value = 0.01, unit = "N m" }'
+    path.write_text(KNEE.read_text(encoding="utf-8").replace("eta = 0.7", more), encoding="utf-8")
+    parameters = so.read_problem(path).parameters
+    assert (parameters["f_s"].unit, parameters["k"].unit, parameters["m"].value) == ("N m", "N/m", 4.0)
