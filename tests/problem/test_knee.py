@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import pytest
 
 import seaopt as so
+from tests.words import check_words
 
 KNEE = Path(__file__).resolve().parents[2] / "problems" / "knee.toml"
 TRUTH = {"J_m": 2.4e-5, "b_r": 5e-5, "f_c": 0.005, "k_s": 300.0, "J_l": 0.25, "d_l": 0.3}
@@ -38,6 +41,11 @@ def test_the_knee_runs_with_everything_met(tmp_path):
     assert run.returncode == 0, run.stdout + run.stderr
     stored = {name: json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8")) for name in
               ("fit", "controller", "robustness")}  # fmt: skip
+    page = re.sub(
+        r"<style.*?</style>|<[^>]*>", " ", (tmp_path / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+    own = r"N\s+gear ratio\s+100|m\s+pendulum mass\s+4\s+kg"  # the table's rows of a name and of a mass
+    check_words(run.stdout, re.sub(own, "", unescape(page)))
     assert stored["fit"]["met"] and stored["controller"]["feasible"] and stored["robustness"]["passed"]
     for name, value in TRUTH.items():
         fitted = stored["fit"]["parameters"][name]
