@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.bench import Noise
+from seaopt.bench import Chirp, Noise
 from seaopt.control import MPCSpec, export, force_mpc, passivity
 from seaopt.control.laws.limit_cycles import describe_friction
 from seaopt.control.loops.loop import LoopFigures
 from seaopt.control.running.equilibrium import equilibrium
 from seaopt.estimation import Limits, Multisines, design_experiment
+from seaopt.frequency import survey
 from seaopt.robustness import coupled_stability
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.verification.large_signal import large_signal
@@ -213,3 +214,17 @@ def test_a_raised_shank_rests_where_gravity_is_held(controllers, paths):
     assert rest.force[0] == pytest.approx(torque, rel=1e-9)
     assert rest.current_A[0] == pytest.approx(torque / (N * 0.7 * 0.0369), rel=1e-9)
     check_words(repr(rest))
+
+
+def test_the_second_order_reading_of_a_locked_joint(paths):
+    """(16) in kg m^2 and N m s/rad: of the torque alone, and close to the truth on a chirp without friction."""
+    path = paths[1]
+    log = so.virtual_log(path.stand, path.params, (Chirp(amplitude=1.0, f0_hz=0.05, f1_hz=60.0),), duration_s=60,
+                         rate_hz=500, seed=1, sensors=so.Sensors(noise_std={"tau_s": 0.02}))  # fmt: skip
+    measured = survey(path.stand, log, outputs=("tau_s", "theta_m"))
+    torque, angle = measured.pairs
+    drive = measured.drive(torque, path.params)
+    assert drive.m_k.unit == "kg m^2" and drive.b_m.unit == "N m s/rad"
+    assert drive.m_k.value == pytest.approx(N**2 * ROTARY["J_m"], rel=0.01)
+    assert drive.efficiency.value == pytest.approx(ROTARY["eta"], rel=0.01)
+    assert measured.drive(angle, path.params) is None

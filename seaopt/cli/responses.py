@@ -73,7 +73,7 @@ class Responses:
             for pair in survey.pairs:
                 drive = survey.drive(pair, self.guess)
                 if drive is not None:
-                    console.print(f"{name}: {_describe_drive(pair, drive)}", highlight=False, markup=False)
+                    console.print(f"{name}: {_describe_drive(survey, pair, drive)}", highlight=False, markup=False)
 
     def _format_cells(self, name: str, survey: Survey, pair: Pair) -> list[str]:
         band, peak, form = pair.good_band_hz, pair.peak, pair.second_order
@@ -124,12 +124,13 @@ def _adopt_fit(survey: Survey, nuisance: Nuisance) -> Survey:
     return replace(survey, clock=replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False), gain=nuisance.gain)
 
 
-def _describe_drive(pair: Pair, drive: DriveEstimate) -> str:
-    form = pair.second_order
-    assert form is not None
+def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> str:
+    form, spring = pair.second_order, survey.plant.spring
+    assert form is not None and spring is not None
+    m_k, b_m = spring.mass, spring.damping
     return (
         f"{pair.name} as (16), per unit of what the motor gives: {drive.K.value:.5g}/(s² + {form.a.value:.4g} s + "
         f"{form.b.value:.5g})\n"
-        f"  with k known: m_k = {drive.m_k}, b_m = {drive.b_m}, efficiency {drive.efficiency}\n"
-        f"  K and b averaged, as the paper does: m_k = {drive.m_k_averaged}, b_m = {drive.b_m_averaged}"
+        f"  with k known: {m_k} = {drive.m_k}, {b_m} = {drive.b_m}, efficiency {drive.efficiency}\n"
+        f"  K and b averaged, as the paper does: {m_k} = {drive.m_k_averaged}, {b_m} = {drive.b_m_averaged}"
     )

@@ -141,12 +141,16 @@ class Survey:
     def drive(self, pair: Pair, params: ParameterSet) -> DriveEstimate | None:
         """Return the actuator's parameters that a pair's second-order form implies, with k known, as in (16).
 
-        None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output.
+        None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output, a force or a
+        torque.
         """
         values, actuation, spring = self.plant.complete(params), self.plant.actuation, self.plant.spring
         if pair.second_order is None or actuation is None or spring is None or spring.stiffness is None:
             return None
-        if not _is_form(self.plant, spring, values, pair):
+        sensing = self.plant.sensing
+        if (sensing is not None and pair.output not in sensing.regulated) or not _is_form(
+            self.plant, spring, values, pair
+        ):
             return None
         k = values[spring.stiffness]
         lossless = (

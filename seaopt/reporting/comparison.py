@@ -12,6 +12,7 @@ from seaopt.estimation import DerivedFigure, Experiment, Fit
 from seaopt.formatting import join_words
 from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain, survey
 from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants.friction import has_friction
 from seaopt.reporting.bode import Curve, Panel, bode_figure
 from seaopt.simulation import Clock
 
@@ -113,15 +114,17 @@ def sentence(measured: Survey, fit: Fit) -> str:
     parts = [f"The fitted model lies {_each(away, names)} standard deviations from H1 (rms over its coherent lines)"]
     forms = [pair.second_order.misfit for pair in usable if pair.second_order is not None]
     parts.append(f", the second-order fit {_each(forms, names)}. ")
-    if max(away) > FAR:
+    if has_friction(measured.plant, fit.parameters):
+        parts.append("With dry friction a response depends on the amplitude: the model's is that of sliding. ")
+    elif max(away) > FAR:
         parts.append("The model lacks something that the log shows. ")
     odd = [name for name, form, model in zip(names, forms, away, strict=True) if form > FAR * max(model, 1.0)]
     if odd:
         parts.append(f"{join_words(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
     spring = measured.plant.spring
     if spring is not None and spring.mass is not None and spring.damping is not None:
-        derived = fit.derived[spring.mass], fit.derived[spring.damping]
-        parts += [_reading(pair, drive, *derived) for pair, drive in _drives(measured, fit)[:1]]
+        derived = {name: fit.derived[name] for name in (spring.mass, spring.damping)}
+        parts += [_reading(pair, drive, derived) for pair, drive in _drives(measured, fit)[:1]]
     return "".join(parts).strip()
 
 
@@ -130,18 +133,19 @@ def _drives(measured: Survey, fit: Fit) -> list[tuple[Pair, DriveEstimate]]:
     return [(pair, drive) for pair, drive in pairs if drive is not None]
 
 
-def _reading(pair: Pair, drive: DriveEstimate, mass: DerivedFigure, damping: DerivedFigure) -> str:
-    """Say what (16) gives for the sprung mass and the damping, and what the fit gives."""
-    words = f"{_gap('m_k', drive.m_k, mass)} and {_gap('b_m', drive.b_m, damping)}"
+def _reading(pair: Pair, drive: DriveEstimate, derived: Mapping[str, DerivedFigure]) -> str:
+    """Say what (16) gives for the sprung mass and the damping, and what the fit gives; `derived` is these two."""
+    (m_k, mass), (b_m, damping) = derived.items()
+    words = f"{_gap(m_k, drive.m_k, mass)} and {_gap(b_m, drive.b_m, damping)}"
     averaged = ""
     if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:
         averaged = (
             f" The form's static gain is {drive.efficiency.value:.3f} of what the motor gives, not 1: averaging K and "
-            f"b, as the paper does, would give m_k = {drive.m_k_averaged.value:.4g} {drive.m_k_averaged.unit} and "
-            f"b_m = {drive.b_m_averaged.value:.5g} {drive.b_m_averaged.unit}."
+            f"b, as the paper does, would give {m_k} = {drive.m_k_averaged.value:.4g} {drive.m_k_averaged.unit} and "
+            f"{b_m} = {drive.b_m_averaged.value:.5g} {drive.b_m_averaged.unit}."
         )
     return (
-        f"Read as (16) with k known, {pair.name} gives m_k = {drive.m_k} and b_m = {drive.b_m}; the fit in time "
+        f"Read as (16) with k known, {pair.name} gives {m_k} = {drive.m_k} and {b_m} = {drive.b_m}; the fit in time "
         f"gives {mass.value:.5g} ± {mass.std:.2g} {mass.unit} and {damping.value:.5g} ± {damping.std:.2g} "
         f"{damping.unit}. So (16) has {words}.{averaged}"
     )
