@@ -62,6 +62,7 @@ import casadi as ca
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants import parts as part_laws
+from seaopt.plants.equations.stored_equations import store_function
 from seaopt.plants.parts import Part
 from seaopt.plants.plant import Derived, Plant
 from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring, StateExpression
@@ -314,9 +315,17 @@ def make_plant(
     def deflection(x: Any, p: Any) -> Any:
         return solve_motion(actuator, x, at_rest, p).deflection
 
+    def read_loads(x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        spring = solve_motion(actuator, x, at_rest, p).spring_force
+        return {"motor": drive.per_ampere(p) * u.I, "output": drive.travel(p) * spring}
+
+    states = {state: unit for pair in pairs for state, unit in zip(pair[:2], (pair[2], f"{pair[2]}/s"), strict=True)}
+    # Stored, it takes expressions for the states, which the derivatives in `solve_motion` do not.
+    names = [parameter.name for parameter in parameters]
+    loads = store_function(read_loads, states, ("I",), names) if "load_friction" in parts else None
     plant = Plant(
         name=name,
-        states={state: unit for pair in pairs for state, unit in zip(pair[:2], (pair[2], f"{pair[2]}/s"), strict=True)},
+        states=states,
         inputs={"I": "A"} | dict.fromkeys(inputs, effort),
         outputs={output: unit for output, (unit, _) in outputs.items()},
         parameters={parameter.name: parameter for parameter in parameters},
@@ -344,6 +353,8 @@ def make_plant(
                 slopes=lambda p: part_laws.bound_friction_slopes(parts, p),
                 jump=lambda speed, p: part_laws.friction_level(parts, speed, p),
                 smoothing="v_s",
+                loads=loads,
+                rated=part_laws.LOADS if "load_friction" in parts else {},
             )
         },
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in parts else None,

@@ -7,6 +7,16 @@ is the motor's, and the units are N m and rad):
     Friction rises at low speed (Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30(7), 1994),
     smoothed through zero: :math:`F_f = [f_c + (f_s - f_c) e^{-(v/v_{st})^2}] \tanh(v/v_s)`; without it
     :math:`F_f = f_c \tanh(v/v_s)`. Viscous friction is b_r, in every plant.
+``load_friction``
+    Friction grows with what the transmission carries (Duclusaud and Passault, Extended Friction Models for the Physics
+    Simulation of Servo Actuators, 2024: M3, and M5 with both shares): :math:`|c_m F_m + c_e F_e|` is added to f_c, with
+    the motor's effort F_m and the spring's F_e, both at the motor (the nut), where the friction is.
+``load_stribeck``
+    With the two before, breakaway friction grows too (M4 and M5): :math:`|c_{ms} F_m + c_{es} F_e|` is added to f_s
+    beside what is added to f_c.
+``load_square``
+    With these, breakaway friction has a part of the square of the smaller of F_m and F_e, where they oppose each other
+    (M6): q_m F_m^2 or q_e F_e^2.
 ``backlash``
     Play of total width :math:`2 g_b` in series with the spring: the spring sees
     :math:`z(\delta) = \delta + \tfrac12\big(\sqrt{(\delta-g_b)^2+\epsilon^2} - \sqrt{(\delta+g_b)^2+\epsilon^2}\big)`,
@@ -56,9 +66,9 @@ from seaopt.plants.roles import Friction, Port
 from seaopt.records import record
 
 Part = Literal[
-    "stribeck", "backlash", "hardening", "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay",
-    "measurement_delay", "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit",
-    "servo_delay",
+    "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
+    "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input", "duty_input", "inductance",
+    "position_servo", "servo_integral", "servo_limit", "servo_delay",
 ]  # fmt: skip
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
@@ -70,6 +80,18 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
         Parameter(
             name="v_st", value=5e-3, unit="m/s", min=1e-9, description="Stribeck speed", plausible=(0.00001, 10)
         ),
+    ),
+    "load_friction": (
+        Parameter(name="c_m", value=0.0, unit="-", min=0.0, description="friction over the motor's effort"),
+        Parameter(name="c_e", value=0.0, unit="-", min=0.0, description="friction over the spring's effort"),
+    ),
+    "load_stribeck": (
+        Parameter(name="c_ms", value=0.0, unit="-", min=0.0, description="of the motor's effort, at breakaway"),
+        Parameter(name="c_es", value=0.0, unit="-", min=0.0, description="of the spring's effort, at breakaway"),
+    ),
+    "load_square": (
+        Parameter(name="q_m", value=0.0, unit="1/N", min=0.0, description="of the motor's squared, at breakaway"),
+        Parameter(name="q_e", value=0.0, unit="1/N", min=0.0, description="of the spring's squared, at breakaway"),
     ),
     "backlash": (
         Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play"),
@@ -95,7 +117,12 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "servo_delay": (Parameter(name="T_v", value=1e-3, unit="s", min=1e-9, description="delay of the servo's command"),),
     **drives.PARTS,
 }  # fmt: skip
-INSIDE: tuple[Part, ...] = ("stribeck", "backlash", "hardening", "spring_damping", "screw_mode")
+INSIDE: tuple[Part, ...] = (
+    "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
+    "screw_mode",
+)  # fmt: skip
+NEEDS = {"load_stribeck": ("stribeck", "load_friction"), "load_square": ("stribeck", "load_friction")}
+LOADS = {"motor": 0.0, "output": 0.0}  # of friction that grows with them, as linear analysis takes it
 
 
 def parameters(parts: Sequence[str], of_part: Mapping[str, tuple[Parameter, ...]]) -> list[Parameter]:
@@ -119,6 +146,9 @@ def check_parts(parts: Sequence[str]) -> None:
             raise PlantError(f'part "{part}" is not known; {suggestion(str(part), PARTS)}')
         if list(parts).count(part) > 1:
             raise PlantError(f'part "{part}" is given twice; each part goes on once')
+        missing = [needed for needed in NEEDS.get(part, ()) if needed not in parts]
+        if missing:
+            raise PlantError(f'part "{part}" needs {" and ".join(missing)}; add what is missing')
 
 
 def play(deflection: Any, p: Any) -> Any:
@@ -154,22 +184,31 @@ def spring_energy(parts: Sequence[str], deflection: Any, k: Any, p: Any) -> Any:
 
 
 def dry_friction(parts: Sequence[str], speed: Any, p: Any) -> Any:
-    """Return Coulomb's and, with the part, Stribeck's friction (N, N m), smoothed through zero."""
+    """Return Coulomb's friction and what parts add to it (N, N m), smoothed through zero."""
     return friction_level(parts, speed, p) * ca.tanh(speed / p.v_s)
 
 
 def friction_level(parts: Sequence[str], speed: Any, p: Any) -> Any:
     """Return what dry friction is without its smoothing (N, N m); at zero speed what holds the drive at rest."""
-    if "stribeck" not in parts:
-        return p.f_c
-    return p.f_c + (p.f_s - p.f_c) * ca.exp(-((speed / p.v_st) ** 2))
+    sliding, breakaway = p.f_c, p.f_s if "stribeck" in parts else None
+    if "load_friction" in parts:
+        sliding += ca.fabs(p.c_m * p.motor + p.c_e * p.output)
+    if breakaway is None:
+        return sliding
+    breakaway += sliding - p.f_c
+    if "load_stribeck" in parts:
+        breakaway += ca.fabs(p.c_ms * p.motor + p.c_es * p.output)
+    if "load_square" in parts:
+        smaller = ca.if_else(ca.fabs(p.motor) > ca.fabs(p.output), p.q_e * p.output**2, p.q_m * p.motor**2)
+        breakaway += ca.if_else(p.motor * p.output > 0.0, smaller, 0.0)
+    return sliding + (breakaway - sliding) * ca.exp(-((speed / p.v_st) ** 2))
 
 
 def bound_friction_slopes(parts: Sequence[str], p: Any) -> tuple[Any, Any]:
     """Return bounds of the slope of `dry_friction` over all speeds, N s/m (N m s/rad): the flattest and the steepest.
 
-    The smoothing's slope is largest at rest, level/v_s, and never negative; that of (f_s - f_c) exp(-(v/v_st)^2) is
-    largest at v_st/sqrt(2), |f_s - f_c| sqrt(2/e)/v_st.
+    Without a load. The smoothing's slope is largest at rest, level/v_s, and never negative; that of
+    (f_s - f_c) exp(-(v/v_st)^2) is largest at v_st/sqrt(2), |f_s - f_c| sqrt(2/e)/v_st.
     """
     if "stribeck" not in parts:
         return 0.0, p.f_c / p.v_s

@@ -27,7 +27,7 @@ from seaopt.plants.actuator import (
     check_choices,
     make_plant,
 )
-from seaopt.plants.parts import INSIDE, Part, check_parts
+from seaopt.plants.parts import INSIDE, PARTS, Part, check_parts
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import GRAVITY
 from seaopt.plants.roles import Port, Sensing
@@ -67,6 +67,9 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
         Parameter(name="f_s", value=0.0, unit="N m", min=0.0, description="breakaway friction at the motor"),
         Parameter(name="v_st", value=10.0, unit="rad/s", min=1e-9, description="Stribeck speed, at the motor"),
     ),
+    "load_friction": PARTS["load_friction"],
+    "load_stribeck": PARTS["load_stribeck"],
+    "load_square": tuple(replace(item, unit="1/(N m)") for item in PARTS["load_square"]),
     "backlash": (
         Parameter(name="g_b", value=5e-4, unit="rad", min=0.0, description="half of the play, at the spring"),
         Parameter(name="eps_b", value=5e-5, unit="rad", min=1e-12, description="rounding of the play's corners"),
