@@ -67,8 +67,8 @@ from seaopt.records import record
 
 Part = Literal[
     "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
-    "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input", "duty_input", "inductance",
-    "position_servo", "servo_integral", "servo_limit", "servo_delay",
+    "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input", "duty_input",
+    "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
 ]  # fmt: skip
 
 PARTS: dict[str, tuple[Parameter, ...]] = {

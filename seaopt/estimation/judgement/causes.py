@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from itertools import combinations, zip_longest
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
@@ -36,6 +37,7 @@ HALVED = 0.5  # of a residual's power: what leaves less is another explanation, 
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
 SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
+LOAD, LOAD_SHARE = "load_at_motor", "share_of_load"  # of friction that is tried
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
@@ -268,6 +270,7 @@ def _list_candidates(
         yield from _free_gains(fit.experiments, first)
     yield from _free_delays(fit.experiments, here)
     yield from _free_parameters(fit, minimum, suspects)
+    yield from _load_friction(fit.experiments, here)
     yield from _clip_outputs(minimum.problem, residuals, here)
     yield from _filter_outputs(fit.experiments, here)
 
@@ -296,6 +299,45 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
             return _say_value(parameter, values[name], stds[name] if name in speeds else 0.0)
 
         yield _Candidate(where=name, experiments=fit.experiments, params=params, describe=describe, frees={name: 0.0})
+
+
+def _load_friction(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
+    """Yield friction that grows with the motor's effort, where the plant's own does not."""
+    loaded = {plant: _grow_with_load(plant) for plant in dict.fromkeys(e.plant for e in experiments)}
+    if None in loaded.values():
+        return
+    changed = tuple(replace(e, plant=loaded[e.plant] or e.plant) for e in experiments)
+
+    def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
+        share = values[LOAD_SHARE]
+        return None if share < 1e-3 else f"friction grows with the load, by {share:.3g} of it; add part load_friction"
+
+    share = Parameter(name=LOAD_SHARE, value=0.05, unit="-", free=True, min=0.0, max=1.0)
+    yield _Candidate(
+        where=experiments[0].name, experiments=changed, params=params.with_parameters(share), describe=describe
+    )
+
+
+def _grow_with_load(plant: Plant) -> Plant | None:
+    """Return a plant whose friction takes a share of the motor's effort, too; None where roles do not tell how."""
+    actuation = plant.actuation
+    name, friction = next(iter(plant.friction.items()), ("", None))
+    if actuation is None or friction is None or friction.loads is not None or friction.smoothing is None:
+        return None
+    smoothing, curve, jump = friction.smoothing, friction.force, friction.jump
+
+    def take(p: Any) -> Any:
+        return getattr(p, LOAD_SHARE) * ca.fabs(getattr(p, LOAD))
+
+    grown = replace(
+        friction,
+        force=lambda v, p: curve(v, p) + take(p) * ca.tanh(v / getattr(p, smoothing)),
+        jump=None if jump is None else lambda speed, p: jump(speed, p) + take(p),
+        loads=lambda x, u, p: {LOAD: actuation.effort(p) * getattr(u, actuation.input) / friction.effort(p)},
+        rated={LOAD: 0.0},
+    )
+    share = Parameter(name=LOAD_SHARE, value=0.0, unit="-", min=0.0)
+    return replace(plant, friction={**plant.friction, name: grown}, parameters={**plant.parameters, LOAD_SHARE: share})
 
 
 def _say_value(parameter: Parameter, value: float, unresolved: float) -> str:

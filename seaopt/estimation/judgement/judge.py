@@ -22,6 +22,8 @@ from seaopt.estimation.judgement.causes import Cause, find_causes, free_delay
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.findings import SEVERITIES, FitFinding, OutputFit
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.parameters import Parameter
@@ -37,6 +39,7 @@ DOUBTFUL = 1e-3  # probability of a score below which a refit decides: far from 
 SYSTEMATIC = 0.5  # of a residual's power: more than its noise
 LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
 SMALL = 1e-5  # below which a systematic residual is worth no word
+FAR_ABOVE = 5.0  # times the noise between neighbouring samples, from third differences (variance 20 times the noise's)
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
@@ -69,12 +72,30 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
     findings += [*_find_implausible(fit), *_find_contradicting_delays(fit), *_find_few_samples(fit, minimum)]
     tests = _run_tests(fit, minimum)
     suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
-    wrong = bool(suspects) or any(finding.severity != "note" for finding in findings) or fit.status != "converged"
+    wrong = (
+        bool(suspects)
+        or _exceeds_noise(minimum.problem, residuals)
+        or any(finding.severity != "note" for finding in findings)
+        or fit.status != "converged"
+    )
     if wrong:
         poor = any(finding.kind == "explained" for finding in findings) or fit.status == "not_identifiable"
         causes = find_causes(fit, residuals, suspects, alternatives, poor=poor)
         findings += _name_causes(fit, causes, suspects)
     return _conclude(fit, findings)
+
+
+def _exceeds_noise(problem: FitProblem, residuals: ResidualsByExperiment) -> bool:
+    """Tell whether some residual is far above its noise between neighbouring samples, so that causes are looked for.
+
+    Noise of a colour is so, too: only a cause that explains it is a finding.
+    """
+    for output in problem.outputs:
+        raw = [part[np.isfinite(part)] for part in residuals[output.experiment.name].raw_of(output.name)]
+        thirds = np.concatenate([np.diff(part, 3) for part in raw])
+        if thirds.size and np.std(np.concatenate(raw)) > FAR_ABOVE * np.sqrt(np.mean(thirds**2) / 20.0):
+            return True
+    return False
 
 
 def _conclude(fit: Fit, findings: Sequence[FitFinding]) -> Fit:

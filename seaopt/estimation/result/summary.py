@@ -36,7 +36,7 @@ from seaopt.estimation.result.nuisance import describe_nuisance
 from seaopt.estimation.solver.least_squares import Solution
 from seaopt.estimation.solver.methods import Method
 from seaopt.estimation.solver.settle import Solved, explains_little
-from seaopt.estimation.solver.step_size import MAX_SUBSTEPS, StepError
+from seaopt.estimation.solver.step_size import StepError
 from seaopt.formatting import format_number, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -227,7 +227,7 @@ def _find_status(
     if known.rank == known.free:
         if not step.small:
             error = f"{step.output:.2g} sigma in an output and {step.parameter:.2g} std in a parameter"
-            return "stalled", f"steps of 1/{MAX_SUBSTEPS} sample still leave an error of {error}"
+            return "stalled", f"the finest integration steps still leave an error of {error}"
         weak = "; ".join(
             f"{join_words(sorted(direction))} are only weakly distinguished (condition {known.condition:.2g}): "
             "each would be known far better if the others were"

@@ -30,6 +30,7 @@ NEAR = 1e-2  # squared standard deviations that may be left to it
 FALL = 4.0  # of a smoothing speed of friction, in a stage
 TOLD = 2.0  # of the misfit, which is twice a log-likelihood: what sharper friction has to gain
 HALF = 0.5  # of the finest steps, which leaves room to check their error
+JUMPY_DECREMENT = 1e-2  # where joints stick, residuals jump a little as a stop moves to another integration step
 FLAT_DECREMENT = 1e-3  # process noise that is hardly there, or sharp friction, is a flat direction: slow to search
 
 
@@ -104,6 +105,8 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
     problem, here = choose_first_steps(problem, start)
     decrement = FLAT_DECREMENT if problem.predicts or problem.find_smoothing() else DECREMENT
+    if any(experiment.model.sticks for experiment in problem.experiments):
+        decrement = JUMPY_DECREMENT
     checks: Checks = {}
     rough, before = problem.straight and not explains_little(problem, here.power), 0.0
     if rough:  # so good a start gives sigmas good enough to come near the minimum, and there they are estimated well

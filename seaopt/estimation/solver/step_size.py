@@ -20,6 +20,8 @@ TOLERATED = 3.0  # times that, where no finer steps are left: an interval of 95 
 FIRST_STEP_ERROR = 0.1  # allowed in an output while sigma is not yet known
 MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trust
 NEARBY = 10.0  # standard deviations, over which a step error does not change
+# Of an order: where a joint that sticks stops, residuals jump, and finer steps make that no better for ever.
+MOST_STEPS = {4: MAX_SUBSTEPS, 2: 32}
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
 
 
@@ -131,7 +133,7 @@ def _choose_steps(steps: int, error: StepError, allowed: float, order: int) -> i
     if over <= 1.0 or not np.isfinite(over):
         return steps
     finer = steps * min(1.1 * over ** (1.0 / order), MUCH_FINER)
-    return min(max(int(np.ceil(finer)), steps + 1), MAX_SUBSTEPS)
+    return min(max(int(np.ceil(finer)), steps + 1), MOST_STEPS[order])
 
 
 @np.errstate(all="ignore")
