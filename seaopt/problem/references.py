@@ -65,7 +65,7 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 
 def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     sensors = table.robustness.sensors if table.robustness else SensorsTable()
-    known = {name for plant in plants.values() for name in plant.outputs}
+    known = list(dict.fromkeys(name for plant in plants.values() for name in plant.outputs))
     for kind in SensorsTable.model_fields:
         for name in getattr(sensors, kind):
             if name not in known:

@@ -111,7 +111,8 @@ def loop_figure(controller: Controller, plants: dict[str, tuple[Plant, Parameter
     handles: dict[str, Any] = {}
     for axis in axes.ravel():
         handles |= {str(line.get_label()): line for line in axis.lines if not str(line.get_label()).startswith("_")}
-    figure.legend(list(handles.values()), list(handles), loc="outside upper left", frameon=False, ncols=len(handles))
+    columns = min(len(handles), 5)
+    figure.legend(list(handles.values()), list(handles), loc="outside upper left", frameon=False, ncols=columns)
     return figure
 
 
