@@ -215,7 +215,11 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[Callable[[], Plant
         loads = friction.loads
         if loads is None:
             return friction
-        return replace(friction, loads=lambda x, u, p: loads(x, solve_inside(0.0, x, u, p)[0], p))
+        still = dict.fromkeys(plant.friction, 0.0)  # loads do not depend on friction
+        return replace(
+            friction,
+            loads=lambda x, u, p: loads(x, solve_inside(0.0, x, SimpleNamespace(**{**vars(u), **still}), p)[0], p),
+        )
 
     def port(one: Port) -> Port:
         makers = {name: make for name, make in (("held", one.held), ("probe", one.probe)) if make is not None}

@@ -358,7 +358,13 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         loads = friction.loads
         if loads is None:
             return friction
-        return replace(friction, loads=lambda x, u, p: loads(x, SimpleNamespace(**split(0.0, x, u, p)[0]), p))
+        still = dict.fromkeys(plant.friction, 0.0)  # loads do not depend on friction
+        return replace(
+            friction,
+            loads=lambda x, u, p: loads(
+                x, SimpleNamespace(**split(0.0, x, SimpleNamespace(**{**vars(u), **still}), p)[0]), p
+            ),
+        )
 
     return replace(
         plant,

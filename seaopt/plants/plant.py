@@ -8,6 +8,7 @@ mapping from state (output) names to expressions. They are called once, when the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field, replace
 from types import SimpleNamespace
@@ -165,7 +166,7 @@ class Plant:
         Raises
         ------
         ParameterError
-            A parameter has neither a value in `params` nor a default.
+            A parameter has neither a value in `params` nor a default, or one that the plant cannot have.
         UnitError
             A value's unit has another dimension than the plant's.
 
@@ -179,7 +180,7 @@ class Plant:
         for name, default in self.parameters.items():
             unit = self.parameter_unit(name)
             if name in params:
-                completed.append(_convert_unit(params[name], unit, self.name))
+                completed.append(_keep_bounds(_convert_unit(params[name], unit, self.name), default, self.name))
             elif isinstance(default, Parameter):
                 completed.append(default)
             else:
@@ -409,6 +410,22 @@ def _convert_unit(parameter: Parameter, unit: str, plant: str) -> Parameter:
     prior, std = (None if value is None else value * scale for value in (parameter.prior_std, parameter.std))
     low, high = parameter.min * scale, parameter.max * scale
     return replace(parameter, value=parameter.value * scale, unit=unit, min=low, max=high, prior_std=prior, std=std)
+
+
+def _keep_bounds(parameter: Parameter, default: str | Parameter, plant: str) -> Parameter:
+    """Return a parameter with the plant's bounds where it has none of its own."""
+    if isinstance(default, str):
+        return parameter
+    low = default.min if parameter.min == -math.inf else parameter.min
+    high = default.max if parameter.max == math.inf else parameter.max
+    if (low, high) == (parameter.min, parameter.max):
+        return parameter
+    if not low <= parameter.value <= high:
+        raise ParameterError(
+            f"parameter {parameter.name} = {parameter.value:g}{unit_after(parameter.unit)} of plant {plant} is outside "
+            f"{low:g} to {high:g}; correct its value, sign or unit"
+        )
+    return replace(parameter, min=low, max=high)
 
 
 def _evaluate_equations(plant: Plant, what: str, equations: Equations, *arguments: Any) -> Mapping[str, Any]:

@@ -225,12 +225,12 @@ def _weigh(
     after = _measure_powers(solved.solution.evaluation, solved.problem)
     if len(after) != len(before):
         return None
-    fall = np.log(before[:, 0] / after[:, 0])
+    fall = np.log(before[:, 0]) - np.log(after[:, 0])
     gain = 0.5 * float(np.sum(before[:, 1] * fall)) / colour
     values = dict(zip(solved.problem.unknowns.names, solved.solution.z.tolist(), strict=True))
     variances = colour * np.diag(invert(solved.solution.evaluation.hessian)[0])
     stds = dict(zip(values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
-    left = float(np.min(after[:, 0] / before[:, 0]))
+    left = float(np.exp(-np.max(fall)))
     text = candidate.describe(values, stds) if gain > ENOUGH and not (poor and left > HALVED) else None
     if text is None:
         return None
