@@ -303,3 +303,19 @@ def test_a_torque_sensor_lags():
 def test_options_that_do_not_exist_are_refused(options, words):
     with pytest.raises(PlantError, match=words):
         so.plants.rotary(**options)
+
+
+def test_a_torque_on_a_link_whose_motor_sticks_twists_the_spring():
+    """With the motor stuck the shank rests where spring and gravity hold the torque: k_s a + m g L sin a = tau_e."""
+    knee = so.plants.let_stick(so.plants.rotary("pendulum", external=True))
+    params = knee.defaults.update(f_c=5.0, d_l=6.0)
+    n = 1000
+    log = so.Log.from_arrays(time=np.arange(n) / 500, I=np.zeros(n), tau_e=np.full(n, 40.0))
+    run = so.simulate(knee, params, log, initial_state={}, rtol=1e-3)
+    angle = run["theta_l"][-1]
+    weight = params["m"].value * params["g"].value * params["L"].value
+    assert params["k_s"].value * angle + weight * math.sin(angle) == pytest.approx(40.0, rel=1e-6)
+    assert np.max(np.abs(run["theta_m"])) < 1e-5
+    np.testing.assert_allclose(run["tau_s"], -params["k_s"].value * run["theta_l"], atol=1e-4)
+    without = so.simulate(knee, params, so.Log.from_arrays(time=log.time, I=log["I"]), initial_state={})
+    assert np.max(np.abs(without["theta_l"])) == 0.0

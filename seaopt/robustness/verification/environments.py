@@ -114,6 +114,7 @@ class StabilityMap:
         return {
             "stable_everywhere": self.everywhere,
             "fixed_stable": self.fixed_stable,
+            "units": {"m_2": self.called.inertia, "k_e": self.called.stiffness, "d_e": self.called.damping},
             "range": {
                 "m_2": [float(self.mass[0]), float(self.mass[-1])],
                 "k_e": [float(self.stiffness[0]), float(self.stiffness[-1])],

@@ -87,6 +87,7 @@ class LargeSignal:
         """Return amplitudes, bandwidths and the saturation map, for robustness.json."""
         return {
             "plant": self.plant,
+            "unit": self.unit,
             "amplitude_N": self.amplitude_N.tolist(),
             "bandwidth_hz": list(self.bandwidth_hz),
             "predicted_hz": list(self.predicted_hz),
