@@ -116,6 +116,8 @@ class Survey:
         Of the sensors: measured = gain * output.
     pairs : tuple of Pair
         Input by input.
+    adapt : callable ``params -> params``
+        Puts parameters of this log alone in their places.
 
     """
 
@@ -123,12 +125,14 @@ class Survey:
     clock: Clock
     gain: Mapping[str, float]
     pairs: tuple[Pair, ...]
+    adapt: Callable[[ParameterSet], ParameterSet] = lambda params: params
 
     def model(self, pair: Pair, params: ParameterSet) -> ResponseFunction:
         """Return the plant's response as the sensors see it, linearised at rest, as a function of frequencies in Hz.
 
         A plant with dry friction slides: what moves enough to be measured does, and at rest it would be a damper.
         """
+        params = self.adapt(params)
         model = linearise(make_model(take_sliding(self.plant, params), params, (), (pair.output,)))
         clock = replace(self.clock, delay_free=False)
         source, gain = list(self.plant.inputs).index(pair.source), self.gain.get(pair.output, 1.0)
@@ -144,7 +148,7 @@ class Survey:
         None where the plant does not have the form k/(m_k s^2 + b_m s + k) from this input to this output, a force or a
         torque.
         """
-        values, actuation, spring = self.plant.complete(params), self.plant.actuation, self.plant.spring
+        values, actuation, spring = self.plant.complete(self.adapt(params)), self.plant.actuation, self.plant.spring
         if pair.second_order is None or actuation is None or spring is None or spring.stiffness is None:
             return None
         sensing = self.plant.sensing

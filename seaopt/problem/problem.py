@@ -49,7 +49,7 @@ from seaopt.problem.schema import (
 )
 from seaopt.records import record
 from seaopt.robustness import place_value
-from seaopt.units import ROTARY, factor
+from seaopt.units import ROTARY, factor, same_dimension
 
 MAX_BYTES = 4 << 20
 OWN = "parameter "  # before the name of a parameter that is read as a channel
@@ -244,6 +244,12 @@ class Problem:
             return replace(made, min=low, max=made.max if given.max is not None else max(default.max, made.value))
         if not isinstance(given, ColumnTable):
             return given
+        read, unit = log.signal(OWN + name).unit, plant.parameter_unit(name)
+        if read and read != unit and not same_dimension(read, unit):
+            raise ProblemError(
+                f'experiment {table.name}: parameters: {name} is in {unit or "no unit"}, and column "{given.column}" '
+                f"in {read}; correct the column's unit"
+            )
         values = set(log[OWN + name].tolist())
         if len(values) != 1:
             raise ProblemError(

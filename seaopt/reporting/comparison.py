@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,9 +48,10 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
     known = nuisance.delay_s if nuisance is not None else _value(delay)
     clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known, delay_free=free)
     gain = nuisance.gain if nuisance is not None else {name: _value(gain) for name, gain in experiment.gain.items()}
-    return survey(
+    estimate = survey(
         experiment.plant, experiment.log, outputs=experiment.outputs, clock=clock, gain=gain, stretch_s=stretch_s
     )
+    return replace(estimate, adapt=experiment.apply_own)
 
 
 def _value(number: float | Parameter) -> float:
@@ -104,8 +106,8 @@ def survey_figure(
     return bode_figure(panels)
 
 
-def sentence(measured: Survey, fit: Fit) -> str:
-    """Say in plain words how the frequency responses of one experiment compare with the fit."""
+def sentence(measured: Survey, fit: Fit, experiment: str) -> str:
+    """Say in plain words how the frequency responses of the experiment of a name compare with the fit."""
     usable = [pair for pair in measured.pairs if pair.second_order is not None]
     if not usable:
         return "The log is not coherent enough for a comparison in frequency."
@@ -114,7 +116,7 @@ def sentence(measured: Survey, fit: Fit) -> str:
     parts = [f"The fitted model lies {_each(away, names)} standard deviations from H1 (rms over its coherent lines)"]
     forms = [pair.second_order.misfit for pair in usable if pair.second_order is not None]
     parts.append(f", the second-order fit {_each(forms, names)}. ")
-    if has_friction(measured.plant, fit.parameters):
+    if has_friction(measured.plant, measured.adapt(fit.parameters)):
         parts.append("With dry friction a response depends on the amplitude: the model's is that of sliding. ")
     elif max(away) > FAR:
         parts.append("The model lacks something that the log shows. ")
@@ -123,7 +125,8 @@ def sentence(measured: Survey, fit: Fit) -> str:
         parts.append(f"{join_words(odd)} {'is' if len(odd) == 1 else 'are'} not of second order.")
     spring = measured.plant.spring
     if spring is not None and spring.mass is not None and spring.damping is not None:
-        derived = {name: fit.derived[name] for name in (spring.mass, spring.damping)}
+        figures = (spring.mass, spring.damping)
+        derived = {name: fit.derived.get(f"{experiment}.{name}") or fit.derived[name] for name in figures}
         parts += [_reading(pair, drive, derived) for pair, drive in _drives(measured, fit)[:1]]
     return "".join(parts).strip()
 

@@ -222,7 +222,7 @@ def _caption(name: str) -> str:
 def _note(name: str, surveys: Mapping[str, Survey], fit: Fit | None) -> str:
     """Return what a figure of frequency responses shows, in words; nothing for other figures."""
     kind, _, experiment = name.partition("_")
-    return sentence(surveys[experiment], fit) if kind == "response" and fit is not None else ""
+    return sentence(surveys[experiment], fit, experiment) if kind == "response" and fit is not None else ""
 
 
 def _swings(certificate: Certificate | None) -> bool:

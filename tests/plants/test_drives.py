@@ -130,6 +130,16 @@ def test_a_torque_controller_commands_the_voltage():
     assert again.inputs == plant.inputs and again.port.probe is not None
 
 
+def test_a_limit_of_the_current_is_said_to_be_one_of_the_voltage():
+    """Linear in the command: 12 V at rest are 12 times the effort of one, N eta K_tau / R."""
+    plant = so.plants.rotary(link="locked", parts=["voltage_input"])
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, current_limit_A=12.0)
+    controller = so.tune(plant, plant.defaults, spec)
+    at_rest = 12.0 * 50.0 * 0.05 / 1.0
+    assert any("12 V of V" in note for note in controller.notes)
+    assert f"12 V allow a reference of {at_rest:.4g} N m at rest" in str(controller)
+
+
 def test_loads_of_friction_see_the_current_behind_the_drive():
     inner = so.Plant(
         name="hub", states={"q": "rad", "w": "rad/s"}, inputs={"I": "A"}, outputs={"q": "rad"},

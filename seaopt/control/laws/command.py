@@ -12,7 +12,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import describe_parameters, evaluate
 from seaopt.records import record
-from seaopt.units import Mechanics, mechanics_of
+from seaopt.units import Mechanics, mechanics_of, unit_after
 
 
 @record
@@ -96,6 +96,16 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
                 f"{effort:g}; give it actuation = Actuation(input, effort)"
             )
     return Command(input=source, unit=unit, per_effort=1.0 / effort, effort_unit=effort_unit)
+
+
+def limit_notes(command: Command, limit: float | None) -> tuple[str, ...]:
+    """Say what a limit of the current is of where something else is commanded: a voltage, a duty."""
+    if limit is None or command.unit == "A":
+        return ()
+    return (
+        f"current_limit_A = {limit:g} is of what is commanded, {limit:g}{unit_after(command.unit)} of {command.input}: "
+        "the current itself is not limited",
+    )
 
 
 def actuation_notes(plant: Plant, command: Command) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control.laws.command import Command, actuation_notes
+from seaopt.control.laws.command import Command, actuation_notes, limit_notes
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
@@ -41,6 +41,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
 from seaopt.records import record
+from seaopt.units import unit_after
 
 FRICTION_MARGIN = "friction_margin"  # among what controller.json says is achieved
 CONTROLLER_SCHEMA = "seaopt/controller/2"
@@ -175,7 +176,10 @@ class Controller:
         plant, values = self.design
         # What the plants of robust_to need is in the same set.
         vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
-        return (*lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command), *self._noise_notes())
+        return (
+            *lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command),
+            *limit_notes(self.command, self.spec.current_limit_A), *self._noise_notes(),
+        )  # fmt: skip
 
     def _friction_notes(self) -> tuple[str, ...]:
         """Say that a friction margin was asked where there is no friction."""
@@ -381,8 +385,8 @@ class Controller:
         if slow is None or fast is None:
             return []
         limit, band = self.spec.current_limit_A, self.spec.bandwidth_hz
-        unit = self.command.effort_unit
-        return [f"  {limit:g} A allow a reference of {slow:.4g} {unit} at rest and {fast:.4g} {unit} at {band:g} Hz"]
+        unit, most = self.command.effort_unit, f"{limit:g}{unit_after(self.command.unit)}"
+        return [f"  {most} allow a reference of {slow:.4g} {unit} at rest and {fast:.4g} {unit} at {band:g} Hz"]
 
     def _repr_html_(self) -> str:
         head, *_ = repr(self).splitlines()

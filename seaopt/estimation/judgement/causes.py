@@ -620,6 +620,11 @@ def _say_gain(gain: float) -> str | None:
     return f"reads {gain:.3g} times what it should" if likely else None
 
 
+def _share_parameter(name: str, one: Plant, other: Plant) -> bool:
+    """Tell whether both plants have a parameter, in the same unit."""
+    return name in other.parameters and one.parameter_unit(name) == other.parameter_unit(name)
+
+
 def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, plant: Plant) -> Iterator[_Candidate]:
     """Yield another plant in place of the experiments' own."""
     if any(e.plant.name == plant.name or not set(e.outputs) <= set(plant.outputs) for e in experiments):
@@ -629,16 +634,20 @@ def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, pla
     free = [name for name in params.free_names if name in plant.parameters]
     if not free:
         return
-    own = plant.complete(params.fix())
     changed = tuple(
-        replace(e, plant=plant, initial_state=e.initial_state if isinstance(e.initial_state, str) else "estimate")
+        replace(
+            e, plant=plant, initial_state=e.initial_state if isinstance(e.initial_state, str) else "estimate",
+            parameters={n: v for n, v in e.parameters.items() if _share_parameter(n, e.plant, plant)},
+        )
         for e in experiments
-    )
+    )  # fmt: skip
+    own = [own for e in changed for own in e.list_own().values()]
+    values = plant.complete(changed[0].apply_own(params.fix())).values()
 
     def describe(values: Mapping[str, float], stds: Mapping[str, float]) -> str | None:
         return f"the log is of the plant {plant.name}, not {experiments[0].plant.name}"
 
     yield _Candidate(
-        where=experiments[0].name, experiments=changed, params=ParameterSet(own.values()).free(*free),
+        where=experiments[0].name, experiments=changed, params=ParameterSet([*values, *own]).free(*free),
         describe=describe,
     )  # fmt: skip

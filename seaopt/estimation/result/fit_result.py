@@ -190,9 +190,15 @@ class Fit:
         Raises
         ------
         EstimationError
-            The log is too short.
+            The log is too short, or has a free parameter of its own that the fit has not.
 
         """
+        for name, parameter in experiment.list_own().items():
+            if parameter.name not in self.parameters:
+                raise EstimationError(
+                    f"experiment {experiment.name}: its own {name} is free, and the fit has no {parameter.name}; "
+                    f"give {name} a value, or fit it with this log"
+                )
         own, in_band = self._find_nuisance(experiment)
         model = make_model(experiment.plant, experiment.apply_own(self.parameters), (), experiment.outputs)
         n = len(experiment.log)

@@ -19,6 +19,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import RANK, eliminate
 from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
+from seaopt.plants import CompletedParameters
 from seaopt.records import record
 from seaopt.simulation import Segment, run_passes
 from seaopt.units import unit_after
@@ -162,7 +163,9 @@ def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
 
 
 def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) -> tuple[str, ...]:
-    """Return a warning that names values from a fit that cannot identify them; nothing where there are none.
+    """Return a warning that names values from a fit that cannot identify them, and one of those fitted for logs alone.
+
+    Nothing where there are none.
 
     Parameters
     ----------
@@ -172,13 +175,34 @@ def warn_unidentified(params: ParameterSet, used: Container[str] | None = None) 
         The names that matter; all if left out.
 
     """
+    alone = _warn_alone(params.given if isinstance(params, CompletedParameters) else params, used)
     names = [name for name in params.unidentified_names if used is None or name in used]
     if not names:
-        return ()
+        return alone
     values = ", ".join(f"{name} = {params[name].value:.4g}{unit_after(params[name].unit)}" for name in names)
     verb = "is" if len(names) == 1 else "are"
     return (
         f"the fit does not identify {join_words(names)}: {values} {verb} one choice among others that fit as well, "
         "and what follows at these values holds for no other; excite more, or give a value, a prior, or a range to "
         "certify over",
+        *alone,
+    )
+
+
+def _warn_alone(params: ParameterSet, used: Container[str] | None) -> tuple[str, ...]:
+    """Return a warning of each parameter that was fitted for single logs, EXPERIMENT.NAME: nothing else takes those."""
+    fitted: dict[str, list[str]] = {}
+    for label, parameter in params.items():
+        experiment, dot, name = label.partition(".")
+        if dot and (used is None or name in used):
+            value = f"{parameter.value:.4g}{unit_after(parameter.unit)}"
+            fitted.setdefault(name, []).append(f"{value} in {experiment}")
+    taken = {
+        name: f"{name} = {params[name].value:.4g}{unit_after(params[name].unit)}" if name in params else "its default"
+        for name in fitted
+    }
+    return tuple(
+        f"{name} was fitted for single logs ({', '.join(values)}), and what follows is for {taken[name]}; give the "
+        "value that is meant, or a range to certify over"
+        for name, values in fitted.items()
     )

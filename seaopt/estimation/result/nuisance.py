@@ -34,7 +34,7 @@ def estimate_nuisance(
     """
     values = experiment.plant.complete(experiment.apply_own(params))
     known = ParameterSet(values.values()).fix()
-    problem = pose_problem((experiment,), known, loss=Squares(), band_hz=band_hz)
+    problem = pose_problem((replace(experiment, parameters={}),), known, loss=Squares(), band_hz=band_hz)
     solved = settle(problem, problem.evaluate(problem.unknowns.start), ITERATIONS, None)
     problem, z = solved.problem, solved.solution.z
     statistics = compute_statistics(problem, z)

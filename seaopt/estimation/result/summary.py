@@ -261,6 +261,7 @@ def _derive_figures(
 
     Sigma is over what is seen. A figure that is the same along every direction that is not has its variance from that,
     whatever single parameters have (an estimable function: Searle, Linear Models, 1971, ch. 5); any other has none.
+    One that depends on parameters of one log alone is that log's, EXPERIMENT.NAME.
     """
     out: dict[str, DerivedFigure] = {}
     sizes = {name: fitted[name].value for name in seen.names}
@@ -268,11 +269,14 @@ def _derive_figures(
         plant = experiment.plant
         function, units = _compile_figures(plant)
         values, slopes = (np.array(array) for array in function(plant.complete(experiment.apply_own(fitted)).vector))
-        names = list(plant.parameters)
+        own = {name: parameter.name for name, parameter in experiment.list_own().items()}
+        names = [own.get(name, "" if name in experiment.parameters else name) for name in plant.parameters]
         free = [name for name in seen.names if name in names]
         rows = [seen.names.index(name) for name in free]
         matrix = seen.matrix[np.ix_(rows, rows)]
-        for i, (name, unit) in enumerate(units.items()):
+        alone = [name in experiment.parameters for name in plant.parameters]
+        for i, (figure, unit) in enumerate(units.items()):
+            name = f"{experiment.name}.{figure}" if np.any(slopes[i, alone]) else figure
             g = slopes[i, [names.index(parameter) for parameter in free]]
             determined = known.determines(dict(zip(free, g.tolist(), strict=True)), sizes)
             std = float(np.sqrt(max(float(g @ matrix @ g), 0.0))) if determined else np.inf

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.errors import EstimationError, ProblemError
+from seaopt.estimation import warn_unidentified
+from seaopt.reporting.comparison import experiment_survey
 
 RATE_HZ, K, B = 200.0, 400.0, 1.5
 MASSES = {"light": 0.5, "heavy": 2.0}
@@ -122,3 +126,77 @@ def test_wrong_ones_are_refused(experiments):
             so.Experiment(plant=one.plant, log=one.log, parameters=parameters)
     with pytest.raises(EstimationError, match="is free, but"):
         so.fit(experiments[:1], so.ParameterSet.of(m=(1.0, "kg"), k=(K, "N/m"), b=(B, "N s/m")).free("m"))
+
+
+def make_derived_cart():
+    """Return the cart with its frequency, and what it has of its damper alone, as derived figures."""
+    figures = lambda p: {"f": ((p.k / p.m) ** 0.5 / (2 * np.pi), "Hz"), "tau": (p.b / p.k, "s")}  # noqa: E731
+    return replace(make_cart(), derived=figures)
+
+
+def test_derived_figures_of_own_parameters_are_their_logs_own(experiments):
+    """d log f = (d log k - d log m)/2; the std of f follows from the covariance of k and heavy.m."""
+    start = so.ParameterSet.of(k=(250.0, "N/m"), b=(0.5, "N s/m")).bound(k=(0, 1e5), b=(0, 1e3)).free("k", "b")
+    fit = so.fit([replace(e, plant=make_derived_cart()) for e in experiments], start)
+    assert set(fit.derived) == {"light.f", "heavy.f", "tau"}
+    k, m, names = fit.parameters["k"].value, fit.parameters["heavy.m"].value, list(fit.covariance.names)
+    slopes = np.zeros(len(names))
+    slopes[[names.index("k"), names.index("heavy.m")]] = 0.5 / k, -0.5 / m
+    heavy = fit.derived["heavy.f"]
+    assert np.isclose(heavy.value, np.sqrt(k / m) / (2 * np.pi))
+    assert np.isclose(heavy.std, heavy.value * np.sqrt(slopes @ fit.covariance.matrix @ slopes))
+    assert np.isclose(fit.derived["light.f"].value, np.sqrt(k / MASSES["light"]) / (2 * np.pi))
+
+
+def test_a_start_is_estimated_with_the_fitted_mass(fit, experiments):
+    """Another log of the same experiment: the start belongs to the mass with which it is simulated."""
+    heavy = experiments[1]
+    later = heavy.log.between(2.0, 7.0)
+    fitted = fit.predict(replace(heavy, log=later))
+    known = fit.predict(replace(heavy, log=later, parameters={"m": fit.parameters["heavy.m"].value}))
+    assert fitted.own.initial_state == known.own.initial_state
+    assert fitted.fit_percent["x"] > 99.0
+
+
+def test_a_free_parameter_that_the_fit_has_not_is_refused(fit, experiments):
+    with pytest.raises(EstimationError, match=r"other\.m"):
+        fit.predict(experiments[1].rename("other"))
+
+
+def test_a_unit_of_another_kind_in_a_header_is_refused(records, tmp_path):
+    t, f, x = records["light"]
+    rows = [f"{a!r},{b!r},{c!r}" for a, b, c in zip(t.tolist(), f.tolist(), x.tolist(), strict=True)]
+    (tmp_path / "light.csv").write_text("\n".join(["# payload = 0.5", "time [s],F [N],x [m]", *rows]) + "\n")
+    text = "schema = 1\n[parameters]\nk = 400\nb = { value = 0.5, free = true }\n" + CART
+    text += '[[experiment]]\nname = "light"\nplant = "cart"\nlog = "light.csv"\ntime = "time [s]"\n'
+    text += 'inputs = { F = "F [N]" }\noutputs = { x = "x [m]" }\n'
+    text += 'parameters = { m = { column = "payload", from = "header", unit = "mA" } }\n'
+    (tmp_path / "cart.toml").write_text(text)
+    with pytest.raises(ProblemError, match="is in kg, and column"):
+        so.read_problem(tmp_path / "cart.toml").experiments()
+
+
+def test_frequency_responses_take_each_logs_own(fit, experiments):
+    k, b = (fit.parameters[name].value for name in ("k", "b"))
+    for experiment, m in zip(experiments, (MASSES["light"], fit.parameters["heavy.m"].value), strict=True):
+        measured, w = experiment_survey(experiment, fit), 2 * np.pi * np.array([1.0, 5.0])
+        response = measured.model(measured.pairs[0], fit.parameters)(w / (2 * np.pi))
+        assert np.allclose(np.abs(response), 1.0 / np.abs(k - m * w**2 + 1j * b * w), rtol=1e-2)
+
+
+def test_what_is_computed_for_no_log_says_which_value_it_takes(fit):
+    params = fit.parameters.with_parameters(so.Parameter(name="m", value=3.0, unit="kg"))
+    assert any("heavy" in note and "m = 3" in note for note in warn_unidentified(params, {"m"}))
+    assert not warn_unidentified(params, {"k"})
+
+
+def test_another_plant_without_the_own_parameter_is_a_cause():
+    """A log of the stand, fitted as one of the pendulum with a known mass, which the stand does not have."""
+    stand, swing = so.plants.high_impedance(drive="lumped"), so.plants.moving_output(drive="lumped")
+    t, rng = np.arange(500) / 250, np.random.default_rng(0)
+    current = np.interp(t, np.arange(0, 4.1, 0.04), rng.normal(size=103) * 1.5)
+    force = so.simulate(stand, so.plants.thor(), so.Log.from_arrays(time=t, I=current))["F1"]
+    log = so.Log.from_arrays(time=t, I=current, F1=force + 2.0 * rng.normal(size=t.size))
+    wrong = so.Experiment(plant=swing, log=log, name="a", parameters={"m": 6.0})
+    fit = so.fit([wrong], so.plants.thor().free("b_r"), alternatives=[stand])
+    assert not fit.met and any(finding.kind == "cause" and stand.name in finding.text for finding in fit.findings)
