@@ -1,4 +1,4 @@
-"""Symbolic CasADi plants: the paper's actuator between two links, and a user's own."""
+"""Symbolic CasADi plants: linear and rotary actuators between two links, and a user's own."""
 
 from seaopt.plants.exchange import export_fmu, to_control
 from seaopt.plants.friction import let_stick
