@@ -143,3 +143,29 @@ def test_what_cannot_stick_and_loads_that_are_not_rated_are_refused():
     with pytest.raises(PlantError, match="true or false"):
         so.plants.plant_of_kind("high_impedance", sticks="yes")
     assert so.plants.plant_of_kind("high_impedance", sticks=True).sticks
+
+
+@pytest.mark.slow
+def test_a_fall_of_friction_that_lost_its_effect_on_the_way_is_brought_back():
+    """Stribeck's fall: from this start the search once ended at v_st = 7e-5, where it does nothing, and said met."""
+    stand = so.plants.let_stick(so.plants.high_impedance(parts=["stribeck"]))
+    own = (so.Parameter(name="f_s", value=30.0, unit="N"), so.Parameter(name="v_st", value=0.01, unit="m/s"))
+    truth = so.plants.thor().update(f_c=20.0).with_parameters(*own)
+    values = {name: parameter.value for name, parameter in stand.complete(truth).items()}
+    rate, n, rng = 500.0, 4000, np.random.default_rng(2)
+    t = np.arange(n) / rate
+    tones = np.unique(np.round(np.geomspace(0.25, 60, 30) / 0.125) * 0.125)
+    current = np.sin(2 * np.pi * 0.25 * t) + 0.9 / np.sqrt(15) * sum(
+        np.sin(2 * np.pi * tone * t + rng.uniform(0, 2 * np.pi)) for tone in tones
+    )
+    through = {"num": [1.0], "den": [1.0]}
+    law = {"sample_time_s": 1 / rate, "delay_samples": 0, "reference": through, "measurement": through | {"num": [0.0]}}
+    effort = values["eta"] * values["K_tau"] / (values["l"] / (2 * np.pi * values["N_p"]))
+    run = simulate([Mass.of(values, jump=True)], [law], effort * current[None], substeps=60)
+    log = so.Log.from_arrays(time=t, I=current, F1=run.force[0] + 2.0 * rng.normal(size=n))
+    start = truth.update(J=2.5e-6, b_r=2e-4, f_c=12.0, f_s=20.0, v_st=0.02, eta=0.9)
+    free = start.free("J", "b_r", "eta", "f_c", "f_s", "v_st")
+    fit = so.fit([so.Experiment(plant=stand, log=log, outputs=("F1",))], free)
+    assert fit.met, str(fit)
+    for name in free.free_names:
+        assert abs(fit.parameters[name].value - values[name]) < 4.0 * fit.parameters[name].std, fit.parameters[name]

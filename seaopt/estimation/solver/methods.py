@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
+from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
@@ -17,6 +18,7 @@ from seaopt.estimation.solver.settle import Solved, explains_little, settle, set
 from seaopt.estimation.solver.stretches import find_start_on_stretches
 from seaopt.records import record
 
+FAR = 10.0  # times its start: a parameter whose standard deviation is larger than itself there has lost its effect
 FURTHER = 5  # guesses of the frequency responses that are tried at most
 
 
@@ -61,6 +63,8 @@ class OutputError(Method):
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
         solved = settle(problem, best, self.max_iterations, callback) if np.isfinite(best.cost) else None
+        if solved is not None and self.search:
+            solved = self._bring_back(solved, callback)
         if solved is not None and not (self.search and _is_doubtful(solved, guesses)):
             return solved
         for start in _further_starts(problem, best, guesses, self) if self.search else ():
@@ -72,6 +76,25 @@ class OutputError(Method):
             if not _is_doubtful(solved, guesses):
                 break
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
+
+    def _bring_back(self, solved: Solved, callback: Callback | None) -> Solved:
+        """Return the better of a minimum and one from where parameters that lost their effect are at their start again.
+
+        So friction's fall over a speed that becomes tiny: nothing brings it back, and the others have taken its place.
+        """
+        problem, evaluation, shared = solved.problem, solved.solution.evaluation, solved.problem.unknowns.shared
+        if not np.all(np.isfinite(evaluation.hessian)):
+            return solved
+        start, z = problem.unknowns.start[:shared], solved.solution.z[:shared]
+        variances = np.diag(invert(evaluation.hessian)[0])[:shared]
+        far = (np.abs(z) < np.abs(start) / FAR) | (np.abs(z) > FAR * np.abs(start))
+        lost = np.flatnonzero(far & (start != 0.0) & (variances > z**2))
+        if not lost.size:
+            return solved
+        again = solved.solution.z.copy()
+        again[lost] = start[lost]
+        other = settle(problem, problem.evaluate(again), self.max_iterations, callback)
+        return other if other.misfit < solved.misfit else solved
 
 
 @record
