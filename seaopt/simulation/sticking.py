@@ -27,6 +27,7 @@ from seaopt.simulation.runge_kutta import runge_kutta_step
 
 LATEST_STOP = 0.999  # of a step: in what is left of it a force must have an effect that can be divided by
 AT_ONCE = 1e-6  # of a step: a joint that stops before that is at rest
+SHORTEST_S = 1e-12  # in place of a step without length, whose forces would be zero over zero
 TINY = 1e-300  # beside a difference that may be zero
 STILL_S = 1e-13  # a velocity that friction alone takes away in this time is rounding
 SWEEPS = 30  # over the forces of several joints that stop at once
@@ -54,8 +55,8 @@ def sticking_step(plant: Plant) -> ca.Function:
 def sticking_line_step(plant: Plant) -> ca.Function:
     """Return the CasADi function (t, x, u0, u1, p, h) -> x+ of one step, u a straight line from u0 to u1."""
     joints = _Joints(plant)
-    t, x, u0, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
-    u1 = ca.SX.sym("u1", u0.numel())
+    t, x, u0, p, length = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
+    u1, h = ca.SX.sym("u1", u0.numel()), length + ca.if_else(length > 0.0, 0.0, SHORTEST_S)
     before = joints.speeds(x, p)
     signs = joints.signs(t, x, u0, p)
 
@@ -89,7 +90,7 @@ def sticking_line_step(plant: Plant) -> ca.Function:
     effects = ca.horzcat(*(speeds - joints.speeds(each, p) for each in pushed))
     forces = _find_holding(speeds, effects, first, ca.if_else(levels > 0.0, 1.0, 0.0))
     stopped = free + ca.mtimes(ca.horzcat(*(each - free for each in pushed)), forces)
-    return ca.Function("step", [t, x, u0, u1, p, h], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
+    return ca.Function("step", [t, x, u0, u1, p, length], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
 
 
 @memo

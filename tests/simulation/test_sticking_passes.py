@@ -79,6 +79,20 @@ def test_compiled_and_interpreted_passes_agree_and_their_derivatives_are_those_o
         assert np.quantile(off, 0.99) < 1e-3 and np.max(off) < 0.01
 
 
+def test_a_free_delay_of_whole_samples_has_the_derivatives_of_one_beside_it(drive):
+    model, start, plain = make_model(BLOCK, VALUES, FREE), np.zeros((1, 2)), Weights.plain(2)
+    segment = Segment(u=(drive,), y=(np.zeros(drive.size), np.zeros(drive.size)))
+
+    def run(delay):
+        point = make_point([2.0, 800.0, 3.0], free=True, delay_s=delay)
+        return run_passes(model, segment, point, start, plain, outputs=True, columns=True)
+
+    whole, beside = run(2e-3), run(2e-3 + 1e-9)
+    assert np.allclose(whole.outputs[:, 0], beside.outputs[:, 0], atol=1e-8)
+    size = np.max(np.abs(beside.columns[:, 0]), axis=0)  # of the speed that sticks at the start it is zero
+    assert np.all(np.abs(whole.columns[:, 0] - beside.columns[:, 0]) <= 1e-3 * size + 1e-8)
+
+
 def test_a_held_joint_stands_still_and_its_force_is_what_holds_it(drive):
     log = so.Log.from_arrays(time=np.arange(100) / 500, F=np.full(100, 2.5))
     run = so.simulate(BLOCK, VALUES, log)
