@@ -211,3 +211,11 @@ def test_the_integrals_that_the_tuning_page_states_are_those_of_its_code(capsys)
     exec("\n".join(lines) + "\n" + second, {})
     assert capsys.readouterr().out.split() == ["pid_dob", "1.0", "pid", "1.53"]
     assert "is 1.00\nwith it and 1.53 without;" in text
+
+
+def test_the_design_of_the_elastic_joint_tells_the_damping_better():
+    space: dict = {}
+    for code in blocks("elastic_joint.md", "python"):
+        exec(re.sub(r"(?m)^print\(.*", "", code), space)
+    ratio = space["design"].against((space["Chirp"](amplitude=0.5, f0_hz=0.1, f1_hz=10),)).ratio
+    assert ratio["b_r"] > 2.2 and ratio["c_s"] > 1.2 and ratio["k_s"] < 0.5
