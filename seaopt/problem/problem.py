@@ -104,9 +104,15 @@ class Problem:
 
     @property
     def notes(self) -> list[str]:
-        """What of the file's own plants may be a mistake: what they declare and do not use."""
+        """What of the file may be a mistake: what it declares and does not use."""
         tables = {name: table for name, table in self.table.plant.items() if isinstance(table, EquationsTable)}
-        return [f"plant.{name}.{text}" for name, table in tables.items() for text in list_unused(table)]
+        notes = [f"plant.{name}.{text}" for name, table in tables.items() for text in list_unused(table)]
+        used = {name for plant in self.plants.values() for name in plant.parameters}
+        for name in self.table.parameters:
+            if name not in used and self.plants:
+                remedy = suggestion(name, sorted(used - self.table.parameters.keys()))
+                notes.append(f"parameters.{name} is of no plant of this file; {remedy}")
+        return notes
 
     @property
     def robustness(self) -> RobustnessTable:

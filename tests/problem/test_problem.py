@@ -201,3 +201,11 @@ def test_a_plants_own_parameter_is_not_that_of_a_built_in_plant(write, monkeypat
     assert values == {"J": (0.1, "kg m^2"), "k": (300.0, "N m/rad"), "N": (-2.0, "N m/V"), "m_l": (0.7, "kg")}
     with pytest.raises(so.SeaoptError, match=r"parameters\.k is missing"):
         so.read_problem(write(text))
+
+
+def test_a_parameter_of_another_kind_of_actuator_is_noted(tmp_path):
+    """J is a screw's inertia; in a rotary actuator's file J_m would keep its default."""
+    path = tmp_path / "elbow.toml"
+    path.write_text('schema = 1\n[parameters]\nJ = 4e-5\nk_s = 350\n[plant.elbow]\nkind = "rotary"\n')
+    (note,) = so.read_problem(path).notes
+    assert "parameters.J " in note and "J_" in note
