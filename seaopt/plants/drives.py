@@ -38,7 +38,7 @@ import casadi as ca
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants.plant import Plant
-from seaopt.plants.roles import Actuation, Friction, Port
+from seaopt.plants.roles import Actuation, PlantMaker, put_behind
 from seaopt.records import record
 
 _RESISTANCE = Parameter(
@@ -185,13 +185,11 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     ), partial(_drive_again, add_servo, tuple(parts)))  # fmt: skip
 
 
-def _drive_again(
-    drive: Callable[[Plant, Collection[str]], Plant], parts: Collection[str], make: Callable[[], Plant]
-) -> Plant:
+def _drive_again(drive: Callable[[Plant, Collection[str]], Plant], parts: Collection[str], make: PlantMaker) -> Plant:
     return drive(make(), parts)
 
 
-def _put_before(plant: Plant, drive: _Drive, again: Callable[[Callable[[], Plant]], Plant]) -> Plant:
+def _put_before(plant: Plant, drive: _Drive, again: Callable[[PlantMaker], Plant]) -> Plant:
     """Return a plant behind a drive; `again` puts it before the plants that its ports make, too."""
     source = next(iter(plant.inputs))
     taken = {*plant.inputs, *plant.outputs, *plant.states, *plant.parameters} - {source}
@@ -211,20 +209,6 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[Callable[[], Plant
         inside, _, outputs = solve_inside(t, x, u, p)
         return {**plant.h(t, x, inside, p), **outputs}
 
-    def load(friction: Friction) -> Friction:
-        loads = friction.loads
-        if loads is None:
-            return friction
-        still = dict.fromkeys(plant.friction, 0.0)  # loads do not depend on friction
-        return replace(
-            friction,
-            loads=lambda x, u, p: loads(x, solve_inside(0.0, x, SimpleNamespace(**{**vars(u), **still}), p)[0], p),
-        )
-
-    def port(one: Port) -> Port:
-        makers = {name: make for name, make in (("held", one.held), ("probe", one.probe)) if make is not None}
-        return replace(one, **{name: partial(again, make) for name, make in makers.items()})
-
     before = plant.actuation
     actuation = before and Actuation(
         input=drive.input, effort=lambda p: before.effort(p) * drive.effort(p), unit=before.unit,
@@ -237,6 +221,6 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[Callable[[], Plant
         states={**plant.states, **drive.states}, inputs={drive.input: drive.unit, **others},
         outputs={**plant.outputs, **drive.outputs}, optional_inputs=frozenset(optional),
         parameters={**plant.parameters, **{item.name: item for item in drive.parameters}},
-        friction={name: load(one) for name, one in plant.friction.items()},
-        ports=tuple(port(one) for one in plant.ports),
+        friction=put_behind(plant.friction, lambda x, u, p: solve_inside(0.0, x, u, p)[0]),
+        ports=tuple(port.change_makers(again) for port in plant.ports),
     )  # fmt: skip

@@ -22,7 +22,7 @@ from seaopt.errors import PlantError
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import CompletedParameters, Plant, state_space
-from seaopt.plants.roles import Friction, PlantMaker, Port
+from seaopt.plants.roles import Friction, PlantMaker
 from seaopt.records import record
 
 SLIDING, STUCK = "sliding", "stuck"
@@ -285,14 +285,9 @@ def _with_slope(plant: Plant, state: str) -> Plant:
             jump=None, loads=None, rated={},
         )  # fmt: skip
 
-    def follow(maker: PlantMaker | None) -> PlantMaker | None:
-        return None if maker is None else partial(_make_with_slope, maker, state)
-
-    def port(one: Port) -> Port:
-        return replace(one, held=follow(one.held), probe=follow(one.probe))
-
+    change = partial(_make_with_slope, state=state)
     return replace(
-        plant, name=f"{plant.name} {state}", ports=tuple(port(one) for one in plant.ports),
+        plant, name=f"{plant.name} {state}", ports=tuple(port.change_makers(change) for port in plant.ports),
         friction={name: viscous(friction) for name, friction in plant.friction.items()},
     )  # fmt: skip
 

@@ -50,7 +50,7 @@ Around any plant, besides those of `seaopt.plants.drives`:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -62,7 +62,7 @@ from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants import drives
 from seaopt.plants.plant import Plant
-from seaopt.plants.roles import Friction, Port
+from seaopt.plants.roles import PlantMaker, put_behind
 from seaopt.records import record
 
 Part = Literal[
@@ -307,7 +307,7 @@ def wrapped(
     return plant
 
 
-def _make_filtered(make: Callable[[], Plant], part: str, signals: Sequence[str]) -> Plant:
+def _make_filtered(make: PlantMaker, part: str, signals: Sequence[str]) -> Plant:
     """Return what `make` makes, with one filter on each of the named signals that it has."""
     inner = make()
     known = inner.inputs if _FILTERS[part][2] == "input" else inner.outputs
@@ -342,11 +342,6 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
             rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
         return inner_u, dict(out), rates
 
-    def port_behind(port: Port) -> Port:
-        makers = {"held": port.held, "probe": port.probe}
-        behind = {name: partial(_make_filtered, make, part, signals) for name, make in makers.items() if make}
-        return replace(port, **behind)
-
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         inner_u, _, rates = split(t, x, u, p)
         return {**plant.f(t, x, SimpleNamespace(**inner_u), p), **rates}
@@ -354,17 +349,8 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return split(t, x, u, p)[1]
 
-    def load(friction: Friction) -> Friction:
-        loads = friction.loads
-        if loads is None:
-            return friction
-        still = dict.fromkeys(plant.friction, 0.0)  # loads do not depend on friction
-        return replace(
-            friction,
-            loads=lambda x, u, p: loads(
-                x, SimpleNamespace(**split(0.0, x, SimpleNamespace(**{**vars(u), **still}), p)[0]), p
-            ),
-        )
+    def find_inputs(x: Any, u: Any, p: Any) -> SimpleNamespace:
+        return SimpleNamespace(**split(0.0, x, u, p)[0])
 
     return replace(
         plant,
@@ -373,6 +359,6 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         parameters={**plant.parameters, **{parameter.name: parameter for parameter in PARTS[part]}},
         f=f,
         h=h,
-        ports=tuple(port_behind(port) for port in plant.ports),
-        friction={name: load(one) for name, one in plant.friction.items()} if where == "input" else plant.friction,
+        ports=tuple(port.change_makers(partial(_make_filtered, part=part, signals=signals)) for port in plant.ports),
+        friction=put_behind(plant.friction, find_inputs) if where == "input" else plant.friction,
     )

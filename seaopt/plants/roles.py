@@ -8,7 +8,8 @@ inputs, outputs and parameters, whose units the plant knows.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -167,6 +168,21 @@ class Friction:
         return mechanics_of(self.unit).damping
 
 
+def put_behind(frictions: Mapping[str, Friction], find_inputs: Callable[[Any, Any, Any], Any]) -> dict[str, Friction]:
+    """Return the frictions of a plant whose own inputs follow from others, by (x, u, p): their loads see its own."""
+    still = dict.fromkeys(frictions, 0.0)  # loads do not depend on friction
+
+    def put(one: Friction) -> Friction:
+        loads = one.loads
+        if loads is None:
+            return one
+        return replace(
+            one, loads=lambda x, u, p: loads(x, find_inputs(x, SimpleNamespace(**{**vars(u), **still}), p), p)
+        )
+
+    return {name: put(one) for name, one in frictions.items()}
+
+
 @record(eq=False)
 class Port:
     r"""Where the world touches an actuator: at one of its links, which moves or is held.
@@ -201,6 +217,11 @@ class Port:
     drive: str | None = None
     ratio: Expression = _one
     probe: PlantMaker | None = None
+
+    def change_makers(self, change: Callable[[PlantMaker], Any]) -> Port:
+        """Return the port with makers that make what `change` does of each: a function that pickles by its name."""
+        makers = {"held": self.held, "probe": self.probe}
+        return replace(self, **{name: partial(change, make) for name, make in makers.items() if make is not None})
 
 
 @record
