@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import field
 
@@ -12,7 +13,8 @@ from seaopt.bench.excitation import Excitation, excite
 from seaopt.errors import SimulationError, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
+from seaopt.plants import CompletedParameters, Plant
+from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
@@ -21,6 +23,8 @@ from seaopt.simulation import simulate
 @record
 class Sensors:
     """Errors of the sensors of each output, by name; what is left out is ideal.
+
+    An output that is computed from encoders (`deflection_sensor`) has their errors besides its own.
 
     Parameters
     ----------
@@ -47,6 +51,18 @@ class Sensors:
         if limit is not None:
             out = np.clip(out, -limit, limit)
         return step * np.round(out / step) if step else out
+
+    def combine_errors(self, plant: Plant, params: CompletedParameters, name: str) -> tuple[float, float]:
+        """Return noise (std) and rounding (step) of an output, of those encoders included that it is computed from.
+
+        Several roundings are as one of a step that has the same variance, the step's square over 12.
+        """
+        weights = {**evaluate_weights(plant, params, name), name: 1.0}
+        noise, step = (
+            math.hypot(*(weight * errors.get(source, 0.0) for source, weight in weights.items()))
+            for errors in (self.noise_std, self.quantisation)
+        )
+        return noise, step
 
 
 def virtual_log(
@@ -114,6 +130,11 @@ def virtual_log(
     )
     truth = simulate(plant, params, commanded, initial_state=initial_state)
     signals = dict(commanded.signals)
-    for stream, (name, unit) in zip(streams[1:], plant.outputs.items(), strict=True):
-        signals[name] = Signal(name=name, values=devices.read(name, truth[name], stream), unit=unit)
+    values, computed = plant.complete(params), plant.sensing.from_encoders if plant.sensing is not None else ()
+    for name, stream in sorted(zip(plant.outputs, streams[1:], strict=True), key=lambda pair: pair[0] in computed):
+        reading = truth[name]
+        for encoder, weight in evaluate_weights(plant, values, name).items():
+            if encoder in plant.outputs:
+                reading = reading + weight * (signals[encoder].values - truth[encoder])
+        signals[name] = Signal(name=name, values=devices.read(name, reading, stream), unit=plant.outputs[name])
     return Log(time=time, signals=signals, source=f"virtual {plant.name}, seed {seed}")

@@ -45,12 +45,14 @@ Around any plant, besides those of `seaopt.plants.drives`:
     Dead times T_c before the input and T_m behind the same outputs, as Padé approximants of order three: the phase is
     right to one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are
     for linearisation and continuous-time loops.
+``deflection_sensor``
+    One more output, what two encoders and a nominal stiffness make: `seaopt.plants.sensors.deflection`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -63,12 +65,14 @@ from seaopt.parameters import Parameter
 from seaopt.plants import drives
 from seaopt.plants.plant import Plant
 from seaopt.plants.roles import PlantMaker, put_behind
+from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
+from seaopt.plants.sensors.deflection import read_deflection
 from seaopt.records import record
 
 Part = Literal[
     "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
     "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input", "duty_input",
-    "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
+    "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay", "deflection_sensor",
 ]  # fmt: skip
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
@@ -116,6 +120,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
     "servo_delay": (Parameter(name="T_v", value=1e-3, unit="s", min=1e-9, description="delay of the servo's command"),),
     **drives.PARTS,
+    **SENSOR_PARTS,
 }  # fmt: skip
 INSIDE: tuple[Part, ...] = (
     "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
@@ -246,6 +251,16 @@ _FILTERS = {
     "servo_delay": (_pade, "T_v", "input", 3),
 }
 
+_WRAPPERS: dict[str, Callable[[Plant, Sequence[str]], Plant]] = {
+    "position_servo": drives.add_servo,
+    "deflection_sensor": lambda plant, parts: read_deflection(plant),
+}
+# From the motor outwards; a load cell does not read what encoders do, which the delay of the readings comes after.
+_ORDER = (
+    "current_loop", "servo_delay", "position_servo", "command_delay", "load_cell", "deflection_sensor",
+    "measurement_delay",
+)  # fmt: skip
+
 
 def wrapped(
     plant: Plant, parts: Sequence[str], *, source: str | None = None, outputs: Sequence[str] | None = None
@@ -276,8 +291,6 @@ def wrapped(
 
     """
     check_parts(parts)
-    if outputs is None:
-        outputs = plant.sensing.regulated if plant.sensing is not None else ()
     for part in parts:
         if part in INSIDE:
             raise PlantError(
@@ -286,11 +299,11 @@ def wrapped(
     drives.check(parts)
     if "voltage_input" in parts or "duty_input" in parts:
         plant = drives.drive_electrically(plant, parts)
-    for part in ("current_loop", "servo_delay", "position_servo", "command_delay", "load_cell", "measurement_delay"):
+    for part in _ORDER:
         if part not in parts:
             continue
-        if part == "position_servo":
-            plant = drives.add_servo(plant, parts)
+        if part in _WRAPPERS:
+            plant = _WRAPPERS[part](plant, parts)
             continue
         where = _FILTERS[part][2]
         if where == "input":
@@ -299,7 +312,8 @@ def wrapped(
                 raise PlantError(f'plant {plant.name} has no input "{name}"; {suggestion(name, plant.inputs)}')
             signals = [name]
         else:
-            signals = [name for name in outputs if name in plant.outputs]
+            regulated = plant.sensing.regulated if plant.sensing is not None else ()
+            signals = [name for name in (regulated if outputs is None else outputs) if name in plant.outputs]
             if not signals:
                 reading = f"none of the outputs {', '.join(outputs)}" if outputs else "no regulated output"
                 raise PlantError(f"plant {plant.name} has {reading} that {part} reads; name others")

@@ -505,6 +505,7 @@ def _check_roles(plant: Plant) -> None:
                   ("actuation.efficiency", plant.actuation.efficiency, plant.parameters)]  # fmt: skip
     if plant.sensing is not None:
         named += [("sensing.regulated", name, plant.outputs) for name in plant.sensing.regulated]
+        named += [("sensing.from_encoders", name, plant.outputs) for name in plant.sensing.from_encoders]
         fields = ("motor_position", "motor_speed", "link_position")
         named += [(f"sensing.{name}", getattr(plant.sensing, name), signals) for name in fields]
     if plant.spring is not None:

@@ -62,6 +62,8 @@ class Sensing:
         them.
     motor_position, motor_speed, link_position : str or None
         What encoders on either side of the spring read.
+    from_encoders : tuple of str
+        Outputs that a device computes from these two positions: with their errors.
 
     """
 
@@ -69,6 +71,7 @@ class Sensing:
     motor_position: str | None = None
     motor_speed: str | None = None
     link_position: str | None = None
+    from_encoders: tuple[str, ...] = ()
 
 
 @record(eq=False)

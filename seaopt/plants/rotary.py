@@ -76,6 +76,7 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
     "hardening": (Parameter(name="k_3", value=0.0, unit="N m/rad^3", min=0.0, description="cubic stiffness"),),
     "spring_damping": (),  # c_s is there without it
+    "deflection_sensor": tuple(replace(item, unit="N m/rad") for item in PARTS["deflection_sensor"]),
 }
 
 _GEAR = Transmission(

@@ -278,7 +278,11 @@ def _list_kinds(table: EquationsTable) -> dict[str, str]:
 def _sense(table: EquationsTable) -> Sensing | None:
     if table.sensing is None:
         return None
-    return Sensing(**table.sensing.model_dump(exclude={"regulated"}), regulated=tuple(table.sensing.regulated))
+    given = table.sensing
+    return Sensing(
+        regulated=tuple(given.regulated), motor_position=given.motor_position, motor_speed=given.motor_speed,
+        link_position=given.link_position, from_encoders=tuple(given.from_encoders),
+    )  # fmt: skip
 
 
 def _declare(name: str, declared: Any) -> str | Parameter:

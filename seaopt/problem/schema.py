@@ -79,6 +79,7 @@ class SensingTable(_Strict):
     motor_position: str | None = None
     motor_speed: str | None = None
     link_position: str | None = None
+    from_encoders: list[str] = []
 
 
 class SpringTable(_Strict):

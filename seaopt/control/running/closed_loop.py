@@ -176,7 +176,7 @@ def run_loop(
     n = wanted.shape[1]
     job = Job(
         reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
-        noise=_noise(loop, runs, n, seed),
+        noise=_noise(loop, values, n, seed),
         external=_external(loop.plant, external or {}, n),
         p=np.array([each.vector for each in values]).reshape(runs, -1),
         **_lags(loop, values),
@@ -258,11 +258,11 @@ def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, subst
     )
 
 
-def _noise(loop: SampledLoop, runs: int, n: int, seed: int) -> Rows:
-    std = loop.sensors.noise_std.get(loop.measured, 0.0)
-    if not std:
-        return np.zeros((runs, n))
-    return np.tile(std * np.random.default_rng(seed).normal(size=n), (runs, 1))
+def _noise(loop: SampledLoop, params: Sequence[CompletedParameters], n: int, seed: int) -> Rows:
+    std = np.array([loop.sensors.combine_errors(loop.plant, values, loop.measured)[0] for values in params])
+    if not np.any(std):
+        return np.zeros((len(params), n))
+    return std[:, None] * np.random.default_rng(seed).normal(size=n)
 
 
 def _external(plant: Plant, signals: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:

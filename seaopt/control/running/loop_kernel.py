@@ -19,6 +19,7 @@ from jaxtyping import Float
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
+from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
 from seaopt.simulation.runge_kutta import runge_kutta_step
@@ -73,6 +74,7 @@ class _Structure:
     rounds_current: bool
     saturates: bool
     quantises: bool
+    encoders: tuple[str, ...]  # that round, of those that the reading is computed from
     limits_current: bool
     sticks: bool
 
@@ -82,7 +84,7 @@ def _structure_of(loop: SampledLoop) -> _Structure:
     return _Structure(
         measured=name, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
         saturates=sensors.saturation.get(name) is not None, quantises=bool(sensors.quantisation.get(name)),
-        limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
+        encoders=tuple(loop.encoder_steps), limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
     )  # fmt: skip
 
 
@@ -93,18 +95,23 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     """
     n, queue = structure.law_states, structure.waiting
     z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
-    e, c = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("c", n * n + 4 * n + 9)
+    e, steps = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("steps", len(structure.encoders))
+    c = ca.vertcat(ca.SX.sym("c", n * n + 4 * n + 9), steps)
     observe = _observe(plant, structure.sticks)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
     waiting = ca.densify(ca.mtimes(ca.reshape(first[1:], queue, 1).T, behind))
-    reading = (
-        observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)[list(plant.outputs).index(structure.measured)] + w
+    outputs = dict(
+        zip(plant.outputs, ca.vertsplit(observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)), strict=False)
     )
+    reading = outputs[structure.measured] + w
+    weights = weigh_encoders(plant, structure.measured)
+    for name, width in zip(structure.encoders, ca.vertsplit(steps) if structure.encoders else (), strict=True):
+        reading += weights[name] * (width * ca.floor(outputs[name] / width + 0.5) - outputs[name])
     size = n * n
     a = ca.reshape(c[:size], n, n)
     b_r, b_y, out, windup = (ca.reshape(c[size + i * n : size + (i + 1) * n], n, 1) for i in range(4))
-    d_r, d_y, limit, gain, offset, highest, quantum, step, most = ca.vertsplit(c[size + 4 * n :])
+    d_r, d_y, limit, gain, offset, highest, quantum, step, most = ca.vertsplit(c[size + 4 * n : size + 4 * n + 9])
     reading = reading + offset
     if structure.saturates:
         reading = ca.fmin(ca.fmax(reading, -highest), highest)
@@ -134,6 +141,7 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
         sensors.saturation.get(name, 0.0), sensors.quantisation.get(name, 0.0), loop.current_step_A,
         most,
     ]  # fmt: skip
+    numbers += loop.encoder_steps.values()
     return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
 
 

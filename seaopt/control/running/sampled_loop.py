@@ -15,6 +15,7 @@ from seaopt.errors import SimulationError, suggestion
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick
 from seaopt.plants.plant import ENERGY
+from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
 
 
@@ -33,7 +34,8 @@ class SampledLoop:
     delay_samples : int
         Whole samples from measurement to output, besides the hold.
     sensors : Sensors
-        Noise, offset, range and quantisation of the measured output.
+        Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from:
+        these round, and their noise is the output's.
     current_step_A : float
         What the current is rounded to; 0 for not at all. The largest is the last whole step within the law's limit.
     longest_delay_s : float
@@ -88,6 +90,16 @@ class SampledLoop:
                 f"{self.measured} of {plant.name} contains the present current, which a law without delay sets from "
                 "it; give delay_samples = 1 or more, or measure another output"
             )
+
+    @property
+    def encoder_steps(self) -> dict[str, float]:
+        """The steps of those encoders that round and that the measured output is computed from."""
+        weights = weigh_encoders(self.plant, self.measured)
+        return {
+            name: step
+            for name in weights
+            if name in self.plant.outputs and (step := self.sensors.quantisation.get(name))
+        }
 
     @property
     def waiting(self) -> int:

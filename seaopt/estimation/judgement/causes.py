@@ -29,7 +29,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.parts import wrapped
 from seaopt.records import record
-from seaopt.units import unit_after
+from seaopt.units import ROTARY, mechanics_of, unit_after
 
 ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that chance does not give
 SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the cause, and others need not be tried
@@ -69,6 +69,8 @@ class Cause:
         What it does to the residuals and the estimates.
     preferred : mapping of name to (value, std)
         What the refit gives the parameter or the delays that it frees.
+    unknowns : int
+        How many its refit had.
 
     """
 
@@ -79,6 +81,7 @@ class Cause:
     material: bool
     consequence: str
     preferred: Mapping[str, tuple[float, float]]
+    unknowns: int
 
 
 @record(eq=False)
@@ -138,7 +141,9 @@ def find_causes(
             causes.append(cause)
             if poor and cause.solved:
                 break
-    return sorted(causes, key=lambda cause: cause.gain, reverse=True)
+    best = max((cause.gain for cause in causes), default=0.0)
+    # Of explanations that chance alone sets apart, the one that frees least comes first.
+    return sorted(causes, key=lambda c: (c.gain < best - ENOUGH, c.unknowns if c.gain >= best - ENOUGH else 0, -c.gain))
 
 
 def _measure_powers(here: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:
@@ -253,6 +258,7 @@ def _weigh(
         consequence=consequence,
         preferred={name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
         material=bool(moved) or left < HALVED or candidate.certain,
+        unknowns=len(values),
     )
 
 
@@ -268,6 +274,7 @@ def _list_candidates(
         for plant in alternatives:  # the right one is soon found, and the wrong one takes long to refit
             yield from _change_plant(fit.experiments, first, plant)
         yield from _free_gains(fit.experiments, first)
+    yield from _read_deflections(fit.experiments, here)
     yield from _free_delays(fit.experiments, here)
     yield from _free_parameters(fit, minimum, suspects)
     yield from _load_friction(fit.experiments, here)
@@ -299,6 +306,35 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
             return _say_value(parameter, values[name], stds[name] if name in speeds else 0.0)
 
         yield _Candidate(where=name, experiments=fit.experiments, params=params, describe=describe, frees={name: 0.0})
+
+
+def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
+    """Yield each effort at the spring as made of its deflection by two encoders, where the model has more in it."""
+    first = experiments[0].plant
+    sensing, spring = first.sensing, first.spring
+    if sensing is None or spring is None or spring.stiffness is None or any(e.plant is not first for e in experiments):
+        return
+    stiffness, deflection = spring.stiffness, spring.deflection
+    for output in experiments[0].outputs:
+        if output not in sensing.regulated or output in sensing.from_encoders:
+            continue
+
+        def h(t: Any, x: Any, u: Any, p: Any, output: str = output) -> Mapping[str, Any]:
+            return {**first.h(t, x, u, p), output: getattr(p, stiffness) * deflection(x, p)}
+
+        def describe(values: Mapping[str, float], stds: Mapping[str, float], output: str = output) -> str | None:
+            unit = first.outputs[output]
+            name = "tau_d" if unit == ROTARY.unit else "F_d"
+            return (
+                f"{output} is the {mechanics_of(unit).word} from deflection, a stiffness times what two "
+                f"encoders read, without what else acts at the spring; add part deflection_sensor, and name it {name}"
+            )
+
+        plant = replace(first, h=h)
+        yield _Candidate(
+            where=output, experiments=tuple(replace(e, plant=plant) for e in experiments), params=params,
+            describe=describe,
+        )  # fmt: skip
 
 
 def _load_friction(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:

@@ -319,10 +319,10 @@ def _find_windows(stage: Stage, trace: Playback) -> tuple[slice, slice]:
 
 def _noise_floor(stage: Stage, trace: Playback, run: int) -> float:
     """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation."""
-    name, sensors = stage.controller.spec.measured, stage.sensors
     rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
-    noise = 2.0 * sensors.noise_std.get(name, 0.0) + 1.5 * sensors.quantisation.get(name, 0.0)
-    return max(noise + rounding, 1e-3 * float(trace.peaks[name][run]))
+    std, step = stage.reading_errors
+    noise = 2.0 * std + 1.5 * step
+    return max(noise + rounding, 1e-3 * float(trace.peaks[stage.controller.spec.measured][run]))
 
 
 def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:

@@ -97,10 +97,9 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
     params = drawn.with_parameters(*plant.complete(drawn).values())
     for phase in scenario.phases:
         params = apply_load(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
-    name = controller.spec.measured
     return LinearView(
         loop=Loop(plant=controller.plant(plant, params), law=controller.law),
-        noise_N=_combine_std(stage.sensors.noise_std.get(name, 0.0), stage.sensors.quantisation.get(name, 0.0)),
+        noise_N=_combine_std(*stage.reading_errors),
         step_N=_combine_std(0.0, stage.current_step_A / controller.command.per_effort),
     )
 

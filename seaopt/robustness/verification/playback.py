@@ -81,9 +81,17 @@ class Stage:
     @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
-        sensors, name = self.sensors, self.controller.spec.measured
-        additions = (getattr(sensors, field).get(name, 0.0) for field in ("noise_std", "offset", "quantisation"))
-        return not (self.current_step_A or any(additions))
+        offset = self.sensors.offset.get(self.controller.spec.measured, 0.0)
+        return not (self.current_step_A or offset or any(self.reading_errors))
+
+    @property
+    def reading_errors(self) -> tuple[float, float]:
+        """Noise (std) and rounding (step) of what is fed back, of the encoders included that it is computed from."""
+        measured = self.controller.spec.measured
+        if self.controller.design is None:
+            return self.sensors.noise_std.get(measured, 0.0), self.sensors.quantisation.get(measured, 0.0)
+        plant, params = self.controller.design
+        return self.sensors.combine_errors(plant, plant.complete(params), measured)
 
 
 @record(eq=False)

@@ -1,0 +1,1 @@
+"""What sensors make of a plant's motion: torque from deflection, speed by difference."""

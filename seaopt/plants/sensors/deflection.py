@@ -1,0 +1,109 @@
+r"""Sensors that compute what they read from encoders on either side of the spring.
+
+``deflection_sensor``, a part around any plant that has a spring: the torque (force) that firmware makes of two encoders
+and a constant of its own,
+
+.. math:: \tau_d = k_n \delta, \qquad \delta = \theta_m/N - \theta_l \quad (q + x_2 - x_1 \text{ of a screw}),
+
+beside the spring's own effort, which a load cell reads. The two differ in all that is parallel to the spring or in
+series with it: the damping c_s makes :math:`\tau_s = (k_s + c_s s)\,\delta`, which leads :math:`\tau_d` by
+:math:`c_s/k_s` seconds at low frequencies; play is in :math:`\delta`, hardening is not in k_n, and where k_n is not the
+spring's stiffness the reading is wrong by their ratio.
+
+Errors of the encoders are errors of what is computed from them: by :math:`\partial\tau_d/\partial\theta_m = k_n/N` and
+:math:`\partial\tau_d/\partial\theta_l = -k_n`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+
+from seaopt.errors import PlantError
+from seaopt.parameters import Parameter
+from seaopt.plants.plant import CompletedParameters, Plant
+from seaopt.plants.roles import PlantMaker
+from seaopt.units import ROTARY
+
+NOMINAL = "k_n"
+# Of a screw; whoever has such a sensor states the constant that it multiplies by: a plant has no default for it.
+PARTS: dict[str, tuple[Parameter, ...]] = {
+    "deflection_sensor": (
+        Parameter(name=NOMINAL, value=655e3, unit="N/m", min=0.0, description="stiffness that the sensor assumes"),
+    )
+}
+
+
+def read_deflection(plant: Plant) -> Plant:
+    """Return a plant with one more output, tau_d or F_d: what two encoders make of the spring's deflection.
+
+    Raises
+    ------
+    PlantError
+        The plant states no spring, or not what is regulated, or has such an output.
+
+    """
+    spring, sensing = plant.spring, plant.sensing
+    if spring is None or sensing is None or not sensing.regulated:
+        missing = "spring = SeriesSpring(deflection, unit)" if spring is None else "sensing = Sensing(regulated=...)"
+        raise PlantError(f'plant {plant.name}: part "deflection_sensor" needs the role {missing}; give it')
+    unit = plant.outputs[sensing.regulated[0]]
+    name = "tau_d" if unit == ROTARY.unit else "F_d"
+    if name in plant.outputs or NOMINAL in plant.parameters:
+        raise PlantError(f'plant {plant.name}: part "deflection_sensor" has {name} and {NOMINAL}, which it has, too')
+    deflection = spring.deflection
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return {**plant.h(t, x, u, p), name: getattr(p, NOMINAL) * deflection(x, p)}
+
+    return replace(
+        plant, name=f"{plant.name} with deflection_sensor", h=h, outputs={**plant.outputs, name: unit},
+        parameters={**plant.parameters, NOMINAL: f"{unit}/{spring.unit}"},
+        sensing=replace(
+            sensing, regulated=(*sensing.regulated, name), from_encoders=(*sensing.from_encoders, name)
+        ),
+        ports=tuple(port.change_makers(_read_deflection_of) for port in plant.ports),
+    )  # fmt: skip
+
+
+def _read_deflection_of(make: PlantMaker) -> Plant:
+    return read_deflection(make())
+
+
+def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:
+    """Return how much an output moves with what each encoder reads: {output or state that is read: expression of p}.
+
+    Empty where the output is not computed from encoders.
+    """
+    sensing, port = plant.sensing, plant.port
+    position = sensing.motor_position if sensing is not None and output in sensing.from_encoders else None
+    if position is None or position not in plant.states:
+        return {}
+    motor = list(plant.states).index(position)
+    slope = ca.simplify(ca.jacobian(plant.output[list(plant.outputs).index(output)], plant.x[motor]))
+    weights: dict[str, Any] = {position: slope}
+    if port is not None and port.motion is not None and port.drive == position:
+        p = SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
+        weights[port.motion] = ca.simplify(slope * port.ratio(p))
+    return weights
+
+
+def evaluate_weights(plant: Plant, params: CompletedParameters, output: str) -> dict[str, float]:
+    """Return the numbers of `weigh_encoders`.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> plant = so.plants.rotary(parts=["deflection_sensor"])
+    >>> params = plant.complete(so.ParameterSet.of(k_n=(300.0, "N m/rad")))
+    >>> evaluate_weights(plant, params, "tau_d")  # N m per radian of either encoder
+    {'theta_m': 6.0, 'theta_l': -300.0}
+
+    """
+    weights = weigh_encoders(plant, output)
+    values = ca.Function("weights", [plant.p], [ca.vertcat(*weights.values())])(params.vector) if weights else None
+    return {} if values is None else dict(zip(weights, values.full().ravel().tolist(), strict=True))
