@@ -54,7 +54,13 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
         Parameter(name="L_m", value=1e-3, unit="H", min=1e-12, description="winding inductance", plausible=(1e-7, 1)),
     ),
     "position_servo": (
-        Parameter(name="k_p", value=1.0, unit="-", min=0.0, description="gain of the servo, in its own units"),
+        Parameter(
+            name="k_p",
+            value=1.0,
+            unit="-",
+            min=0.0,
+            description="gain of the servo, in the units that g_s, 1 unless given, converts",
+        ),
         Parameter(name="k_d", value=0.0, unit="s", min=0.0, description="damping of the servo, in its own units"),
         Parameter(name="g_s", value=1.0, unit="-", min=0.0, description="command of one unit of gain and error"),
     ),
@@ -64,6 +70,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "servo_limit": (Parameter(name="c_max", value=1.0, unit="-", min=0.0, description="limit of the servo's command"),),
 }
 SERVO = ("position_servo", "servo_integral", "servo_limit")
+STATED = ("k_p",)  # without a default: who has a servo knows its gain, and any other one would be a guess
 INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 
 
@@ -209,6 +216,7 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[PlantMaker], Plant
         inside, _, outputs = solve_inside(t, x, u, p)
         return {**plant.h(t, x, inside, p), **outputs}
 
+    own = {item.name: item.unit if item.name in STATED else item for item in drive.parameters}
     before = plant.actuation
     actuation = before and Actuation(
         input=drive.input, effort=lambda p: before.effort(p) * drive.effort(p), unit=before.unit,
@@ -220,7 +228,7 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[PlantMaker], Plant
         plant, name=f"{plant.name} with {drive.name}", f=f, h=h, actuation=actuation,
         states={**plant.states, **drive.states}, inputs={drive.input: drive.unit, **others},
         outputs={**plant.outputs, **drive.outputs}, optional_inputs=frozenset(optional),
-        parameters={**plant.parameters, **{item.name: item for item in drive.parameters}},
+        parameters={**plant.parameters, **own},
         friction=put_behind(plant.friction, lambda x, u, p: solve_inside(0.0, x, u, p)[0]),
         ports=tuple(port.change_makers(again) for port in plant.ports),
     )  # fmt: skip

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import ParameterError, PlantError, SeaoptError, UnitError, require_number, require_type, suggestion
-from seaopt.formatting import html_text
+from seaopt.formatting import html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.equations.stored_equations import store_plant
 from seaopt.plants.memo import memo
@@ -176,6 +176,15 @@ class Plant:
             if params.plant is self:
                 return params
             params = params.given
+        missing = [
+            n for n, default in self.parameters.items() if n not in params and not isinstance(default, Parameter)
+        ]
+        if missing:
+            names = join_words([f'"{name}"' for name in missing])
+            in_units = {name: unit_after(self.parameter_unit(name)) for name in missing}
+            units = join_words([f"{name} in{unit}" if unit else name for name, unit in in_units.items()])
+            what, have = ("parameter", "has") if len(missing) == 1 else ("parameters", "have")
+            raise ParameterError(f"{what} {names} of plant {self.name} {have} no value, and no default; give {units}")
         completed: list[Parameter] = []
         for name, default in self.parameters.items():
             unit = self.parameter_unit(name)
@@ -183,9 +192,6 @@ class Plant:
                 completed.append(_keep_bounds(_convert_unit(params[name], unit, self.name), default, self.name))
             elif isinstance(default, Parameter):
                 completed.append(default)
-            else:
-                what = f"one in{unit_after(unit)}" if unit_after(unit) else "one"
-                raise ParameterError(f'parameter "{name}" of plant {self.name} has no value; give {what}')
         return CompletedParameters(self, params, completed)
 
     def derived_values(self) -> dict[str, tuple[Any, str]]:

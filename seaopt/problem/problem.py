@@ -27,6 +27,7 @@ from seaopt.estimation import (
     Squares,
 )
 from seaopt.files import check_regular
+from seaopt.formatting import join_words
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters, plant_of_kind
@@ -49,7 +50,7 @@ from seaopt.problem.schema import (
 )
 from seaopt.records import record
 from seaopt.robustness import place_value
-from seaopt.units import ROTARY, factor, same_dimension
+from seaopt.units import ROTARY, factor, same_dimension, unit_after
 
 MAX_BYTES = 4 << 20
 OWN = "parameter "  # before the name of a parameter that is read as a channel
@@ -419,18 +420,22 @@ def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Parame
     # What each log states for itself need not be stated for all.
     own = {key: [set(e.parameters) for e in table.experiment if e.plant == key] for key in plants}
     declared = {name: default for plant in plants.values() for name, default in plant.defaults.items()}
-    for key, plant in plants.items():
-        for name in plant.parameters:
-            if name not in declared:
-                if name not in tables and own[key] and all(name in given for given in own[key]):
-                    continue
-                if name not in tables:
-                    raise ProblemError(f"parameters.{name} is missing; plant {plant.name} needs it")
-                declared[name] = Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
-    _check_units(plants)
     turns = any(plant.actuation is not None and plant.actuation.unit == ROTARY.unit for plant in plants.values())
+    built_in = known_parameters(rotary_first=turns)
+    for key, plant in plants.items():
+        undeclared = [name for name in plant.parameters if name not in declared]
+        stated = [name for name in undeclared if own[key] and all(name in given for given in own[key])]
+        missing = [name for name in undeclared if name not in tables and name not in stated]
+        if missing:
+            raise ProblemError(_ask_for(key, plant, missing, built_in))
+        declared |= {
+            name: Parameter(name=name, value=0.0, unit=plant.parameter_unit(name))
+            for name in undeclared
+            if name in tables
+        }
+    _check_units(plants)
     # A plant of the file may use a built-in plant's name for something else.
-    known = known_parameters(rotary_first=turns) | declared
+    known = built_in | declared
     parameters = {name: known[name] for name in known if name in declared or name in tables}
     for name, value in tables.items():
         if name not in known:
@@ -444,6 +449,21 @@ def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Parame
         except UnitError as error:
             raise UnitError(f"parameters.{name}: {error}") from error
     return ParameterSet(parameters.values())
+
+
+def _ask_for(key: str, plant: Plant, missing: Sequence[str], known: Mapping[str, Parameter]) -> str:
+    """Return what to say of parameters without a value or a default: what they are, in which unit, where they go."""
+    words: list[str] = []
+    for name in missing:
+        unit = plant.parameter_unit(name)
+        same = name in known and known[name].unit == unit
+        about = [text for text in (known[name].description if same else "", unit_after(unit).strip()) if text]
+        words.append(f"{name} ({', '.join(about)})" if about else name)
+    example = ", ".join(f"{name} = ..." for name in missing)
+    return (
+        f"parameters.{missing[0]} is missing: plant.{key} needs {join_words(words)} and has no default; give {example} "
+        "in [parameters], or in the parameters of each of its experiments"
+    )
 
 
 def _check_units(plants: Mapping[str, Plant]) -> None:

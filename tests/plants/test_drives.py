@@ -22,7 +22,8 @@ RATE_HZ = 500.0
 def values_of(plant, **other):
     """Return the motor's values of a plant's parameters."""
     own = {name: value for name, value in (MOTOR | other).items() if name in plant.parameters}
-    return plant.defaults.update(**own)
+    stated = [so.Parameter(name="k_p", value=1.0, unit="-")] if "k_p" in own else []  # has no default
+    return plant.defaults.with_parameters(*stated).update(**own)
 
 
 def motion(t, x, current, p):

@@ -328,8 +328,10 @@ def test_every_part_composes_on_every_plant(excluded):
         so.plants.two_link("mass", "pendulum", parts=parts),
         so.plants.rotary(parts=tuple(part for part in parts if part != "screw_mode")),
     ):
-        nominal = so.Parameter(name="k_n", value=300.0, unit=plant.parameter_unit("k_n"))  # has no default
-        rate, output = numbers(plant, plant.defaults.with_parameters(nominal))
+        stated = [
+            so.Parameter(name=n, value=300.0, unit=plant.parameter_unit(n)) for n in ("k_n", "k_p")
+        ]  # no defaults
+        rate, output = numbers(plant, plant.defaults.with_parameters(*stated))
         x, u = np.full(len(plant.states), 1e-3), np.ones(len(plant.inputs))
         assert np.all(np.isfinite(rate(x, u)))
         assert np.all(np.isfinite(output(x, u)))

@@ -1,6 +1,5 @@
-from __future__ import annotations
-
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -176,6 +175,51 @@ def test_import_is_light():
     code = f"import sys, seaopt; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def test_a_servo_without_its_gain_is_asked_for_it(write):
+    text = 'schema = 1\n[plant.joint]\nkind = "rotary"\nparts = ["position_servo", "deflection_sensor"]\n[parameters]\n'
+    with pytest.raises(
+        so.SeaoptError, match=r"k_p \(.*g_s.*\) and k_n \(.*N m/rad\).*give k_p = \.\.\., k_n = "
+    ) as raised:
+        so.read_problem(write(text))
+    assert "\n" not in str(raised.value)
+    assert so.read_problem(write(text + "k_p = 40\nk_n = 300\n")).parameters["k_p"].value == 40.0
+    joint = so.plants.rotary(parts=["position_servo", "deflection_sensor"])
+    with pytest.raises(so.errors.ParameterError, match=r'"k_p" and "k_n" .* give k_p and k_n in N m/rad'):
+        joint.complete(joint.defaults)
+
+
+OWN = """states = { v = "rad/s" }
+inputs = { I = "A" }
+outputs = { v = "rad/s" }
+parameters = { J = { unit = "kg m^2", value = 1 } }
+f = { v = "I/J" }
+h = { v = "v" }
+"""
+KNEE = 'kind = "rotary"\n'
+TRIAL = '[[experiment]]\nname = "e"\nplant = "p"\nlog = "a.csv"\ntime = "t [s]"\ninputs = { I = "I [A]" }\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        (OWN + 'parts = ["position_servo"]', "motor_position"),
+        (OWN + 'parts = ["voltage_input"]', "speed="),
+        (OWN + 'parts = ["deflection_sensor"]', "SeriesSpring"),
+        (OWN + 'sensing = { regulated = ["tau"] }', 'sensing.regulated = "tau"'),
+        (KNEE + TRIAL + 'outputs = { F1 = "F [N]" }', "outputs names"),
+        (KNEE + 'link = "locked"\n' + TRIAL + 'outputs = { theta_l = "F [N]" }', "theta_l"),
+        (KNEE + '[controller]\nplant = "p"\nmeasured = "F1"\nbandwidth_hz = 20', "is not an output of plant.p"),
+        (KNEE + '[parameters]\nk_s = { value = 300, unit = "N/m" }', "N m/rad"),
+        (KNEE + '[parameters]\nf_c = { value = 3, unit = "N" }', "N m"),
+        (KNEE + "[parameters]\nK_tau = 0.05\nK_e = 0.06", "give K_tau alone"),
+    ],
+)
+def test_what_a_plant_lacks_is_said_in_one_line(write, text, named):
+    with pytest.raises(so.SeaoptError, match=re.escape(named)) as raised:
+        so.read_problem(write("schema = 1\n[plant.p]\n" + text + "\n"))
+    assert "\n" not in str(raised.value)
 
 
 def test_a_plants_own_parameter_is_not_that_of_a_built_in_plant(write, monkeypatch):
