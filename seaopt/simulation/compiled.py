@@ -282,8 +282,11 @@ class Program:
 
     def double_sum(
         self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
-    ) -> Float[np.ndarray, "p p"]:
-        """Return the sum over t and s of a(t)' R(t - s) a(s), a the influences into v of the samples that count."""
+    ) -> Float[np.ndarray, "2 p p"]:
+        """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives.
+
+        The a are the influences into v of the samples that count.
+        """
         ny, p, nc = into.shape
         width = _pad_to_vectors(p)
         padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
@@ -293,7 +296,7 @@ class Program:
         if self.run_up:
             edges, starts, warm = self._halves(0, self.segment.n, starts)
             warm[1:] += len(r)  # influences reach so far back
-        ring, form = np.zeros((len(warm), 2 * len(r), ny, width)), np.zeros((len(warm), width, width))
+        ring, form = np.zeros((len(warm), 2 * len(r), ny, width)), np.zeros((len(warm), 2, width, width))
         arguments = np.repeat(self.base, len(warm))
         arguments["from"], arguments["start"], arguments["to"] = edges[:-1] - warm, edges[:-1] - warm, edges[1:]
         arguments["warm"], arguments["lags"], arguments["parts"] = warm, len(r) - 1, width // 4
@@ -303,7 +306,7 @@ class Program:
         buffers = (self.memory, padded, halved, starts, ring, form)
         self.kernel.run(arguments, buffers, parallel=self.segment.n >= PARALLEL)
         total = np.sum(form, axis=0)
-        return (total + total.T)[:p, :p]
+        return (total + total.transpose(0, 2, 1))[:, :p, :p]
 
     def _halves(self, first: int, last: int, x0: Float[np.ndarray, "1 nx"]) -> tuple[Any, Any, Any]:
         """Return edges, starts and run-up of two halves; the second starts at zero and forgets it before it counts."""

@@ -46,7 +46,8 @@ typedef struct {
     const double *into;            /* NY x NC x 4 parts: takes v to its influence on so many estimates; or NULL */
     const double *correlation;     /* (1 + lags) x NY x NY: R(k), R(0) halved */
     double *ring;                  /* 2 (1 + lags) x NY x 4 parts: influences of the last samples, zero at first */
-    double *form;                  /* 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s) */
+    double *form;                  /* 2 x 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s), and of it
+                                      what t = s gives */
     long lags, parts;
     long warm;                     /* rows from `from` that bring the state about, and are in no sum */
 } seaopt_pass_args;
@@ -390,16 +391,24 @@ INLINE void influence(const seaopt_pass_args *a, double *const *v, const int *co
             here[o * parts + j] = again[o * parts + j] = sum;
         }
     for (long j = 0; j < parts && k >= a->from + a->warm; j++) {
-        loose sum[NY][NY];
+        loose sum[NY][NY], now[NY];
         memset(sum, 0, sizeof sum);
         const double *r = a->correlation;
-        for (long lag = 0; lag < size; lag++, r += NY * NY)
+        for (long lag = 0; lag < size; lag++, r += NY * NY) {
             for (int o = 0; o < NY; o++)
                 for (int b = 0; b < NY; b++) sum[o][b] += r[o * NY + b] * here[(b - lag * NY) * parts + j];
+            for (int o = 0; lag == 0 && o < NY; o++) {
+                now[o] = sum[o][0];
+                for (int b = 1; b < NY; b++) now[o] += sum[o][b];
+            }
+        }
         for (int o = 0; o < NY; o++) {
             for (int b = 1; b < NY; b++) sum[o][0] += sum[o][b];
-            for (long i = 0; i < 4 * parts; i++)
-                ((loose *)a->form)[i * parts + j] += ((const double *)(here + o * parts))[i] * sum[o][0];
+            for (long i = 0; i < 4 * parts; i++) {
+                const double one = ((const double *)(here + o * parts))[i];
+                ((loose *)a->form)[i * parts + j] += one * sum[o][0];
+                ((loose *)a->form)[(4 * parts + i) * parts + j] += one * now[o];
+            }
         }
     }
 }

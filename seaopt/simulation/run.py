@@ -107,8 +107,10 @@ def double_sum(
     weights: Weights,
     into: Float[np.ndarray, "ny p nc"],
     r: Float[np.ndarray, "lags1 ny ny"],
-) -> Float[np.ndarray, "p p"] | None:
-    """Return the sum over t and s of a(t)' R(t - s) a(s) in one pass; None where there is no compiler.
+) -> Float[np.ndarray, "2 p p"] | None:
+    """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives; None where there is no compiler.
+
+    Both are summed in one pass.
 
     Parameters
     ----------

@@ -100,19 +100,17 @@ def compute_meat(
     for experiment in problem.experiments:
         sums = statistics[experiment.name]
         r, last = estimate_correlations(sums)
-        meat = _sum_twice(experiment, z, inverse, r)
-        if np.max(sums.count) < SHORT_LOG and not last:
-            meat = _at_least(meat, _sum_twice(experiment, z, inverse, r[:1]))
-        total += meat
+        meat, together = _sum_twice(experiment, z, inverse, r)
+        total += _at_least(meat, together) if np.max(sums.count) < SHORT_LOG and not last else meat
     return total
 
 
 def _sum_twice(
     experiment: FitExperiment, z: Float[np.ndarray, " n"], inverse: Float[np.ndarray, "n p"],
     r: Float[np.ndarray, "lags1 ny ny"],
-) -> Float[np.ndarray, "p p"]:  # fmt: skip
-    """Return one experiment's part of the double sum."""
-    total = np.zeros((inverse.shape[1],) * 2)
+) -> Float[np.ndarray, "2 p p"]:  # fmt: skip
+    """Return one experiment's part of the double sum, and of that what t = s gives."""
+    total = np.zeros((2, *(inverse.shape[1],) * 2))
     reach, chunk = len(r) - 1, max(CACHED_SAMPLES, 4 * len(r))
     pairs = [(segment, _map_to_influence(experiment, segment, inverse)) for segment in experiment.segments]
     if reach <= COMPILED_LAGS:
@@ -124,12 +122,13 @@ def _sum_twice(
         if all(one is not None for one in sums):
             return np.sum(np.array(sums), axis=0)
     longest = reach + min(chunk, experiment.longest)
-    whole, twice = (_Form.make(r, n) for n in (longest, reach))
+    whole, twice, together = (_Form.make(kept, n) for kept, n in ((r, longest), (r, reach), (r[:1], chunk)))
     for segment, into in pairs:
         tail = np.zeros((*into.shape[:2], 0))
         for _, columns, used in stream_columns(experiment, segment, z, chunk):
-            with_tail = np.concatenate([tail, _influence(columns, used, into)], axis=2)
-            total += whole(with_tail) - twice(tail)
+            now = _influence(columns, used, into)
+            with_tail = np.concatenate([tail, now], axis=2)
+            total += whole(with_tail) - twice(tail), together(now)
             tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
     return total
 
