@@ -13,10 +13,11 @@ import pytest
 import seaopt as so
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
+QUICK = (1, 19, 20)
 FOUND = {1: 1.71841, 5: 0.659755, 12: 2.30130, 16: 2.12125, 19: 20.9570, 20: 10.3486}  # number: the objective
 
 
-@pytest.mark.parametrize("number", FOUND)
+@pytest.mark.parametrize("number", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in FOUND])
 def test_it_is_within_three_per_cent_of_a_long_search(number, monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import bench_tune as bench

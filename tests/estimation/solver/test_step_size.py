@@ -28,12 +28,14 @@ def test_a_step_error_is_measured_again_where_derivatives_are_not_finite(swing, 
         assert again is not known["swing"] and again.error == known["swing"].error
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 3])
-def test_a_search_that_ends_early_states_its_iterations_once(stand, short_log, thor, iterations):
+@pytest.mark.parametrize("iterations", [2, 3])
+def test_a_search_that_ends_early_states_its_iterations_once(stand, thor, iterations):
     """The count stands in the fit's text; what its verdict says to do can be done in a problem file."""
+    log = so.virtual_log(stand, thor, so.bench.PAPER_STAND, duration_s=4, rate_hz=400, seed=12,
+                         sensors=so.Sensors(noise_std={"F1": 2.0}))  # fmt: skip
     method = so.OutputError(search=False, max_iterations=iterations)
     start = thor.update(J=3e-5, b_r=1e-2).free("J", "b_r", "eta")
-    fit = so.fit([so.Experiment(plant=stand, log=short_log, name="chirp", outputs=("F1",))], start, method=method)
+    fit = so.fit([so.Experiment(plant=stand, log=log, name="chirp", outputs=("F1",))], start, method=method)
     assert fit.status == "max_iterations" and fit.iterations == iterations
     assert f"{iterations} iterations" in repr(fit) and f"{iterations} iterations" not in fit.message
     assert "start closer" in fit.message
