@@ -42,9 +42,10 @@ CHOICES = (
     ("disturbance", "noise"),
 )
 PARTS = (
-    "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
-    "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input", "duty_input",
-    "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay", "deflection_sensor",
+    "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
+    "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay",
+    "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
+    "deflection_sensor",
 )  # fmt: skip
 OVERRIDES = FrozenDict({Literal[choices]: str for choices in (*CHOICES, PARTS)})
 checker = ModuleType("seaopt_type_checker")

@@ -53,7 +53,7 @@ the ground with :math:`-F_1 = -J \ddot\theta - \tau_s`, which the lumped drive m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -65,11 +65,23 @@ from seaopt.plants import parts as part_laws
 from seaopt.plants.equations.stored_equations import store_function
 from seaopt.plants.parts import Part
 from seaopt.plants.plant import Derived, Plant
-from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring, StateExpression
+from seaopt.plants.roles import (
+    Actuation,
+    Bristles,
+    Expression,
+    Friction,
+    Mode,
+    Port,
+    Sensing,
+    SeriesSpring,
+    StateExpression,
+)
 from seaopt.records import record
 
 Drive = Literal["unlumped", "lumped"]
 Spring = Literal["link1", "link2"]
+SPRING_SLIP = "spring_slip"  # the friction within a spring with hysteresis
+BRISTLES, SLIPPING = "z_f", "z_h"  # states: deflections of LuGre's bristles, and of the spring that gives way
 DRIVES: tuple[Drive, ...] = ("unlumped", "lumped")
 SPRINGS: tuple[Spring, ...] = ("link1", "link2")
 
@@ -174,6 +186,7 @@ class Motion:
     forces: tuple[Any, Any]
     places: tuple[Any, Any]
     deflection: Any
+    deflection_rate: Any
     spring_force: Any
     energy: Any
 
@@ -217,6 +230,8 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
     tension = part_laws.spring_force(parts, deflection, stiffness, p)
     if actuator.damped_spring:
         tension += getattr(p, drive.spring_damping) * speed(deflection)
+    if "hysteresis" in parts:
+        tension += getattr(u, SPRING_SLIP)
     bolt = (p.k_b * x.s + p.c_b * x.sd) if screw else 0.0
 
     # T = yd' H(y) yd / 2, so that H ydd = Q - dV/dy - (dH/dt yd - dT/dy).
@@ -244,7 +259,8 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
     stored = kinetic + potential + part_laws.spring_energy(parts, deflection, stiffness, p)
     return Motion(
         rates={name: value for k, pair in enumerate(names) for name, value in zip(pair, (yd[k], ydd[k]), strict=True)},
-        forces=forces, places=(x_1, x_2), deflection=deflection, spring_force=tension,
+        forces=forces, places=(x_1, x_2), deflection=deflection, deflection_rate=speed(deflection),
+        spring_force=tension,
         energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
     )  # fmt: skip
 
@@ -300,32 +316,28 @@ def make_plant(
     parameters = [*drive.parameters, *part_laws.parameters(parts, drive.part_parameters)]
     parameters += [parameter for link in actuator.links for parameter in link.parameters]
 
+    states = {state: unit for pair in pairs for state, unit in zip(pair[:2], (pair[2], f"{pair[2]}/s"), strict=True)}
+    frictions = _list_frictions(actuator, states, [parameter.name for parameter in parameters])
+    bristled = [one for one in frictions.values() if one.bristles is not None]
+
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return solve_motion(actuator, x, u, p).rates
+        slips = {_get_bristles(one).state: one.find_rate(x, u, p) for one in bristled}
+        return {**solve_motion(actuator, x, u, p).rates, **slips}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
         motion = solve_motion(actuator, x, u, p)
         return {output: read(motion, x) for output, (_, read) in outputs.items()}
 
-    at_rest = SimpleNamespace(**{"I": 0.0, drive.friction: 0.0})
-
     def energy(x: Any, p: Any) -> Any:
-        return solve_motion(actuator, x, at_rest, p).energy
+        held = (0.5 * one.stiffness(p) * getattr(x, one.state) ** 2 for one in map(_get_bristles, bristled))
+        return solve_motion(actuator, x, _rest(actuator), p).energy + sum(held)
 
     def deflection(x: Any, p: Any) -> Any:
-        return solve_motion(actuator, x, at_rest, p).deflection
+        return solve_motion(actuator, x, _rest(actuator), p).deflection
 
-    def read_loads(x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        spring = solve_motion(actuator, x, at_rest, p).spring_force
-        return {"motor": drive.per_ampere(p) * u.I, "output": drive.travel(p) * spring}
-
-    states = {state: unit for pair in pairs for state, unit in zip(pair[:2], (pair[2], f"{pair[2]}/s"), strict=True)}
-    # Stored, it takes expressions for the states, which the derivatives in `solve_motion` do not.
-    names = [parameter.name for parameter in parameters]
-    loads = store_function(read_loads, states, ("I",), names) if "load_friction" in parts else None
     plant = Plant(
         name=name,
-        states=states,
+        states=states | {_get_bristles(one).state: place for one in bristled},
         inputs={"I": "A"} | dict.fromkeys(inputs, effort),
         outputs={output: unit for output, (unit, _) in outputs.items()},
         parameters={parameter.name: parameter for parameter in parameters},
@@ -344,19 +356,75 @@ def make_plant(
             mass=second_order[0] if second_order else None, damping=second_order[1] if second_order else None,
         ),
         ports=ports,
-        friction={
-            drive.friction: Friction(
-                velocity=lambda x, p: getattr(x, drive.rate),
-                force=lambda v, p: part_laws.dry_friction(parts, v, p),
-                unit=effort,
-                effort=lambda p: 1.0 / drive.travel(p),
-                slopes=lambda p: part_laws.bound_friction_slopes(parts, p),
-                jump=lambda speed, p: part_laws.friction_level(parts, speed, p),
-                smoothing="v_s",
-                loads=loads,
-                rated=part_laws.LOADS if "load_friction" in parts else {},
-            )
-        },
+        friction=frictions,
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in parts else None,
     )  # fmt: skip
     return part_laws.wrapped(plant, [part for part in parts if part not in part_laws.INSIDE])
+
+
+def _rest(actuator: Actuator) -> SimpleNamespace:
+    """Return the inputs of an actuator that nothing drives and that does not rub."""
+    return SimpleNamespace(**dict.fromkeys(("I", actuator.transmission.friction, SPRING_SLIP), 0.0))
+
+
+def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence[str]) -> dict[str, Friction]:
+    """Return what rubs: the drive, and within a spring with hysteresis what gives way.
+
+    `states` are those of the motion, `names` those of the parameters.
+    """
+    drive, parts = actuator.transmission, actuator.parts
+    slips = (SLIPPING,) if "hysteresis" in parts else ()
+
+    def read_loads(x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        spring = solve_motion(actuator, x, _rest(actuator), p).spring_force
+        spring += p.k_h * x.z_h if slips else 0.0
+        return {"motor": drive.per_ampere(p) * u.I, "output": drive.travel(p) * spring}
+
+    # Stored, it takes expressions for the states, which the derivatives in `solve_motion` do not.
+    loads = store_function(read_loads, (*states, *slips), ("I",), names) if "load_friction" in parts else None
+    bristles = Bristles(
+        state=BRISTLES, coordinate=lambda x, p: getattr(x, drive.coordinate),
+        stiffness=lambda p: p.sigma_0, damping=lambda p: p.sigma_1,
+        rate=lambda z, v, p: part_laws.lugre_rate(parts, z, v, p),
+    )  # fmt: skip
+    frictions = {
+        drive.friction: Friction(
+            velocity=lambda x, p: getattr(x, drive.rate),
+            force=lambda v, p: part_laws.dry_friction(parts, v, p),
+            unit=drive.effort_unit,
+            effort=lambda p: 1.0 / drive.travel(p),
+            slopes=lambda p: part_laws.bound_friction_slopes(parts, p),
+            jump=None if "lugre" in parts else lambda speed, p: part_laws.friction_level(parts, speed, p),
+            smoothing="v_s",
+            loads=loads,
+            rated=part_laws.LOADS if "load_friction" in parts else {},
+            bristles=bristles if "lugre" in parts else None,
+        )
+    }  # fmt: skip
+    if not slips:
+        return frictions
+
+    def read_spring(x: Any, p: Any) -> tuple[Any, Any]:
+        motion = solve_motion(actuator, x, _rest(actuator), p)
+        return motion.deflection, motion.deflection_rate
+
+    spring = store_function(read_spring, states, names)
+    within = Bristles(
+        state=SLIPPING, coordinate=lambda x, p: spring(x, p)[0], stiffness=lambda p: p.k_h, damping=lambda p: 0.0,
+        rate=part_laws.hysteresis_rate,
+    )  # fmt: skip
+    return frictions | {
+        SPRING_SLIP: Friction(
+            velocity=lambda x, p: spring(x, p)[1],
+            force=lambda v, p: p.k_h * p.y_h * ca.sign(v),
+            unit=drive.effort_unit,
+            effort=lambda p: 0.0,  # it is a part of the spring's
+            slopes=lambda p: (0.0, 0.0),
+            bristles=within,
+        )
+    }
+
+
+def _get_bristles(friction: Friction) -> Bristles:
+    assert friction.bristles is not None
+    return friction.bristles

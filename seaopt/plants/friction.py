@@ -4,6 +4,10 @@ Dry friction smoothed through zero, f_c tanh(v/v_s), looks at rest like a damper
 the joint moves; Stribeck's falling part is then even a negative one. A loop is therefore looked at on two plants that
 are linear in that velocity: with every friction replaced by viscous friction of its steepest and of its flattest slope.
 They have the names, roles and parameters of the plant they stand for, so that all that works on a plant works on them.
+
+A friction with bristles (LuGre's, a spring's hysteresis) is a spring where it sticks, of the stiffness sigma_0 beside
+the damping sigma_1. It may stick while others slide, as a spring does behind a motor that moves: each is looked at in
+either state, and those that are curves of the velocity together.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -31,6 +36,7 @@ STATES = (SLIDING, STUCK)
 SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
 SMOOTHED = 10.0  # times the speed of its smoothing a curve is what it smooths
 LOW_SPEED = 1.0  # m/s or rad/s: up to here a curve shows its dry friction
+FORGETTING = 1.0  # rad/s: by which bristles of a linear plant go back; nothing depends on them there
 
 
 def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
@@ -98,7 +104,7 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
 def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     """Return the effort at the spring that is needed to let every joint that can stick slide, N or N m.
 
-    It is the largest force of each friction that declares its jump, at low speeds.
+    It is the largest force at low speeds of each friction that declares its jump, or has bristles.
 
     Examples
     --------
@@ -112,9 +118,12 @@ def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     p = params.by_attribute
     return sum(
         abs(float(friction.effort(p)))
-        * max(float(friction.jump(speed, friction.add_rated(p))) for speed in _list_low_speeds(friction, params))
+        * max(
+            float((friction.jump or friction.force)(speed, friction.add_rated(p)))
+            for speed in _list_low_speeds(friction, params)
+        )
         for friction in plant.friction.values()
-        if friction.jump is not None
+        if friction.jump is not None or friction.bristles is not None
     )
 
 
@@ -128,8 +137,11 @@ def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, "
     """Return the frequencies (Hz) at which the plant swings at rest while every joint that can stick does so.
 
     With A of the sliding plant, B the effect of the friction forces and C the rows of their velocities, a force that
-    keeps C x at zero leaves A - B (C B)^-1 C A.
+    keeps C x at zero leaves A - B (C B)^-1 C A. Where bristles hold it, the plant is the stuck one.
     """
+    if not can_stick(plant):
+        poles = np.linalg.eigvals(state_space(friction_states(plant)[STUCK], params)[0])
+        return np.sort(np.abs(poles[np.imag(poles) > 0.0])) / (2 * np.pi)
     sliding = friction_states(plant)[SLIDING]
     a = state_space(sliding, params)[0]
     effects, _, rows = (
@@ -146,12 +158,23 @@ def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, "
 
 @memo
 def friction_states(plant: Plant) -> Mapping[str, Plant]:
-    """Return the plant with every friction at its flattest slope and at its steepest, as "sliding" and "stuck"."""
-    return {state: _with_slope(plant, state) for state in STATES}
+    """Return the plant with every friction at its flattest slope and at its steepest, as "sliding" and "stuck".
+
+    Beside others a friction with bristles is in either state by itself: "NAME stuck" is where it sticks alone. The
+    sliding plant is the first.
+    """
+    curves = [name for name, one in plant.friction.items() if one.bristles is None]
+    groups = [*([curves] if curves else []), *([name] for name in plant.friction if name not in curves)]
+    states: dict[str, Plant] = {}
+    for choice in product((False, True), repeat=len(groups)):
+        sticking = tuple(name for group, sticks in zip(groups, choice, strict=True) if sticks for name in group)
+        state = STUCK if all(choice) else f"{' and '.join(sticking)} {STUCK}" if any(choice) else SLIDING
+        states[state] = _with_slopes(plant, state, sticking)
+    return states | {STUCK: states.pop(STUCK)} if STUCK in states else states
 
 
 def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()) -> dict[str, Plant]:
-    """Return the plants, one with friction twice, as NAME sliding and NAME stuck.
+    """Return the plants, one with friction in each of its states, as NAME sliding and NAME stuck.
 
     Parameters
     ----------
@@ -180,6 +203,30 @@ def take_sliding(plant: Plant, params: ParameterSet) -> Plant:
 def can_stick(plant: Plant) -> bool:
     """Tell whether a plant has a friction that declares its jump."""
     return any(friction.jump is not None for friction in plant.friction.values())
+
+
+def can_hold(plant: Plant) -> bool:
+    """Tell whether friction can hold a joint at rest: one that jumps there, or one with bristles."""
+    return can_stick(plant) or remembers(plant)
+
+
+def remembers(plant: Plant) -> bool:
+    """Tell whether a plant has a friction with bristles, whose force depends on what was before."""
+    return any(friction.bristles is not None for friction in plant.friction.values())
+
+
+def list_smoothing(plant: Plant) -> tuple[str, ...]:
+    """Return the parameters that are speeds over which a simulated friction is smoothed: not that of bristles."""
+    frictions = (friction for friction in plant.friction.values() if friction.bristles is None)
+    return tuple(dict.fromkeys(friction.smoothing for friction in frictions if friction.smoothing is not None))
+
+
+def take_at_rest(plant: Plant) -> Plant:
+    """Return the plant to linearise at rest: the stuck one of bristles, which follow their coordinate there.
+
+    Linearised as they are they would be a mode that nothing moves and nothing damps.
+    """
+    return friction_states(plant)[STUCK] if remembers(plant) else plant
 
 
 def let_stick(plant: Plant) -> Plant:
@@ -218,7 +265,15 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
     if not plant.friction:
         return False
     flattest, steepest = friction_slopes(plant, params)
-    return bool(np.any(flattest != steepest)) or bool(_friction_parameters(plant) & set(varied))
+    held = any(stiffness != 0.0 for stiffness in find_bristle_stiffness(plant, params))
+    return bool(np.any(flattest != steepest)) or held or bool(_friction_parameters(plant) & set(varied))
+
+
+def find_bristle_stiffness(plant: Plant, params: ParameterSet) -> list[float]:
+    """Return the stiffness of each friction's bristles, zero without any."""
+    p = plant.complete(params).by_attribute
+    bristles = [friction.bristles for friction in plant.friction.values()]
+    return [0.0 if one is None else float(one.stiffness(p)) for one in bristles]
 
 
 @memo
@@ -226,7 +281,13 @@ def remove_friction(plant: Plant) -> Plant:
     """Return the plant as it moves at speed, where dry friction no longer changes with the velocity."""
     friction = {
         name: replace(
-            friction, force=lambda v, p: 0.0 * v, slopes=lambda p: (0.0, 0.0), jump=None, loads=None, rated={}
+            friction,
+            force=lambda v, p: 0.0 * v,
+            slopes=lambda p: (0.0, 0.0),
+            jump=None,
+            loads=None,
+            rated={},
+            bristles=None,
         )
         for name, friction in plant.friction.items()
     }
@@ -236,8 +297,10 @@ def remove_friction(plant: Plant) -> Plant:
 @memo
 def _friction_parameters(plant: Plant) -> frozenset[str]:
     """Return the parameters on which the difference of the slopes depends."""
-    bounds = [bound_slopes(friction, name_parameters(plant, plant.p)) for friction in plant.friction.values()]
+    p = name_parameters(plant, plant.p)
+    bounds = [bound_slopes(friction, p) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
+    spans += [ca.SX(one.bristles.stiffness(p)) for one in plant.friction.values() if one.bristles is not None]
     return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
 
 
@@ -273,26 +336,46 @@ def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:
     return tuple(name for name, symbol in symbols if ca.depends_on(expression, symbol))
 
 
-def _with_slope(plant: Plant, state: str) -> Plant:
-    """Return the plant with viscous friction of one slope in the place of each curve."""
-    which = STATES.index(state)
+def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
+    """Return the plant with viscous friction in the place of each curve, and springs for bristles that stick."""
+    bristled = {name: one.bristles for name, one in plant.friction.items() if one.bristles is not None}
 
-    def viscous(friction: Friction) -> Friction:
+    def choose_slope(name: str, friction: Friction, p: Any) -> Any:
+        if name not in sticking:
+            return bound_slopes(friction, p)[0]
+        return bristled[name].damping(p) if name in bristled else bound_slopes(friction, p)[1]
+
+    def viscous(name: str, friction: Friction) -> Friction:
         return replace(
             friction,
-            force=lambda v, p: bound_slopes(friction, p)[which] * v,
-            slopes=lambda p: (bound_slopes(friction, p)[which],) * 2,
-            jump=None, loads=None, rated={},
+            force=lambda v, p: choose_slope(name, friction, p) * v,
+            slopes=lambda p: (choose_slope(name, friction, p),) * 2,
+            jump=None, loads=None, rated={}, bristles=None,
         )  # fmt: skip
 
-    change = partial(_make_with_slope, state=state)
+    def hold(x: Any, u: Any, p: Any) -> Any:
+        held = {name: one.stiffness(p) * one.coordinate(x, p) for name, one in bristled.items() if name in sticking}
+        return SimpleNamespace(**{**vars(u), **{name: getattr(u, name) + force for name, force in held.items()}})
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        rates = {
+            one.state: plant.friction[name].velocity(x, p) - FORGETTING * getattr(x, one.state)
+            for name, one in bristled.items()
+        }  # fmt: skip
+        return {**plant.f(t, x, hold(x, u, p), p), **rates}
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return plant.h(t, x, hold(x, u, p), p)
+
+    change = partial(_make_with_slopes, state=state)
     return replace(
         plant, name=f"{plant.name} {state}", ports=tuple(port.change_makers(change) for port in plant.ports),
-        friction={name: viscous(friction) for name, friction in plant.friction.items()},
+        friction={name: viscous(name, friction) for name, friction in plant.friction.items()},
+        f=f if bristled else plant.f, h=h if bristled else plant.h,
     )  # fmt: skip
 
 
-def _make_with_slope(maker: PlantMaker, state: str) -> Plant:
+def _make_with_slopes(maker: PlantMaker, state: str) -> Plant:
     return friction_states(maker())[state]
 
 

@@ -62,7 +62,7 @@ def known_parameters(*, rotary_first: bool = False) -> dict[str, Parameter]:
     Of a name that linear and rotary plants have in different units it is the linear one's, unless the rotary comes
     first.
     """
-    linear = [*all_parameters(), *(parameter for items in PARTS.values() for parameter in items)]
+    linear = [*(parameter for items in PARTS.values() for parameter in items), *all_parameters()]
     turning = list(rotary_parameters())
     every = (*linear, *turning) if rotary_first else (*turning, *linear)
     return {parameter.name: parameter for parameter in every}

@@ -17,6 +17,20 @@ is the motor's, and the units are N m and rad):
 ``load_square``
     With these, breakaway friction has a part of the square of the smaller of F_m and F_e, where they oppose each other
     (M6): q_m F_m^2 or q_e F_e^2.
+``lugre``
+    Friction of bristles that bend before they slip (Canudas de Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40(3), 1995):
+    :math:`\dot z = v - \sigma_0 |v| z / g(v)` and :math:`F_f = \sigma_0 z + \sigma_1 \dot z`, with g(v) what the other
+    parts make of dry friction without its smoothing, Stribeck's curve among it. It needs an f_c above zero. The model's
+    sigma_2 is the viscous friction b_r that every plant has. At rest it is a spring of the stiffness sigma_0; v_s then
+    smooths the curve of describing functions alone.
+``hysteresis``
+    A spring of the stiffness k_h beside the main one, which gives way at a deflection y_h of its own: Bouc's and Wen's
+    law (Wen, J. Eng. Mech. Div. 102(2), 1976) of exponent one with beta = gamma = 1/(2 y_h),
+    :math:`\dot z = \dot\delta - (\dot\delta |z| + |\dot\delta| z)/(2 y_h)` and :math:`F = \dots + k_h z`. So it unloads
+    elastically, the stiffness stays from k to k + k_h, and :math:`k_h z (\dot\delta - \dot z) \ge 0` is lost, whatever
+    the motion. Elements of Maxwell's that slip at once instead have a tangent that jumps, over which derivatives of a
+    simulation step; here it has corners only where the motion turns. Over a cycle from -A to A it loses
+    :math:`2 k_h [2 y_h (A - z_0) - z_0^2/2]`, with :math:`z_0 = y_h [1 - W(e^{1 - 2 A/y_h})]`, Lambert's W.
 ``backlash``
     Play of total width :math:`2 g_b` in series with the spring: the spring sees
     :math:`z(\delta) = \delta + \tfrac12\big(\sqrt{(\delta-g_b)^2+\epsilon^2} - \sqrt{(\delta+g_b)^2+\epsilon^2}\big)`,
@@ -70,9 +84,10 @@ from seaopt.plants.sensors.deflection import read_deflection
 from seaopt.records import record
 
 Part = Literal[
-    "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
-    "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input", "duty_input",
-    "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay", "deflection_sensor",
+    "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
+    "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay",
+    "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
+    "deflection_sensor",
 ]  # fmt: skip
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
@@ -96,6 +111,18 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "load_square": (
         Parameter(name="q_m", value=0.0, unit="1/N", min=0.0, description="of the motor's squared, at breakaway"),
         Parameter(name="q_e", value=0.0, unit="1/N", min=0.0, description="of the spring's squared, at breakaway"),
+    ),
+    "lugre": (
+        Parameter(
+            name="f_c", value=20.0, unit="N", min=1e-9, description="Coulomb friction at the screw",
+            plausible=(0, 100000),
+        ),
+        Parameter(name="sigma_0", value=5e6, unit="N/m", min=0.0, description="stiffness of the bristles"),
+        Parameter(name="sigma_1", value=2e3, unit="N s/m", min=0.0, description="damping of the bristles"),
+    ),
+    "hysteresis": (
+        Parameter(name="k_h", value=0.0, unit="N/m", min=0.0, description="stiffness of the spring that gives way"),
+        Parameter(name="y_h", value=1e-4, unit="m", min=1e-12, description="deflection at which it gives way"),
     ),
     "backlash": (
         Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play"),
@@ -123,16 +150,25 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     **SENSOR_PARTS,
 }  # fmt: skip
 INSIDE: tuple[Part, ...] = (
-    "stribeck", "load_friction", "load_stribeck", "load_square", "backlash", "hardening", "spring_damping",
-    "screw_mode",
+    "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
+    "spring_damping", "screw_mode",
 )  # fmt: skip
+BREAKAWAY = 1.5  # of Coulomb friction, where bristles need a default
 NEEDS = {"load_stribeck": ("stribeck", "load_friction"), "load_square": ("stribeck", "load_friction")}
 LOADS = {"motor": 0.0, "output": 0.0}  # of friction that grows with them, as linear analysis takes it
 
 
 def parameters(parts: Sequence[str], of_part: Mapping[str, tuple[Parameter, ...]]) -> list[Parameter]:
-    """Return the parameters of the parts that sit inside the actuator, from a screw's or a gear's table."""
-    return [parameter for part in parts if part in INSIDE for parameter in of_part[part]]
+    """Return the parameters of the parts that sit inside the actuator, from a screw's or a gear's table.
+
+    Bristles slip at the friction's own level, so that with them breakaway friction is above zero, as f_c is.
+    """
+    chosen = [parameter for part in parts if part in INSIDE for parameter in of_part[part]]
+    sliding = next((one for one in chosen if one.name == "f_c"), None)
+    if sliding is None:
+        return chosen
+    breakaway = {"value": BREAKAWAY * sliding.value, "min": sliding.min}
+    return [replace(one, **breakaway) if one.name == "f_s" else one for one in chosen]
 
 
 def check_parts(parts: Sequence[str]) -> None:
@@ -219,6 +255,16 @@ def bound_friction_slopes(parts: Sequence[str], p: Any) -> tuple[Any, Any]:
         return 0.0, p.f_c / p.v_s
     turn = math.sqrt(2.0 / math.e) / p.v_st
     return -ca.fmax(p.f_s - p.f_c, 0.0) * turn, p.f_s / p.v_s + ca.fmax(p.f_c - p.f_s, 0.0) * turn
+
+
+def lugre_rate(parts: Sequence[str], z: Any, speed: Any, p: Any) -> Any:
+    """Return the rate of the deflection z of LuGre's bristles."""
+    return speed - p.sigma_0 * ca.fabs(speed) * z / friction_level(parts, speed, p)
+
+
+def hysteresis_rate(z: Any, speed: Any, p: Any) -> Any:
+    """Return the rate of the deflection z of the spring that gives way, at a rate of the main spring's deflection."""
+    return speed - (speed * ca.fabs(z) + ca.fabs(speed) * z) / (2.0 * p.y_h)
 
 
 @record

@@ -525,6 +525,8 @@ def _check_roles(plant: Plant) -> None:
         named += [(f"port.{name}", getattr(port, name), plant.states) for name in fields]
         named += [("port.payload", name, plant.parameters) for name in port.payload]
     named += [(f"friction.{name}.smoothing", one.smoothing, plant.parameters) for name, one in plant.friction.items()]
+    bristled = {name: one.bristles for name, one in plant.friction.items() if one.bristles is not None}
+    named += [(f"friction.{name}.bristles.state", one.state, plant.states) for name, one in bristled.items()]
     if plant.mode is not None:
         named += [("mode.parameter", plant.mode.parameter, plant.parameters)]
         named += [("mode.state", plant.mode.state, plant.states)]

@@ -99,6 +99,33 @@ class SeriesSpring:
 
 
 @record(eq=False)
+class Bristles:
+    r"""What gives before a friction slides, so that at rest it is a spring: a friction that remembers.
+
+    The bristles' deflection z is a state of the plant, whose rate stands in `f`, and the force is
+    :math:`\\sigma_0 z + \\sigma_1 \\dot z`. While they hold, z follows the coordinate whose rate the velocity is.
+
+    Parameters
+    ----------
+    state : str
+        The deflection z, the plant's own.
+    coordinate : callable ``(x, p) -> expression``
+        What z follows.
+    stiffness, damping : callable ``p -> expression``
+        sigma_0 and sigma_1.
+    rate : callable ``(z, velocity, p) -> expression``
+        dz/dt, the velocity until they slip.
+
+    """
+
+    state: str
+    coordinate: StateExpression
+    stiffness: Expression
+    damping: Expression
+    rate: Callable[[Any, Any, Any], Any]
+
+
+@record(eq=False)
 class Friction:
     """A dissipative force of one velocity, opposite to it; what grows in proportion to the velocity may stay in `f`.
 
@@ -127,6 +154,8 @@ class Friction:
         among the parameters, under its name.
     rated : mapping of name to float
         The largest size of each load, with which linear analysis, which knows none, takes the friction.
+    bristles : Bristles, optional
+        What gives before it slides. `force` is then the curve of steady sliding, and the force that of the bristles.
 
     Examples
     --------
@@ -152,10 +181,19 @@ class Friction:
     smoothing: str | None = None
     loads: Callable[[Any, Any, Any], Mapping[str, Any]] | None = None
     rated: Mapping[str, float] = field(default_factory=dict[str, float])
+    bristles: Bristles | None = None
 
     def force_at(self, x: Any, u: Any, p: Any) -> Any:
         """Return the force of a state, inputs and parameters."""
-        return self.force(self.velocity(x, p), self.add_loads(x, u, p))
+        if self.bristles is None:
+            return self.force(self.velocity(x, p), self.add_loads(x, u, p))
+        held = self.bristles.stiffness(p) * getattr(x, self.bristles.state)
+        return held + self.bristles.damping(p) * self.find_rate(x, u, p)
+
+    def find_rate(self, x: Any, u: Any, p: Any) -> Any:
+        """Return the rate of the bristles' deflection."""
+        assert self.bristles is not None
+        return self.bristles.rate(getattr(x, self.bristles.state), self.velocity(x, p), self.add_loads(x, u, p))
 
     def add_loads(self, x: Any, u: Any, p: Any) -> Any:
         """Return the parameters, and the loads of a state and inputs among them."""

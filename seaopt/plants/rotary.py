@@ -70,6 +70,26 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
     "load_friction": PARTS["load_friction"],
     "load_stribeck": PARTS["load_stribeck"],
     "load_square": tuple(replace(item, unit="1/(N m)") for item in PARTS["load_square"]),
+    "lugre": (
+        Parameter(
+            name="f_c",
+            value=0.02,
+            unit="N m",
+            min=1e-12,
+            description="Coulomb friction at the motor",
+            plausible=(0, 1000),
+        ),
+        Parameter(
+            name="sigma_0", value=20.0, unit="N m/rad", min=0.0, description="stiffness of the bristles, at the motor"
+        ),
+        Parameter(
+            name="sigma_1", value=0.02, unit="N m s/rad", min=0.0, description="damping of the bristles, at the motor"
+        ),
+    ),
+    "hysteresis": (
+        Parameter(name="k_h", value=0.0, unit="N m/rad", min=0.0, description="stiffness of the spring that gives way"),
+        Parameter(name="y_h", value=5e-3, unit="rad", min=1e-12, description="deflection at which it gives way"),
+    ),
     "backlash": (
         Parameter(name="g_b", value=5e-4, unit="rad", min=0.0, description="half of the play, at the spring"),
         Parameter(name="eps_b", value=5e-5, unit="rad", min=1e-12, description="rounding of the play's corners"),
@@ -124,7 +144,7 @@ _PAYLOAD = {"free": ("J_l",), "pendulum": ("J_l", "m"), "bare": ("J_l",)}
 
 def rotary_parameters() -> tuple[Parameter, ...]:
     """Return the parameters that some `rotary` has, with their defaults."""
-    return (*_DRIVE, _HOUSING, *_LINK, *_PENDULUM, *(item for items in _PARTS.values() for item in items))
+    return (*(item for items in _PARTS.values() for item in items), *_DRIVE, _HOUSING, *_LINK, *_PENDULUM)
 
 
 def rotary(

@@ -126,7 +126,7 @@ class _Joints:
                 chosen.append(force)
                 velocities.append(velocity)
             else:  # its curve is all there is
-                curve = friction.force(velocity, friction.add_loads(*spaces))
+                curve = friction.force_at(*spaces)
                 f, h = ca.substitute(f, force, curve), ca.substitute(h, force, curve)
         state, arguments = [plant.x, plant.p], [plant.t, plant.x, plant.u, plant.p, ca.vertcat(*chosen)]
         speeds = ca.vertcat(*velocities)

@@ -349,12 +349,13 @@ class Controller:
         """Give the friction margin, of which state the figures are, and the other's; nothing without friction."""
         if self.design is None:
             return []
-        _, *stuck = self._measure_states().values()
+        _, *stuck = self._measure_states().items()
         margin = [] if self.friction is None else [self._describe_friction_margin(self.friction)]
+        heads = ["these are of the design plant sliding, on which the bandwidth is placed;", *[" "] * len(stuck)]
         return margin + [
-            "  these are of the design plant sliding, on which the bandwidth is placed; stuck: bandwidth "
-            f"{format_number(figures.bandwidth_hz, missing='none')} Hz, {figures.describe_peaks()}"
-            for figures in stuck
+            f"  {head}{state}: bandwidth {format_number(figures.bandwidth_hz, missing='none')} Hz, "
+            f"{figures.describe_peaks()}"
+            for head, (state, figures) in zip(heads, stuck, strict=False)
         ]
 
     def _describe_friction_margin(self, friction: FrictionMargin) -> str:

@@ -135,11 +135,12 @@ def judge_all(
 ) -> list[Verdict]:
     """Judge every plant's loop, and the design plant's, which is the first, by its own limits too.
 
-    Of two `design_states` the first is the design plant sliding, the second the same plant stuck by its friction.
+    Of several `design_states` the first is the design plant sliding, the others the same plant stuck by friction.
     """
     verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant", limits=limits)]
     verdicts += judge(spec, loops[0], "design plant", limits=limits)
-    return verdicts + (judge(spec, loops[1], "design plant", stuck=True, limits=limits) if design_states == 2 else [])
+    stuck = loops[1:design_states]
+    return verdicts + [v for loop in stuck for v in judge(spec, loop, "design plant", stuck=True, limits=limits)]
 
 
 def list_broken(verdicts: Sequence[Verdict]) -> list[str]:

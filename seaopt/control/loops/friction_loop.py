@@ -16,7 +16,13 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant, find_rest, linearise_sets, sample_linear
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import SLIDING, friction_matrices, friction_slopes, friction_states
+from seaopt.plants.friction import (
+    SLIDING,
+    find_bristle_stiffness,
+    friction_matrices,
+    friction_slopes,
+    friction_states,
+)
 from seaopt.plants.memo import memo
 from seaopt.records import record
 
@@ -49,6 +55,8 @@ class FrictionLoop:
         Besides its friction the plant is linear, once links that turn are linearised at rest.
     linearised : bool
         Some link is.
+    remembers : bool
+        Some friction has bristles, and is no curve of its velocity.
 
     """
 
@@ -64,12 +72,15 @@ class FrictionLoop:
     delay_s: float = 0.0
     linear: bool = True
     linearised: bool = False
+    remembers: bool = False
 
     @property
     def obstacle(self) -> str:
         """Why no test of absolute stability is for this loop, whatever its law; empty where one is."""
         if not self.linear:
             return "the plant is not linear besides its friction"
+        if self.remembers:
+            return "friction with bristles is no curve of its velocity"
         if np.any(self.through * self.slopes):  # a sampled jump has no bounded gain
             return "friction acts on the measured output itself"
         return ""
@@ -180,20 +191,22 @@ def make_friction_loops(
     """
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
-    if not np.any(spans):
+    held = [np.array(find_bristle_stiffness(plant, each)) for each in values]
+    if not np.any(spans) and not np.any(held):
         return [None] * len(sets)
     sliding = friction_states(plant)[SLIDING]
     blocks, delays = linearise_sets(sliding, values, measured, per_effort)
     sampled = sample_linear(blocks, delays, law.sample_time_s, delay_samples)
     loops: list[FrictionLoop | None] = []
-    for k, (each, span) in enumerate(zip(values, spans, strict=True)):
+    for k, (each, span, stiffness) in enumerate(zip(values, spans, held, strict=True)):
         x, u = find_rest(plant, each)
         on_states, on_outputs, velocity = (np.array(block) for block in friction_matrices(plant)(x, u, each.vector))
         linear, linearised = _check_linear(sliding, x, each.vector)
-        loops.append(None if not np.any(span) else FrictionLoop(
+        remembers = bool(np.any(stiffness))
+        loops.append(None if not np.any(span) and not remembers else FrictionLoop(
             a=blocks[0][k], motor=blocks[1][k], measured=blocks[2][k], friction=on_states, velocity=velocity,
             through=on_outputs[list(plant.outputs).index(measured)], slopes=span, plant=sampled[k],
-            law=law, delay_s=float(delays[k]), linear=linear, linearised=linearised,
+            law=law, delay_s=float(delays[k]), linear=linear, linearised=linearised, remembers=remembers,
         ))  # fmt: skip
     return loops
 

@@ -24,6 +24,7 @@ from jaxtyping import Complex, Float, Inexact
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, jacobians
+from seaopt.plants.friction import SLIDING, friction_states, remembers, take_at_rest
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import dynamics_function
 from seaopt.records import record
@@ -158,6 +159,8 @@ def sample_linear(
 def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:
     """Return an output of a constant unit of the first input, linearised at rest; infinite where it integrates.
 
+    Bristles slide, which at rest carry a part of the input.
+
     Raises
     ------
     ControlError
@@ -165,6 +168,7 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
 
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items()}
+    plant = friction_states(plant)[SLIDING] if remembers(plant) else plant
     a, b, c, d = linearise(plant, params.vector[:, None], at, output, 1.0)
     return _compute_static_gain(a[0], b[0], c[0], float(d[0]))
 
@@ -223,7 +227,7 @@ def linearise(
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
-    row = list(plant.outputs).index(measured)
+    row, plant = list(plant.outputs).index(measured), take_at_rest(plant)
     a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(plant, p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
@@ -248,7 +252,7 @@ def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarr
 
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name != DELAY}
-    x, u = _solve_rest(plant, params.vector[:, None], at)
+    x, u = _solve_rest(take_at_rest(plant), params.vector[:, None], at)
     return x[:, 0], u[:, 0]
 
 
@@ -287,7 +291,7 @@ def differentiate_linearisation(
     dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
-    row, names = list(plant.outputs).index(measured), list(plant.states)
+    row, names, plant = list(plant.outputs).index(measured), list(plant.states), take_at_rest(plant)
     x, u = _solve_rest(plant, p, at)
     a, b, c, d = _evaluate_jacobians(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)

@@ -180,12 +180,13 @@ def make_task(
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in robust_to.items()}
     varied = {parameter for draw in draws for parameter in draw}
     models: dict[str, tuple[Plant, CompletedParameters]] = {}
+    design_states = len(split_friction({"": plant}, values, varied))
     whole: dict[Plant, Plant] = {}  # the plant with its friction, of one that slides
     for name, (model, given) in named.items():
         completed = model.complete(given)
         variants = split_friction({name: model}, completed, varied)
         models |= {one: (variant, variant.complete(completed)) for one, variant in variants.items()}
-        if model not in variants.values():  # it has friction, and is there twice
+        if model not in variants.values():  # it has friction, and is there twice or more
             whole[friction_states(model)[SLIDING]] = model
     pairs = [*models.items(), *_draw_plants(models, draws)]
     design_plant = pairs[0][1][0]
@@ -204,7 +205,7 @@ def make_task(
     port = None if spec.passive_band_hz is None else port_of(design_plant, values, spec.measured, gain)
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
-        design_states=1 if design_plant is plant else 2,
+        design_states=design_states,
         frictions=_find_friction(spec, [pair for _, pair in pairs], plants, whole, gain),
     )  # fmt: skip
 

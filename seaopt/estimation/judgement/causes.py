@@ -27,6 +27,7 @@ from seaopt.estimation.solver.settle import ROUGH_ITERATIONS, Solved, settle_rou
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import list_smoothing
 from seaopt.plants.parts import wrapped
 from seaopt.records import record
 from seaopt.units import ROTARY, mechanics_of, unit_after
@@ -291,7 +292,7 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
     tests = dict(suspects)
     for name in bending[:MOST_BENDING]:
         tests |= run_score_tests(minimum, fit, (name,)) if name not in tests else {}
-    speeds = {friction.smoothing for e in fit.experiments for friction in e.plant.friction.values()}
+    speeds = {name for e in fit.experiments for name in list_smoothing(e.plant)}
     groups = _group_alike({name: test for name, test in tests.items() if name in plain})
     in_turn = [name for rank in zip_longest(*groups) for name in rank if name is not None]
     for name in [*in_turn[:MOST_REFITTED], *(name for name in tests if name in bending)]:
@@ -358,9 +359,9 @@ def _grow_with_load(plant: Plant) -> Plant | None:
     """Return a plant whose friction takes a share of the motor's effort, too; None where roles do not tell how."""
     actuation = plant.actuation
     name, friction = next(iter(plant.friction.items()), ("", None))
-    if actuation is None or friction is None or friction.loads is not None or friction.smoothing is None:
+    if actuation is None or friction is None or friction.loads is not None or not list_smoothing(plant):
         return None
-    smoothing, curve, jump = friction.smoothing, friction.force, friction.jump
+    smoothing, curve, jump = list_smoothing(plant)[0], friction.force, friction.jump
 
     def take(p: Any) -> Any:
         return getattr(p, LOAD_SHARE) * ca.fabs(getattr(p, LOAD))

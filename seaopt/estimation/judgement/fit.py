@@ -19,8 +19,10 @@ from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.delay_cells import search_delays
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
+from seaopt.estimation.solver.step_size import hold_bristles
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.friction import list_smoothing
 from seaopt.plants.plant import require_plant
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
@@ -100,7 +102,7 @@ def fit(
     )  # fmt: skip
     _check_samples(problem)
     _check_stiffness(problem)
-    solved = search_delays(chosen.solve(problem, callback), chosen.max_iterations, callback)
+    solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
     return judge(result, alternatives) if diagnostics else result
 
@@ -189,11 +191,10 @@ def _check_stiffness(problem: FitProblem) -> None:
             continue
         steps, plant = experiment.count_stable_steps(problem.unknowns.start), experiment.data.plant
         speeds = plant.complete(experiment.data.apply_own(problem.params))
-        names = dict.fromkeys(f.smoothing for f in plant.friction.values() if f.smoothing)
         sharp = [
             f"give {n} = {speeds[n].value * steps / MAX_SUBSTEPS:.1e}{unit_after(speeds[n].unit)} or more in place of "
             f"{speeds[n].value:.1g}, or free it"
-            for n in names
+            for n in list_smoothing(plant)
         ]
         raise EstimationError(
             f"experiment {experiment.name}: {plant.name} is so stiff near rest that each sample takes {steps:.2g} "

@@ -42,6 +42,7 @@ from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import QuadraticModel, TrustRegionStep, solve_seen
 from seaopt.estimation.problem.unknowns import Unknowns, collect, find_places
 from seaopt.parameters import ParameterSet
+from seaopt.plants.friction import list_smoothing
 from seaopt.records import record
 from seaopt.simulation import Pass, threads
 
@@ -150,7 +151,7 @@ class FitProblem:
     def find_smoothing(self) -> list[int]:
         """Return the unknowns that are speeds over which some plant's friction is smoothed through zero."""
         plants = [experiment.data.plant for experiment in self.experiments if not experiment.model.sticks]
-        names = {friction.smoothing for plant in plants for friction in plant.friction.values()}
+        names = {name for plant in plants for name in list_smoothing(plant)}
         return [i for i, name in enumerate(self.unknowns.names[: self.unknowns.shared]) if name in names]
 
     def take_step(self, step: TrustRegionStep[Evaluation]) -> Evaluation:

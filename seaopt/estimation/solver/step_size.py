@@ -11,6 +11,7 @@ from jaxtyping import Float
 from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, MAX_SUBSTEPS, FitExperiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
+from seaopt.plants.friction import remembers
 from seaopt.records import record
 from seaopt.simulation import Pass
 
@@ -74,6 +75,24 @@ def _choose_first_steps(experiment: FitExperiment, here: Evaluation, most: int) 
     error = _measure_output_error(experiment, z, here.passes.by_experiment[experiment.name], fine)
     order = experiment.model.order
     return min(_choose_steps(experiment.count_steps(z), StepError(output=error), FIRST_STEP_ERROR, order), most)
+
+
+def hold_bristles(problem: FitProblem) -> FitProblem:
+    """Return the problem with steps short enough for bristles at the start: they are stiff where they slip, not at rest.
+
+    How fast they slip only a simulation tells, and with steps too long for it that overflows.
+    """
+    bristled = any(remembers(experiment.data.plant) for experiment in problem.experiments)
+    while bristled and not np.isfinite(problem.evaluate(problem.unknowns.start).cost):
+        steps = [experiment.count_steps(problem.unknowns.start) for experiment in problem.experiments]
+        finer = [
+            min(2 * count, MAX_SUBSTEPS) if remembers(experiment.data.plant) else count
+            for experiment, count in zip(problem.experiments, steps, strict=True)
+        ]
+        if finer == steps:
+            break
+        problem = _with_substeps(problem, finer)
+    return problem
 
 
 def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:

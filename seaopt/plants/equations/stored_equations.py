@@ -117,6 +117,11 @@ def store_plant(plant: Any) -> dict[str, Any]:
             one, velocity=store(one.velocity, x, p), force=store(one.force, "velocity", (*p, *one.rated)),
             effort=store(one.effort, p), slopes=store(one.slopes, (*p, *one.rated)),
             jump=store(one.jump, "speed", (*p, *one.rated)), loads=store(one.loads, x, u, p),
+            bristles=None if one.bristles is None else replace(
+                one.bristles, coordinate=store(one.bristles.coordinate, x, p),
+                stiffness=store(one.bristles.stiffness, p), damping=store(one.bristles.damping, p),
+                rate=store(one.bristles.rate, "z", "velocity", (*p, *one.rated)),
+            ),
         )  # fmt: skip
 
     def store_port(one: Port) -> Port:

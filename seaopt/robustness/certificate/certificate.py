@@ -27,7 +27,7 @@ from seaopt.formatting import (
 )
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import friction_slopes, split_friction
+from seaopt.plants.friction import friction_slopes, remembers, split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
@@ -496,6 +496,8 @@ class Certificate:
             return "; " + "; ".join(map(str, self.cycles[name]))
         if not isinstance(self.steps, Verification):
             return "; limit cycles are not looked for, as nothing can be simulated"
+        if remembers(self.models[name]):
+            return "; no simulated step ends in a limit cycle, and those of bristles are not predicted"
         flattest, steepest = friction_slopes(self.models[name], self.parameters)
         if np.count_nonzero(steepest - flattest) > 1:
             return "; no simulated step ends in a limit cycle, and with several frictions none can be predicted"

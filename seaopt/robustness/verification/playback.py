@@ -18,6 +18,7 @@ from seaopt.control.running.sampled_loop import channel_names
 from seaopt.errors import ControlError
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
+from seaopt.plants.friction import can_stick
 from seaopt.plants.impacts import catch, offset, release, strike
 from seaopt.plants.plant import fill_vector
 from seaopt.records import record
@@ -64,7 +65,7 @@ class Stage:
             sensors=self.sensors,
             current_step_A=self.current_step_A,
             longest_delay_s=longest_delay_s,
-            sticks=sticks,
+            sticks=sticks and can_stick(plant),  # bristles hold by themselves
         )
 
     @property

@@ -16,7 +16,7 @@ from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import can_stick, find_breakaway, find_dry_friction, take_sliding
+from seaopt.plants.friction import can_hold, can_stick, find_breakaway, find_dry_friction, take_sliding
 from seaopt.plants.impacts import strike
 from seaopt.records import record
 from seaopt.units import LINEAR, ROTARY, Mechanics
@@ -110,7 +110,7 @@ class Scenario:
         Plants that it applies to: every one, those without a link that moves at a port, or those with one.
     friction : {"smooth", "sticking"}
         How dry friction is simulated: as its smoothed curve, or as one that jumps at rest, so that what sticks stands
-        still (`seaopt.simulation.sticking`).
+        still (`seaopt.simulation.sticking`). Bristles are simulated as they are in either.
 
     """
 
@@ -165,8 +165,8 @@ class Scenario:
         if any(phase.held for phase in self.phases) and partner is None:
             return "there is no plant with the same actuator and its link fixed"
         held = partner if any(phase.held for phase in self.phases) else None
-        if self.friction == "sticking" and not all(can_stick(each) for each in (plant, held) if each is not None):
-            return "the plant has no friction that jumps at rest"
+        if self.friction == "sticking" and not all(can_hold(each) for each in (plant, held) if each is not None):
+            return "the plant has no friction that jumps at rest, or that has bristles"
         for name in (name for phase in self.phases for name in phase.scale):
             if name not in plant.parameters:
                 return f"the plant has no parameter {name}"
@@ -243,10 +243,11 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     end at its reference; a moving link gives way, so that there the force goes back to zero and only what every
     scenario requires is required.
 
-    Dry friction that can stick is simulated in both ways: each step comes again with friction that sticks. Where the
-    law has an integral there are steps of 0.1, 0.3 and 0.7 times the friction besides, in which it has to grow until
-    friction lets go. The time to settle is then longer, by `WAITING_PERIODS` for each time that the friction is the
-    step, and the force may end further off, by 2 % of the friction, but by no more than a tenth of the step.
+    Dry friction that can stick is simulated in both ways: each step comes again with friction that sticks; friction
+    with bristles sticks by itself, and each step is there once. Where the law has an integral there are steps of 0.1,
+    0.3 and 0.7 times the friction besides, in which it has to grow until friction lets go. The time to settle is then
+    longer, by `WAITING_PERIODS` for each time that the friction is the step, and the force may end further off, by 2 %
+    of the friction, but by no more than a tenth of the step.
 
     Parameters
     ----------
@@ -272,7 +273,7 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
             small = {f"step of {share:g} times the friction": share * stuck for share in STUCK_STEPS}
             sizes |= {name: force for name, force in small.items() if force > least}
         sticking = (_step(controller, plant, name, force, tail) for name, force in sizes.items())
-        steps += [_stick(controller, step, stuck) for step in sticking]
+        steps = [*(steps if can_stick(plant) else []), *(_stick(controller, step, stuck) for step in sticking)]
     return tuple(steps)
 
 
@@ -288,7 +289,7 @@ def make_sticking(scenario: Scenario) -> Scenario:
 
 def _find_sticking_friction(plant: Plant, sets: Sequence[ParameterSet]) -> float:
     """Return the largest friction (N) of the sets that holds joints at rest; 0 for none."""
-    return max(find_breakaway(plant, plant.complete(each)) for each in sets) if can_stick(plant) else 0.0
+    return max(find_breakaway(plant, plant.complete(each)) for each in sets) if can_hold(plant) else 0.0
 
 
 def _step(controller: Controller, plant: Plant, name: str, force: float, tail: float) -> Scenario:
