@@ -354,6 +354,7 @@ def make_plant(
         spring=SeriesSpring(
             deflection=deflection, unit=place, stiffness=drive.stiffness,
             mass=second_order[0] if second_order else None, damping=second_order[1] if second_order else None,
+            play="g_b" if "backlash" in parts else None,
         ),
         ports=ports,
         friction=frictions,
@@ -394,7 +395,7 @@ def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence
             unit=drive.effort_unit,
             effort=lambda p: 1.0 / drive.travel(p),
             slopes=lambda p: part_laws.bound_friction_slopes(parts, p),
-            jump=None if "lugre" in parts else lambda speed, p: part_laws.friction_level(parts, speed, p),
+            jump=lambda speed, p: part_laws.friction_level(parts, speed, p),
             smoothing="v_s",
             loads=loads,
             rated=part_laws.LOADS if "load_friction" in parts else {},

@@ -104,7 +104,7 @@ def find_dry_friction(plant: Plant, params: CompletedParameters) -> dict[str, fl
 def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     """Return the effort at the spring that is needed to let every joint that can stick slide, N or N m.
 
-    It is the largest force at low speeds of each friction that declares its jump, or has bristles.
+    It is the largest force of each friction that declares its jump, at low speeds.
 
     Examples
     --------
@@ -118,12 +118,9 @@ def find_breakaway(plant: Plant, params: CompletedParameters) -> float:
     p = params.by_attribute
     return sum(
         abs(float(friction.effort(p)))
-        * max(
-            float((friction.jump or friction.force)(speed, friction.add_rated(p)))
-            for speed in _list_low_speeds(friction, params)
-        )
+        * max(float(friction.jump(speed, friction.add_rated(p))) for speed in _list_low_speeds(friction, params))
         for friction in plant.friction.values()
-        if friction.jump is not None or friction.bristles is not None
+        if friction.jump is not None
     )
 
 
@@ -150,7 +147,7 @@ def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, "
             np.zeros(len(plant.states)), np.zeros(len(plant.inputs)), plant.complete(params).vector
         )
     )
-    sticks = [friction.jump is not None for friction in plant.friction.values()]
+    sticks = [friction.jumps for friction in plant.friction.values()]
     effects, rows = effects[:, sticks], rows[sticks]
     poles = np.linalg.eigvals(a - effects @ np.linalg.solve(rows @ effects, rows @ a))
     return np.sort(np.abs(poles[np.imag(poles) > 0.0])) / (2 * np.pi)
@@ -201,8 +198,8 @@ def take_sliding(plant: Plant, params: ParameterSet) -> Plant:
 
 
 def can_stick(plant: Plant) -> bool:
-    """Tell whether a plant has a friction that declares its jump."""
-    return any(friction.jump is not None for friction in plant.friction.values())
+    """Tell whether a plant has a friction that can be simulated as a jump at rest."""
+    return any(friction.jumps for friction in plant.friction.values())
 
 
 def can_hold(plant: Plant) -> bool:

@@ -125,7 +125,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
         Parameter(name="y_h", value=1e-4, unit="m", min=1e-12, description="deflection at which it gives way"),
     ),
     "backlash": (
-        Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play"),
+        Parameter(name="g_b", value=2e-5, unit="m", min=0.0, description="half of the play", plausible=(0, 0.1)),
         Parameter(name="eps_b", value=2e-6, unit="m", min=1e-12, description="rounding of the play's corners"),
     ),
     "hardening": (Parameter(name="k_3", value=0.0, unit="N/m^3", min=0.0, description="cubic stiffness"),),

@@ -419,10 +419,11 @@ def _convert_unit(parameter: Parameter, unit: str, plant: str) -> Parameter:
 
 
 def _keep_bounds(parameter: Parameter, default: str | Parameter, plant: str) -> Parameter:
-    """Return a parameter with the plant's bounds where it has none of its own."""
+    """Return a parameter with the plant's bounds where it has none of its own; what is divided by stays above zero."""
     if isinstance(default, str):
         return parameter
     low = default.min if parameter.min == -math.inf else parameter.min
+    low = max(low, default.min) if default.min > 0.0 else low
     high = default.max if parameter.max == math.inf else parameter.max
     if (low, high) == (parameter.min, parameter.max):
         return parameter
@@ -516,6 +517,7 @@ def _check_roles(plant: Plant) -> None:
         named += [(f"sensing.{name}", getattr(plant.sensing, name), signals) for name in fields]
     if plant.spring is not None:
         named.append(("spring.stiffness", plant.spring.stiffness, plant.parameters))
+        named.append(("spring.play", plant.spring.play, plant.parameters))
         named += [
             (f"spring.{name}", getattr(plant.spring, name), plant.derived_values()) for name in ("mass", "damping")
         ]

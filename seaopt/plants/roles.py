@@ -88,6 +88,8 @@ class SeriesSpring:
         The parameter that is its stiffness, where one is.
     mass, damping : str or None
         The derived figures that (16) of Orekhov et al. 2015 reads from a second-order response with k known.
+    play : str or None
+        The parameter that is its play, where it has some; a fit that looks for it starts more than once.
 
     """
 
@@ -96,6 +98,7 @@ class SeriesSpring:
     stiffness: str | None = None
     mass: str | None = None
     damping: str | None = None
+    play: str | None = None
 
 
 @record(eq=False)
@@ -202,6 +205,11 @@ class Friction:
     def add_rated(self, p: Any) -> Any:
         """Return the parameters, and the rated loads among them."""
         return SimpleNamespace(**vars(p), **self.rated) if self.rated else p
+
+    @property
+    def jumps(self) -> bool:
+        """Whether a simulation can take it as a jump at rest: bristles are simulated as they are."""
+        return self.jump is not None and self.bristles is None
 
     @property
     def slope_unit(self) -> str:

@@ -91,7 +91,14 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
         Parameter(name="y_h", value=5e-3, unit="rad", min=1e-12, description="deflection at which it gives way"),
     ),
     "backlash": (
-        Parameter(name="g_b", value=5e-4, unit="rad", min=0.0, description="half of the play, at the spring"),
+        Parameter(
+            name="g_b",
+            value=5e-4,
+            unit="rad",
+            min=0.0,
+            description="half of the play, at the spring",
+            plausible=(0, 1),
+        ),
         Parameter(name="eps_b", value=5e-5, unit="rad", min=1e-12, description="rounding of the play's corners"),
     ),
     "hardening": (Parameter(name="k_3", value=0.0, unit="N m/rad^3", min=0.0, description="cubic stiffness"),),

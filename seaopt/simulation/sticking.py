@@ -115,14 +115,14 @@ class _Joints:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.jumps = [(one.jump, one.add_loads) for one in plant.friction.values() if one.jump is not None]
+        self.jumps = [(one.jump, one.add_loads) for one in plant.friction.values() if one.jump and one.jumps]
         equations, spaces = separate_friction(plant), name_symbols(plant, plant.x, plant.u, plant.p)
         chosen: list[Any] = []
         velocities: list[Any] = []
         forces, every = ca.vertsplit(equations.forces), ca.vertsplit(equations.velocities)
         f, h = equations.f, equations.h
         for force, velocity, friction in zip(forces, every, plant.friction.values(), strict=True):
-            if friction.jump is not None:
+            if friction.jumps:
                 chosen.append(force)
                 velocities.append(velocity)
             else:  # its curve is all there is

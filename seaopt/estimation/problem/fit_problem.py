@@ -154,6 +154,13 @@ class FitProblem:
         names = {name for plant in plants for name in list_smoothing(plant)}
         return [i for i, name in enumerate(self.unknowns.names[: self.unknowns.shared]) if name in names]
 
+    @property
+    def seeks_play(self) -> bool:
+        """Whether a spring's play is among the unknowns: there are then minima in which it opens at other times."""
+        springs = (experiment.data.plant.spring for experiment in self.experiments)
+        plays = {spring.play for spring in springs if spring is not None}
+        return any(name in plays for name in self.unknowns.names[: self.unknowns.shared])
+
     def take_step(self, step: TrustRegionStep[Evaluation]) -> Evaluation:
         """Return the evaluation at the end of a step."""
         return self.evaluate(step.end)

@@ -65,7 +65,7 @@ class OutputError(Method):
         solved = settle(problem, best, self.max_iterations, callback) if np.isfinite(best.cost) else None
         if solved is not None and self.search:
             solved = self._bring_back(solved, callback)
-        if solved is not None and not (self.search and _is_doubtful(solved, guesses)):
+        if solved is not None and not (self.search and (problem.seeks_play or _is_doubtful(solved, guesses))):
             return solved
         for start in _further_starts(problem, best, guesses, self) if self.search else ():
             here = problem.evaluate(start)

@@ -78,7 +78,7 @@ def _choose_first_steps(experiment: FitExperiment, here: Evaluation, most: int) 
 
 
 def hold_bristles(problem: FitProblem) -> FitProblem:
-    """Return the problem with steps short enough for bristles at the start: they are stiff where they slip, not at rest.
+    """Return the problem with steps short enough for bristles at the start, which are stiff where they slip.
 
     How fast they slip only a simulation tells, and with steps too long for it that overflows.
     """
