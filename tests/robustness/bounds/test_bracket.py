@@ -53,7 +53,12 @@ CASES = {  # plant, standard deviations, ranges, draws
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+QUICK = ("swing, fit and inertia", "swing, delay", "swing, angle")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 def test_no_draw_is_above_the_bound_and_the_bound_is_near(case, controller, thor, request):
     name, priors, ranges, count = CASES[case]
     plant = request.getfixturevalue(name)

@@ -35,8 +35,10 @@ def controller(stand, swing, thor):
 
 @pytest.fixture(scope="module")
 def certificate(controller, stand, swing, thor):
-    params = thor.prior(J=2e-9, b_r=2e-7, eta=1e-4)
-    return so.certify(controller, {"stand": stand, "swing": swing}, params, ranges={"I_p": (0.2, 0.6)}, samples=1375)
+    params, plants = thor.prior(J=2e-9, b_r=2e-7, eta=1e-4), {"stand": stand, "swing": swing}
+    return so.certify(
+        controller, plants, params, ranges={"I_p": (0.2, 0.6)}, samples=1375, max_failure_probability=0.01
+    )
 
 
 def test_it_passes_with_the_stated_bound(certificate):
@@ -89,8 +91,8 @@ def test_the_worst_draw_is_a_witness(certificate, controller, swing, thor):
     assert worst.ms >= certificate.plants["swing"].ms
 
 
-def test_a_controller_that_fails_is_named_with_its_witness(controller, swing, thor):
-    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"eta": (0.5, 4.0)}, samples=200)
+def test_a_controller_that_fails_is_named_with_its_witness(controller, stand, thor):
+    certificate = so.certify(controller, {"stand": stand}, thor, ranges={"eta": (0.5, 4.0)}, samples=200)
     assert not certificate.passed
     assert certificate.monte_carlo.failures > 0
     broken = [item for item in certificate.requirements if not item.met]
@@ -233,11 +235,11 @@ def test_the_design_plant_is_certified_though_nobody_lists_it(controller, stand,
     assert repr(again) == repr(alone)
 
 
-def test_another_law_meets_other_draws(controller, swing, thor):
+def test_another_law_meets_other_draws(controller, stand, thor):
     """A law tuned with the worst draws of a certificate must not be certified on the same draws."""
     softer = replace(controller, law=scaled(controller.law, 1.0, 0.9))
     points = [
-        so.certify(law, {"swing": swing}, thor, ranges={"I_p": (0.2, 0.6)}, samples=1, seed=seed)
+        so.certify(law, {"stand": stand}, thor, ranges={"eta": (0.9, 1.0)}, samples=1, seed=seed)
         for law, seed in ((controller, 1), (controller, 1), (controller, 2), (softer, 1))
     ]
     assert len({_digest(controller), _digest(softer)}) == 2
@@ -296,30 +298,30 @@ def test_a_range_beyond_the_given_sets_own_bounds(controller, swing, thor):
         so.certify(controller, {"swing": swing}, narrow, ranges={"I_p": (0.2, 0.6)}, samples=5)
 
 
-def test_the_bound_is_required_where_it_is_asked_for(controller, swing, thor):
+def test_the_bound_is_required_where_it_is_asked_for(certificate, controller, stand, thor):
     """1375 draws without a failure bound it by 1 % (ln(1e6)/ln(1/0.99) = 1374.6); 50 by 24 %, which is noted."""
-    options = {"ranges": {"I_p": (0.3, 0.5)}, "max_failure_probability": 0.01}
-    few = so.certify(controller, {"swing": swing}, thor, samples=50, **options)
+    assert certificate.passed and any(row.name == "max_failure_probability" for row in certificate.requirements)
+    options = {"ranges": {"eta": (0.9, 1.0)}, "max_failure_probability": 0.01}
+    few = so.certify(controller, {"stand": stand}, thor, samples=50, **options)
     (row,) = [item for item in few.requirements if not item.met]
     assert (row.name, row.limit) == ("max_failure_probability", 0.01)
     assert row.value == pytest.approx(1.0 - 1e-6 ** (1 / 50), rel=1e-9)
     assert "1375 draws without a failure would do" in row.where
     assert "below 0.24" in few.notes[-1]
-    assert so.certify(controller, {"swing": swing}, thor, samples=1375, **options).passed
-    assert not so.certify(controller, {"swing": swing}, thor, max_failure_probability=0.01).passed  # nothing is drawn
+    assert not so.certify(controller, {"stand": stand}, thor, max_failure_probability=0.01).passed  # nothing is drawn
 
 
-def test_values_in_other_units_are_the_same_values(controller, swing, thor):
+def test_values_in_other_units_are_the_same_values(controller, stand, thor):
     """646 g known within 1 g, and 0.2 ms of delay."""
     late = [Parameter(name="delay_s", value=value, unit=unit) for value, unit in ((2e-4, "s"), (0.2, "ms"))]
     kilograms = thor.with_parameters(replace(thor["m_l"], prior_std=1e-3), late[0])
     grams = Parameter(name="m_l", value=646.0, unit="g", prior_std=1.0, min=0.0)
     found = [
-        so.certify(controller, {"swing": swing}, params, ranges={"I_p": (0.3, 0.5)}, samples=50)
+        so.certify(controller, {"stand": stand}, params, ranges={"eta": (0.9, 1.0)}, samples=50)
         for params in (kilograms, thor.with_parameters(grams, late[1]))
     ]
-    assert found[1].worst["swing"].ms == pytest.approx(found[0].worst["swing"].ms, rel=1e-9)
-    assert found[1].worst["swing"].parameters == pytest.approx(found[0].worst["swing"].parameters, rel=1e-9)
+    assert found[1].worst["stand"].ms == pytest.approx(found[0].worst["stand"].ms, rel=1e-9)
+    assert found[1].worst["stand"].parameters == pytest.approx(found[0].worst["stand"].parameters, rel=1e-9)
     told = [next(item for item in each.varied if item.name == "m_l") for each in found]
     assert told[1].std == pytest.approx(told[0].std)
 
@@ -384,9 +386,6 @@ def test_stability_with_friction_is_shown_over_draws_and_may_be_required(stand, 
     assert row.met and row.sense == "≥" and row.value == min(drawn.least_slope, *certificate.friction["stand"].slopes)
     again = type(certificate).from_dict(certificate.to_dict(), controller, {"stand": stand}, certificate.parameters)
     assert again.friction_draws == certificate.friction_draws
-    asked = so.certify(controller, {"stand": stand}, rubbing, samples=5, min_friction_margin=1e9)
-    (broken,) = [row for row in asked.requirements if row.name == "min_friction_margin"]
-    assert not broken.met and not asked.passed
 
 
 def margin_rows(certificate):
