@@ -180,7 +180,10 @@ class Actuator:
 
 @record
 class Motion:
-    """The accelerations and forces of an actuator, as expressions of state, input and parameters."""
+    """The accelerations and forces of an actuator, as expressions of state, input and parameters.
+
+    Its energy is written down where it is asked for: a spring's may take longer than all the rest.
+    """
 
     rates: Mapping[str, Any]
     forces: tuple[Any, Any]
@@ -188,7 +191,7 @@ class Motion:
     deflection: Any
     deflection_rate: Any
     spring_force: Any
-    energy: Any
+    energy: Callable[[], Any]
 
 
 def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
@@ -256,12 +259,15 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> Motion:
         forces = (tension, -bolt if screw else tension - between)
     else:
         forces = (tension + between + (sigma * thrust(nut, x_n) if screw else 0.0), tension)
-    stored = kinetic + potential + part_laws.spring_energy(parts, deflection, stiffness, p)
+
+    def energy() -> Any:
+        stored = kinetic + potential + part_laws.spring_energy(parts, deflection, stiffness, p)
+        return stored + (0.5 * p.k_b * x.s**2 if screw else 0.0)
+
     return Motion(
         rates={name: value for k, pair in enumerate(names) for name, value in zip(pair, (yd[k], ydd[k]), strict=True)},
         forces=forces, places=(x_1, x_2), deflection=deflection, deflection_rate=speed(deflection),
-        spring_force=tension,
-        energy=stored + (0.5 * p.k_b * x.s**2 if screw else 0.0),
+        spring_force=tension, energy=energy,
     )  # fmt: skip
 
 
@@ -330,7 +336,7 @@ def make_plant(
 
     def energy(x: Any, p: Any) -> Any:
         held = (0.5 * one.stiffness(p) * getattr(x, one.state) ** 2 for one in map(_get_bristles, bristled))
-        return solve_motion(actuator, x, _rest(actuator), p).energy + sum(held)
+        return solve_motion(actuator, x, _rest(actuator), p).energy() + sum(held)
 
     def deflection(x: Any, p: Any) -> Any:
         return solve_motion(actuator, x, _rest(actuator), p).deflection

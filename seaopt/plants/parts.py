@@ -383,34 +383,28 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
     units = plant.inputs if where == "input" else plant.outputs
     added = {state: units[signal] for signal in signals for state in own[signal]}
 
-    def split(t: Any, x: Any, u: Any, p: Any) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Return inner inputs, inner outputs' replacement, and derivatives of the filters' states."""
+    def state(x: Any, signal: str) -> Any:
+        return ca.vertcat(*(getattr(x, name) for name in own[signal]))
+
+    def replace_signals(sources: Mapping[str, Any], x: Any, p: Any) -> dict[str, Any]:
+        """Return inputs or outputs with those that are filtered in place of their sources."""
         filters = law(p, parameter)
-        states = {signal: ca.vertcat(*(getattr(x, name) for name in own[signal])) for signal in signals}
-        inner_u = dict(vars(u))
-        if where == "input":
-            passed = {s: ca.mtimes(filters.c, states[s]) + filters.d * inner_u[s] for s in signals}
-            sources, inner_u = dict(inner_u), inner_u | passed
-            out = plant.h(t, x, SimpleNamespace(**inner_u), p)
-        else:
-            out = dict(plant.h(t, x, SimpleNamespace(**inner_u), p))
-            sources = dict(out)
-            out |= {s: ca.mtimes(filters.c, states[s]) + filters.d * sources[s] for s in signals}
-        rates: dict[str, Any] = {}
-        for s in signals:
-            rate = ca.mtimes(filters.a, states[s]) + filters.b * sources[s]
-            rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
-        return inner_u, dict(out), rates
-
-    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        inner_u, _, rates = split(t, x, u, p)
-        return {**plant.f(t, x, SimpleNamespace(**inner_u), p), **rates}
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return split(t, x, u, p)[1]
+        return {**sources, **{s: ca.mtimes(filters.c, state(x, s)) + filters.d * sources[s] for s in signals}}
 
     def find_inputs(x: Any, u: Any, p: Any) -> SimpleNamespace:
-        return SimpleNamespace(**split(0.0, x, u, p)[0])
+        return SimpleNamespace(**replace_signals(vars(u), x, p)) if where == "input" else u
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        filters, sources = law(p, parameter), vars(u) if where == "input" else plant.h(t, x, u, p)
+        rates = dict(plant.f(t, x, find_inputs(x, u, p), p))
+        for s in signals:
+            rate = ca.mtimes(filters.a, state(x, s)) + filters.b * sources[s]
+            rates |= dict(zip(own[s], ca.vertsplit(rate), strict=True))
+        return rates
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        out = plant.h(t, x, find_inputs(x, u, p), p)
+        return out if where == "input" else replace_signals(out, x, p)
 
     return replace(
         plant,
