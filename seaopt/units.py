@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pint
 
 DIMENSIONLESS = frozenset({"", "-", "1"})
+CELSIUS = frozenset({"degC", "°C", "celsius"})
 _SYNONYMS = {"usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC"}
 _HEADER = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 # Python would work for years on 9^9^9^9.
@@ -91,7 +92,7 @@ def factor(unit: str, to: str) -> float:
 
 @lru_cache(maxsize=1024)
 def si_unit(unit: str) -> str:
-    """Return the SI unit of the same dimension, as text: "mA" gives "A", "deg" gives "rad".
+    """Return the SI unit of the same dimension, as text: "mA" gives "A", "deg" gives "rad"; "degC" is its own.
 
     Examples
     --------
@@ -99,6 +100,8 @@ def si_unit(unit: str) -> str:
     ('A', 'rad', 'N', 's')
 
     """
+    if unit.strip() in CELSIUS:  # the offset against K makes it a unit of its own
+        return "degC"
     parsed = _parse(unit)
     for known in (
         "",
@@ -149,6 +152,43 @@ def unit_after(unit: str) -> str:
 
     """
     return "" if unit.strip() in DIMENSIONLESS else f" {unit.strip()}"
+
+
+def divide_units(unit: str, by: str) -> str:
+    """Return the text of a unit over another.
+
+    Examples
+    --------
+    >>> divide_units("A", "N m"), divide_units("-", "N"), divide_units("N m", "N m")
+    ('A/(N m)', '1/N', 'N m/(N m)')
+
+    """
+    over, under = unit_after(unit).strip() or "1", unit_after(by).strip() or "1"
+    return f"{over}/({under})" if " " in under or "/" in under else f"{over}/{under}"
+
+
+def name_command(source: str, unit: str) -> str:
+    """Return what to call the input that a controller commands: by its unit, else by its own name.
+
+    Examples
+    --------
+    >>> name_command("I", "A"), name_command("V", "V"), name_command("duty", "-")
+    ('current', 'voltage', 'duty')
+
+    """
+    return {"A": "current", "V": "voltage"}.get(unit, source)
+
+
+def show_command(value: float, source: str, unit: str) -> str:
+    """Return a value of a commanded input as text, with its unit; a pure number with what it is.
+
+    Examples
+    --------
+    >>> show_command(9.0, "I", "A"), show_command(0.8, "duty", "-")
+    ('9 A', '0.8 of duty')
+
+    """
+    return f"{value:.4g}{unit_after(unit) or f' of {name_command(source, unit)}'}"
 
 
 def header_unit(header: str) -> str | None:
@@ -213,7 +253,7 @@ class Mechanics:
     @property
     def gain(self) -> str:
         """The unit of effort over effort."""
-        return f"{self.unit}/({self.unit})" if " " in self.unit else f"{self.unit}/{self.unit}"
+        return divide_units(self.unit, self.unit)
 
 
 LINEAR = Mechanics(word="force", unit="N", place="m", inertia_word="mass", inertias="masses", inertia="kg")

@@ -13,7 +13,7 @@ MAX_BANDWIDTHS = 200
 FRONTIER_NOTE = (
     "noise gain: peak of |F_m/noise on the {word}|, {gain}; Ms: of the worst plant; disturbance: integral of |S| "
     "over ln f from 0.1 Hz to the bandwidth, worst plant; |S| < -3 dB: up to here; {word} limit: largest reference "
-    "at that frequency before the current saturates"
+    "at that frequency before the command saturates"
 )
 
 

@@ -235,9 +235,15 @@ def export(
     current_limit: Annotated[
         float | None, typer.Option(metavar="AMPERES", help="In place of the specification's current_limit_A.")
     ] = None,
+    command_limit: Annotated[
+        float | None, typer.Option(metavar="VALUE", help="The same of another command, in its unit: V, or a duty.")
+    ] = None,
     tracking_time: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Of the anti-windup, in place of the default.")
     ] = None,
+    derate: Annotated[
+        bool, typer.Option("--derate", help='Lower the limit as the winding warms up, by the part "thermal".')
+    ] = False,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
     ] = False,
@@ -246,7 +252,10 @@ def export(
     """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
     from seaopt.cli.export import export_controller
 
-    options = {"current_limit_A": current_limit, "tracking_time_s": tracking_time, "allow_infeasible": allow_infeasible}
+    options = {
+        "current_limit_A": current_limit, "command_limit": command_limit, "tracking_time_s": tracking_time,
+        "derate": derate, "allow_infeasible": allow_infeasible,
+    }  # fmt: skip
     if not export_controller(results, c, json, precision=precision, name=name, **options):
         raise typer.Exit(1)
 

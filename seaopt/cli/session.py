@@ -410,9 +410,7 @@ class Session:
             progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
         )  # fmt: skip
         tell("simulating scenarios")
-        result = result.with_simulation(
-            sensors=self.problem.sensors, current_step_A=table.current_step_A, seed=table.seed
-        )
+        result = result.with_simulation(sensors=self.problem.sensors, current_step_A=table.step, seed=table.seed)
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         for remark in (*result.notes, *self.problem.remarks(self.values())):
             self._note(remark)

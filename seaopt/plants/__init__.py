@@ -4,10 +4,11 @@ from seaopt.plants.exchange import export_fmu, to_control
 from seaopt.plants.friction import let_stick
 from seaopt.plants.kinds import KINDS, known_parameters, plant_of_kind
 from seaopt.plants.modes import Modes, Resonance, modes
+from seaopt.plants.motor.thermal import MotorRating, rate_motor, winding
 from seaopt.plants.parts import PARTS, wrapped
 from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_space
 from seaopt.plants.published import thor
-from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring
+from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring, Winding
 from seaopt.plants.rotary import rotary
 from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
@@ -19,11 +20,13 @@ __all__ = [
     "Friction",
     "Mode",
     "Modes",
+    "MotorRating",
     "Plant",
     "Port",
     "Resonance",
     "Sensing",
     "SeriesSpring",
+    "Winding",
     "export_fmu",
     "high_impedance",
     "jacobians",
@@ -32,10 +35,12 @@ __all__ = [
     "modes",
     "moving_output",
     "plant_of_kind",
+    "rate_motor",
     "rotary",
     "state_space",
     "thor",
     "to_control",
     "two_link",
+    "winding",
     "wrapped",
 ]

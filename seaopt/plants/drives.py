@@ -37,17 +37,15 @@ import casadi as ca
 
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
+from seaopt.plants.motor.thermal import RESISTANCE, find_resistance
 from seaopt.plants.plant import Plant
 from seaopt.plants.roles import Actuation, PlantMaker, put_behind
 from seaopt.records import record
 
-_RESISTANCE = Parameter(
-    name="R", value=1.0, unit="ohm", min=1e-9, description="winding resistance", plausible=(1e-3, 1e3)
-)
 PARTS: dict[str, tuple[Parameter, ...]] = {
-    "voltage_input": (_RESISTANCE,),
+    "voltage_input": (RESISTANCE,),
     "duty_input": (
-        _RESISTANCE,
+        RESISTANCE,
         Parameter(name="V_s", value=24.0, unit="V", min=1e-9, description="supply voltage", plausible=(1.0, 1e3)),
     ),
     "inductance": (
@@ -89,6 +87,7 @@ class _Drive:
     parameters: tuple[Parameter, ...]
     solve: Callable[[Any, Any, Any, Any], tuple[Any, Mapping[str, Any], Mapping[str, Any]]]
     effort: Callable[[Any], Any]  # of the parameters: what one unit of the new input is of the plant's, at rest
+    largest: Callable[[Any], Any] | None = None  # of the new input
 
 
 def check(parts: Collection[str]) -> None:
@@ -129,6 +128,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
             "actuation = Actuation(input, effort, speed=lambda x, p: ...)"
         )
     speed, current, (name, unit) = actuation.speed, actuation.input, INPUTS[part]
+    winding = plant.winding  # one that warms up brings its resistance
 
     def find_emf(x: Any, p: Any) -> Any:
         lossless = p if actuation.efficiency is None else SimpleNamespace(**{**vars(p), actuation.efficiency: 1.0})
@@ -138,16 +138,19 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
         applied = u.V if part == "voltage_input" else p.V_s * ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
         if inductive:
             flows = getattr(x, current)
-            return flows, {current: (applied - p.R * flows - find_emf(x, p)) / p.L_m}, {current: flows}
-        flows = (applied - find_emf(x, p)) / p.R
+            dropped = find_resistance(winding, x, p) * flows
+            return flows, {current: (applied - dropped - find_emf(x, p)) / p.L_m}, {current: flows}
+        flows = (applied - find_emf(x, p)) / find_resistance(winding, x, p)
         return flows, {}, {current: flows}
 
     own = (*PARTS[part], *(PARTS["inductance"] if inductive else ()))
+    own = tuple(item for item in own if winding is None or item is not RESISTANCE)
     unit_of_current = plant.inputs[current]
     return _put_before(plant, _Drive(
         name=part, input=name, unit=unit, states={current: unit_of_current} if inductive else {},
         outputs={current: unit_of_current}, parameters=own, solve=solve,
-        effort=(lambda p: 1.0 / p.R) if part == "voltage_input" else (lambda p: p.V_s / p.R),
+        effort=lambda p: (1.0 if part == "voltage_input" else p.V_s) / find_resistance(winding, None, p),
+        largest=(lambda p: 1.0) if part == "duty_input" else None,
     ), partial(_drive_again, drive_electrically, tuple(parts)))  # fmt: skip
 
 
@@ -220,7 +223,7 @@ def _put_before(plant: Plant, drive: _Drive, again: Callable[[PlantMaker], Plant
     before = plant.actuation
     actuation = before and Actuation(
         input=drive.input, effort=lambda p: before.effort(p) * drive.effort(p), unit=before.unit,
-        efficiency=before.efficiency,
+        efficiency=before.efficiency, largest=drive.largest,
     )  # fmt: skip
     others = {name: unit for name, unit in plant.inputs.items() if name != source}
     optional = plant.optional_inputs - {source} | ({drive.input} if source in plant.optional_inputs else set())

@@ -10,6 +10,7 @@ from typing import Any
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants.friction import let_stick
+from seaopt.plants.motor.thermal import winding
 from seaopt.plants.parts import PARTS
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import all_parameters
@@ -22,6 +23,7 @@ KINDS: dict[str, Callable[..., Plant]] = {
     "moving_output": moving_output,
     "two_link": two_link,
     "rotary": rotary,
+    "winding": winding,
 }
 
 

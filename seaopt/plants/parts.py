@@ -77,6 +77,7 @@ import casadi as ca
 from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter
 from seaopt.plants import drives
+from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant
 from seaopt.plants.roles import PlantMaker, put_behind
 from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
@@ -87,7 +88,7 @@ Part = Literal[
     "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
     "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay",
     "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
-    "deflection_sensor",
+    "deflection_sensor", "thermal",
 ]  # fmt: skip
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
@@ -148,6 +149,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     "servo_delay": (Parameter(name="T_v", value=1e-3, unit="s", min=1e-9, description="delay of the servo's command"),),
     **drives.PARTS,
     **SENSOR_PARTS,
+    "thermal": PARAMETERS,
 }  # fmt: skip
 INSIDE: tuple[Part, ...] = (
     "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
@@ -343,6 +345,8 @@ def wrapped(
                 f'part "{part}" sits inside an actuator; give it to two_link, high_impedance, moving_output or rotary'
             )
     drives.check(parts)
+    if "thermal" in parts:
+        plant = add_heat(plant)
     if "voltage_input" in parts or "duty_input" in parts:
         plant = drives.drive_electrically(plant, parts)
     for part in _ORDER:

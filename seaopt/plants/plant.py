@@ -23,7 +23,7 @@ from seaopt.formatting import html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.equations.stored_equations import store_plant
 from seaopt.plants.memo import memo
-from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring
+from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring, Winding
 from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
@@ -60,9 +60,10 @@ class Plant:
     energy : callable ``(x, p) -> expression``, optional
         Kinetic and potential energy, J, of a mechanical plant whose states come as pairs of a coordinate and its rate,
         the coordinate first; states of filters around it may follow.
-    actuation, sensing, spring, ports, friction, mode : roles, optional
+    actuation, sensing, spring, ports, friction, mode, winding : roles, optional
         What a controller commands and what effort that makes, what is measured, the elastic element, where the world
-        touches it (the port that is loaded and looked at first), friction by name, and a mode that ranges may name:
+        touches it (the port that is loaded and looked at first), friction by name, a mode that ranges may name, and the
+        winding that warms up:
         `seaopt.plants.roles`.
     sticks : bool
         Simulate and fit friction that declares its `jump` as it is, a joint at rest standing still; else as its
@@ -108,6 +109,7 @@ class Plant:
     ports: tuple[Port, ...] = field(default=(), repr=False)
     friction: Mapping[str, Friction] = field(default_factory=dict[str, Friction], repr=False)
     mode: Mode | None = field(default=None, repr=False)
+    winding: Winding | None = field(default=None, repr=False)
     sticks: bool = False
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
@@ -325,6 +327,33 @@ def describe_parameters(expression: Expression, params: CompletedParameters) -> 
     return ", ".join(f"{parameter.name} = {parameter.value:g}{unit_after(parameter.unit)}" for parameter in used)
 
 
+def find_range(plant: Plant, params: ParameterSet) -> float | None:
+    """Return the largest magnitude of the first input that acts, by the plant's actuation; None where it states none.
+
+    Raises
+    ------
+    PlantError
+        It is not a positive number.
+
+    """
+    expression = None if plant.actuation is None else plant.actuation.largest
+    if expression is None:
+        return None
+    values = plant.complete(params)
+    largest = evaluate(expression, values)
+    if not 0.0 < largest < math.inf:
+        raise PlantError(
+            f"plant {plant.name}: actuation.largest is {largest:g}, which must be positive and finite; check "
+            f"{describe_parameters(expression, values) or 'its actuation'}"
+        )
+    return largest
+
+
+def name_input(plant: Plant) -> tuple[str, str]:
+    """Return name and unit of the first input, which is what a controller commands."""
+    return next(iter(plant.inputs.items()))
+
+
 def require_plant(value: Any, argument: str, error: type[SeaoptError]) -> None:
     """Refuse what is no plant that moves: an argument of another type, or a plant without states."""
     require_type(value, Plant, argument, "give a Plant", error)
@@ -532,6 +561,9 @@ def _check_roles(plant: Plant) -> None:
     if plant.mode is not None:
         named += [("mode.parameter", plant.mode.parameter, plant.parameters)]
         named += [("mode.state", plant.mode.state, plant.states)]
+    if plant.winding is not None:
+        named += [("winding.rises", name, plant.states) for name in plant.winding.rises]
+        named += [("winding.temperatures", name, plant.outputs) for name in plant.winding.temperatures]
     for role, name, known in named:
         if name is not None and name not in known:
             raise PlantError(f'plant {plant.name}: {role} = "{name}" is not one of its own; {suggestion(name, known)}')
@@ -560,6 +592,12 @@ _COMMON_UNITS = frozenset(
         "N s/m",
         "N m s",
         "m/s^2",
+        "K",
+        "degC",
+        "ohm",
+        "K/W",
+        "J/K",
+        "1/K",
     )
 )
 

@@ -41,6 +41,8 @@ class Actuation:
         The parameter that scales the effort by the losses of the transmission.
     speed : callable ``(x, p) -> expression``, optional
         What the effort moves: effort times speed is the power that the motor makes. It gives the back-EMF.
+    largest : callable ``p -> expression``, optional
+        The largest magnitude of the input that acts; more of it changes nothing, as of a duty above 1.
 
     """
 
@@ -49,6 +51,7 @@ class Actuation:
     unit: str = "N"
     efficiency: str | None = None
     speed: StateExpression | None = None
+    largest: Expression | None = None
 
 
 @record
@@ -271,6 +274,29 @@ class Port:
         """Return the port with makers that make what `change` does of each: a function that pickles by its name."""
         makers = {"held": self.held, "probe": self.probe}
         return replace(self, **{name: partial(change, make) for name, make in makers.items() if make is not None})
+
+
+@record(eq=False)
+class Winding:
+    """The motor's winding, where it warms up: `seaopt.plants.motor.thermal`.
+
+    Parameters
+    ----------
+    rises : (str, str)
+        The states that are the temperatures of winding and case above the ambient's, K.
+    temperatures : (str, str)
+        The outputs that are their temperatures, degC.
+    effort : callable ``p -> expression``
+        The effort at the spring that an ampere makes.
+    unit : str
+        Of the effort.
+
+    """
+
+    rises: tuple[str, str]
+    temperatures: tuple[str, str]
+    effort: Expression
+    unit: str
 
 
 @record

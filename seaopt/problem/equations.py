@@ -222,6 +222,7 @@ class _Texts:
         return None if role is None else Actuation(
             input=role.input, effort=self.of_parameters("actuation.effort", role.effort), unit=role.unit,
             efficiency=role.efficiency, speed=self.of_states("actuation.speed", role.speed),
+            largest=None if role.largest is None else self.of_parameters("actuation.largest", role.largest),
         )  # fmt: skip
 
     def spring(self) -> SeriesSpring | None:

@@ -70,6 +70,7 @@ class ActuationTable(_Strict):
     unit: str = "N"
     efficiency: str | None = None
     speed: Formula | None = None
+    largest: Formula | None = None
 
 
 class SensingTable(_Strict):
@@ -393,6 +394,7 @@ class ControllerTable(_Strict):
     robust_to: list[Name] = []
     draws: Annotated[Whole, Field(ge=0, le=200)] = 0
     current_limit_A: Number | None = None
+    command_limit: Number | None = None
     step_N: Number | None = None
     reserve: Number = 0.005
 
@@ -410,6 +412,18 @@ class RobustnessTable(_Strict):
     min_friction_margin: Annotated[Number, Field(gt=0)] | None = None
     sensors: SensorsTable = SensorsTable()
     current_step_A: NotNegative = 0.0
+    command_step: NotNegative = 0.0
+
+    @property
+    def step(self) -> float:
+        """What the command is rounded to, in its unit; 0 for not at all."""
+        return self.current_step_A or self.command_step
+
+    @model_validator(mode="after")
+    def _check_step(self) -> RobustnessTable:
+        if self.current_step_A and self.command_step:
+            raise ValueError("should have current_step_A or command_step, which is the same of another command")
+        return self
 
 
 class ProblemTable(_Strict):

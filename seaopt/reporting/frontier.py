@@ -40,7 +40,7 @@ def frontier_figure(frontier: Frontier) -> Figure:
                 look: dict[str, Any] = {"color": colour, "markerfacecolor": face, "label": label, "markersize": 5}
                 axis.plot(*zip(*points, strict=True), "o", **look)
         if not shown:
-            axis.text(0.5, 0.5, "no current limit", transform=axis.transAxes, ha="center", color="#767676")
+            axis.text(0.5, 0.5, "no limit of the command", transform=axis.transAxes, ha="center", color="#767676")
     for axis in axes[1]:
         axis.set_xlabel("bandwidth [Hz]")
     handles: dict[str, Any] = {}

@@ -33,10 +33,10 @@ _CAPTIONS = {
     "residual": "Residuals and their correlations; shaded: what one lag of a hundred exceeds by chance",
     "ranking": "Residuals of the fits that are compared, octave by octave",
     "loop": "The closed loop on every plant",
-    "simulation": "Force or torque, and current, of each scenario; grey: link 2 is held; yellow: the judged window of "
-    "a failed run",
+    "simulation": "Force or torque, and what is commanded, of each scenario; grey: link 2 is held; yellow: the "
+    "judged window of a failed run",
     "bandwidth": "Bandwidth against amplitude",
-    "amplitude": "What is left of the loop at large amplitudes, and where the current saturates",
+    "amplitude": "What is left of the loop at large amplitudes, and where the command saturates",
     "environments": "Stable (blue) or not (orange) against a mass on a spring and a damper; dots: the edge",
 }
 
@@ -232,15 +232,19 @@ def _swings(certificate: Certificate | None) -> bool:
 
 
 def _describe_forces(controller: Controller | None) -> str:
-    slow = controller.force_limit(0.01) if controller is not None else None
-    if controller is None or slow is None:
+    """Return what the limit of the command allows, and what the motor can do without overheating."""
+    if controller is None:
         return ""
-    band = controller.spec.bandwidth_hz
-    fast, unit = controller.force_limit(band), controller.command.effort_unit
-    return (
-        f"The current limit of {controller.spec.current_limit_A:g} A allows a reference of {format_number(slow)} "
-        f"{unit} at rest and {format_number(fast)} {unit} at {band:g} Hz, whatever the gains."
-    )
+    slow, band, unit = controller.force_limit(0.0), controller.spec.bandwidth_hz, controller.command.reference_unit
+    sentences = [] if controller.rating is None else [f"Motor: {line}." for line in controller.rating.describe()]
+    if slow is not None and controller.command_limit is not None:
+        sentences.insert(
+            0,
+            f"The limit of {controller.command.show(controller.command_limit)} allows a reference of "
+            f"{format_number(slow)} {unit} at rest and {format_number(controller.force_limit(band))} {unit} at "
+            f"{band:g} Hz, whatever the gains.",
+        )
+    return " ".join(sentences)
 
 
 def _describe_simulations(certificate: Certificate) -> str:

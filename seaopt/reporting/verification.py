@@ -26,14 +26,14 @@ HELD_COLOUR, JUDGED_COLOUR = "#f1f1f1", "#fdf3d8"
 
 
 def verification_figure(verification: Verification, plant: str) -> Figure:
-    """Draw force (torque) and current of each scenario on one plant: the run that failed, or has the largest force.
+    """Draw force (torque) and command of each scenario on one plant: the run that failed, or has the largest force.
 
     Of a run that passed the end of the last phase is left out; a run that failed is drawn whole, with the window that
     it is judged in.
     """
     rows = [row for row in verification.worst() if row.plant == plant]
     controller = verification.stages[plant].controller
-    name, limit = controller.spec.measured, controller.spec.current_limit_A
+    name, limit = controller.spec.measured, controller.command_limit
     figure, axes = panels(len(rows), 2, 0.5 + 1.5 * len(rows))
     for (left, right), row in zip(axes, rows, strict=True):
         trace = verification.replay(row)
@@ -42,7 +42,12 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
         left.plot(time, trace.reference[0][visible], color=MEASURED, linewidth=1.6, label="reference")
         left.plot(time, trace.outputs[name][0][visible], color=MODEL, linewidth=0.9, label=name)
         right.step(
-            time, trace.current[0][visible], where="post", color=PLANT_COLOURS[1], linewidth=0.9, label="current"
+            time,
+            trace.current[0][visible],
+            where="post",
+            color=PLANT_COLOURS[1],
+            linewidth=0.9,
+            label=controller.command.word,
         )
         if limit is not None and row.saturated > 0.0:
             for side in (-limit, limit):
@@ -53,7 +58,7 @@ def verification_figure(verification: Verification, plant: str) -> Figure:
         verdict = cut if row.passed else ": FAILED"
         left.set_title(f"{row.scenario}{draw}{verdict}", fontsize="medium", loc="left")
         left.set_ylabel(f"{name} [{verification.mechanics.unit}]")
-        right.set_ylabel("current [A]")
+        right.set_ylabel(controller.command.label)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for axis in axes[-1]:
@@ -97,7 +102,7 @@ def large_signal_figure(sweeps: Sequence[LargeSignal]) -> Figure:
         left.legend(frameon=False, fontsize="small")
         left.set_title(f"{sweep.plant}: |F/F_ref| [dB]; dots: saturated", fontsize="medium", loc="left")
         right.loglog(sweep.frequency_hz, sweep.onset_N, color=MODEL, linewidth=1.3)
-        right.set_title(f"amplitude at which the current saturates [{sweep.unit}]", fontsize="medium", loc="left")
+        right.set_title(f"amplitude at which the command saturates [{sweep.unit}]", fontsize="medium", loc="left")
         for axis in (left.xaxis, right.xaxis, right.yaxis):
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -129,7 +134,7 @@ def bandwidth_figure(sweeps: Sequence[LargeSignal]) -> Figure:
         one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         one.set_minor_formatter(NullFormatter())
     unit = " or ".join(dict.fromkeys(sweep.unit for sweep in sweeps))
-    marks = "dotted: dry friction; squares: the current saturates in the sweep"
+    marks = "dotted: dry friction; squares: the command saturates in the sweep"
     axis.set_xlabel(f"amplitude of the reference [{unit}]; {marks}")
     axis.set_ylabel("bandwidth [Hz]")
     axis.legend(frameon=False, fontsize="small")

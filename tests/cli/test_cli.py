@@ -58,7 +58,7 @@ def test_a_simulation_that_fails_exits_1_with_its_witness(folder, seaopt, design
     assert seaopt("tune", "clipped.toml").returncode == 0
     out = seaopt("certify", "clipped.toml")
     assert out.returncode == 1, out.stderr
-    assert "NOT MET: steady_error_N" in out.stdout
+    assert "NOT MET: steady_error" in out.stdout
     assert "(stand, " in out.stdout and ", seed 1: the force ends" in out.stdout
 
 

@@ -1,7 +1,7 @@
 """A controller for the target: C99 that needs no library, its gains as a C header, and a MATLAB script.
 
 The C code is `RunnableLaw.step` with the numbers filled in: one struct, `init`, `reset` and `step`; no allocation, no
-include but its own header, nothing global that changes. In double it gives the same currents as `RunnableLaw` to
+include but its own header, nothing global that changes. In double it gives the same commands as `RunnableLaw` to
 rounding. In float the integral stops where an increment is less than half a unit in its last place, at an error of
 about 6e-8 abs(x)/(k_i T_s) (x: the integral's part of the force): take double where k_i is small.
 """
@@ -20,10 +20,12 @@ import numpy as np
 
 from seaopt.control.laws.controller import Controller, name_gain_units
 from seaopt.control.laws.plausibility import PlausibilityGate
-from seaopt.control.laws.realisation import RunnableLaw, realise
+from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
+from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ControlError, FileError
 from seaopt.files import write_text
+from seaopt.plants.motor.heat_guard import HeatGuard
 
 Precision = Literal["double", "float"]
 LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
@@ -51,8 +53,10 @@ def export(
     precision: Precision = "double",
     name: str = "force_law",
     current_limit_A: float | None = None,
+    command_limit: float | None = None,
     tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None,
+    derate: bool = False,
     allow_infeasible: bool = False,
 ) -> tuple[Path, ...]:
     """Write a controller as C99, with its gains as a C header and as a MATLAB script.
@@ -67,10 +71,15 @@ def export(
         Of the C code.
     name : str
         Prefix of every name in C; characters that C does not allow become underscores.
-    current_limit_A, tracking_time_s : float, optional
+    current_limit_A, command_limit : float, optional
+        In place of the specification's limit: of a current, or of whatever is commanded, in its unit. Give one.
+    tracking_time_s : float, optional
         As in `seaopt.control.laws.realisation.runnable`.
     gate : PlausibilityGate, optional
         Which readings the law believes, and what it does about the others.
+    derate : bool
+        Lower the limit as the winding warms up, by `seaopt.plants.motor.heat_guard`: of a design plant with the part
+        "thermal" that is commanded a current.
     allow_infeasible : bool
         Also write a controller that misses its limits; the files state it.
 
@@ -103,15 +112,22 @@ def export(
         raise FileError(f"{folder}: is a file; give a folder")
     if isinstance(controller, Controller):
         stored = {field.name: getattr(controller, field.name) for field in fields(Controller)}
-        figures = _figures(controller)
+        figures, heat = _figures(controller), controller.heat_guard
     else:
         from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
-        stored, figures = read_controller(controller), _stated(controller)
+        stored, figures, heat = read_controller(controller), _stated(controller), _read_guard(controller)
     if not stored["feasible"] and not allow_infeasible:
         missed = join_labels(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
-    law = _law(stored, current_limit_A, tracking_time_s, gate)
+    check_command_limits(current_limit_A, command_limit)
+    if derate and heat is None:
+        raise ControlError(
+            "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that is "
+            "commanded a current"
+        )
+    limit = command_limit if current_limit_A is None else current_limit_A
+    law = _law(stored, limit, tracking_time_s, gate, heat if derate else None)
     context = _describe(stored, law) | {
         "achieved": figures,
         "precision": precision,
@@ -124,6 +140,13 @@ def export(
         for pattern, template in TEMPLATES.items()
     }
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+
+
+def _read_guard(content: Mapping[str, Any]) -> HeatGuard | None:
+    """Return the heat guard of a controller.json, where it has one."""
+    heat = content.get("heat")
+    guard = heat.get("guard") if isinstance(heat, Mapping) else None
+    return HeatGuard.from_dict(guard) if isinstance(guard, Mapping) else None
 
 
 def _identifier(name: str) -> str:
@@ -168,25 +191,31 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
 
 
 def _law(
-    stored: Mapping[str, Any], current_limit_A: float | None, tracking_time_s: float | None,
-    gate: PlausibilityGate | None,
+    stored: Mapping[str, Any], limit: float | None, tracking_time_s: float | None,
+    gate: PlausibilityGate | None, heat: HeatGuard | None,
 ) -> RunnableLaw:  # fmt: skip
     return realise(
         stored["law"],
         per_effort=stored["command"].per_effort,
-        current_limit_A=stored["spec"].current_limit_A if current_limit_A is None else current_limit_A,
+        current_limit_A=choose_limit(stored["command"], stored["spec"], limit),
+        command=(stored["command"].input, stored["command"].unit),
         tracking_time_s=tracking_time_s,
         gate=gate,
+        heat=heat,
     )
 
 
 def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     """Return what the files say in words."""
+    command = stored["command"]
     return {
         "structure": _strip_markup(stored["structure"]),
         "measured": _strip_markup(stored["spec"].measured),
         "effort": stored["command"].mechanics.word,
-        "suffix": stored["command"].effort_unit.replace(" ", ""),
+        "command": {name: _strip_markup(getattr(command, name)) for name in ("word", "unit", "effort_unit")},
+        "symbol": command.symbol,
+        "LIMIT": command.limit_symbol,
+        "suffix": re.sub("[^A-Za-z0-9]+", "_per_", command.reference_unit.replace(" ", "")).strip("_"),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
         "delay_samples": stored["delay_samples"],
         "feasible": stored["feasible"],
@@ -196,6 +225,7 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         "storage": max(law.c.size, 1),
         "integrators": law.integrators,
         "gated": law.gate is not None,
+        "heated": law.heat is not None,
         "max_held": law.gate.max_held if law.gate is not None else 0,
     }
 
@@ -239,7 +269,7 @@ def _numbers(
         "rest_reference": row(rest[0]),
         "rest_measurement": row(rest[1]),
         "effort_limit": number(min(law.force_limit_N, largest)),
-        "current_limit_A": number(min(law.current_limit_A, largest)),
+        "command_limit": number(min(law.current_limit_A, largest)),
         "per_effort": number(law.per_effort),
         "per_effort_unit": stored["command"].per_effort_unit,
         "sample_time_s": number(law.sample_time_s),
@@ -251,9 +281,12 @@ def _numbers(
             "step": number(law.gate.max_step_N),
             "ramp": number(law.gate.ramp_A_per_s * law.sample_time_s),
         },
+        "heat": {} if law.heat is None else {name: repr(value) for name, value in asdict(law.heat).items()},
+        "hottest": "" if law.heat is None else f"{law.heat.ambient + law.heat.allowed_rise:g}",
+        "ambient": "" if law.heat is None else f"{law.heat.ambient:g}",
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
-            {"name": _identifier(key), "value": number(float(value)), "unit": units.get(key, "")}
+            {"name": _identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
             for key, value in stored["gains"].items()
         ],
         "transfer_functions": [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 
@@ -10,9 +11,9 @@ from seaopt.control.loops.sampled_plant import static_gain
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.plant import describe_parameters, evaluate
+from seaopt.plants.plant import describe_parameters, evaluate, find_range
 from seaopt.records import record
-from seaopt.units import Mechanics, mechanics_of, unit_after
+from seaopt.units import Mechanics, divide_units, mechanics_of, name_command, show_command, unit_after
 
 
 @record
@@ -27,6 +28,10 @@ class Command:
         The command for one unit of effort.
     effort_unit : str
         Of the effort: N, or N m.
+    largest : float or None
+        The largest command that acts, by the plant's actuation; None where it states none.
+    measured_unit : str
+        Of what is fed back, and of its reference, where it is no effort: rad of an angle.
 
     """
 
@@ -34,6 +39,49 @@ class Command:
     unit: str
     per_effort: float
     effort_unit: str
+    largest: float | None = None
+    measured_unit: str = ""
+
+    @property
+    def word(self) -> str:
+        """What is commanded: current, voltage, or the input's own name."""
+        return name_command(self.input, self.unit)
+
+    @property
+    def label(self) -> str:
+        """The word with the unit in brackets, for axes and columns."""
+        unit = unit_after(self.unit).strip()
+        return f"{self.word} [{unit}]" if unit else self.word
+
+    @property
+    def symbol(self) -> str:
+        """A name of the command in code, with its unit: current_A, voltage_V, command_duty, command_goal_rad."""
+        word = f"command_{self.input}" if self.word == self.input else self.word
+        return "_".join(re.findall("[A-Za-z0-9_]+", f"{word} {unit_after(self.unit).replace('/', '_per_')}"))
+
+    @property
+    def limit_symbol(self) -> str:
+        """A name of its limit in code: CURRENT_LIMIT_A, VOLTAGE_LIMIT_V, DUTY_LIMIT."""
+        return self.symbol.removeprefix("command_").replace(self.word, f"{self.word}_limit", 1).upper()
+
+    def show(self, value: float) -> str:
+        """Return a command as text, with its unit; of a pure number with what it is."""
+        return show_command(value, self.input, self.unit)
+
+    def limit(self, asked: float | None) -> float | None:
+        """Return the limit that holds: the one asked for, and no more than what acts; None without any."""
+        limits = [limit for limit in (asked, self.largest) if limit is not None]
+        return min(limits, default=None)
+
+    @property
+    def reference_unit(self) -> str:
+        """Of the reference, and of what is measured."""
+        return self.measured_unit or self.effort_unit
+
+    @property
+    def gain_unit(self) -> str:
+        """The unit of effort over what is measured: N/N, N m/(N m), N m/rad."""
+        return divide_units(self.effort_unit, self.reference_unit)
 
     @property
     def mechanics(self) -> Mechanics:
@@ -43,8 +91,7 @@ class Command:
     @property
     def per_effort_unit(self) -> str:
         """The unit of `per_effort`, such as A/N or A/(N m)."""
-        effort = f"({self.effort_unit})" if " " in self.effort_unit else self.effort_unit
-        return f"{self.unit}/{effort}"
+        return divide_units(self.unit, self.effort_unit)
 
 
 def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
@@ -60,8 +107,8 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     Raises
     ------
     ControlError
-        The effort of one unit is not positive, or the plant states no actuation and has no static gain or a
-        negative one.
+        The effort of one unit, or the largest command, is not positive, or the plant states no actuation and has no
+        static gain or a negative one.
 
     Examples
     --------
@@ -95,17 +142,27 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
                 f"plant {plant.name} states no actuation, and its static gain from {source} to {output} is "
                 f"{effort:g}; give it actuation = Actuation(input, effort)"
             )
-    return Command(input=source, unit=unit, per_effort=1.0 / effort, effort_unit=effort_unit)
+    measured_unit = plant.outputs.get(measured, effort_unit)
+    return Command(
+        input=source, unit=unit, per_effort=1.0 / effort, effort_unit=effort_unit, largest=find_range(plant, values),
+        measured_unit="" if measured_unit == effort_unit else measured_unit,
+    )  # fmt: skip
 
 
-def limit_notes(command: Command, limit: float | None) -> tuple[str, ...]:
-    """Say what a limit of the current is of where something else is commanded: a voltage, a duty."""
-    if limit is None or command.unit == "A":
-        return ()
-    return (
-        f"current_limit_A = {limit:g} is of what is commanded, {limit:g}{unit_after(command.unit)} of {command.input}: "
-        "the current itself is not limited",
-    )
+def limit_notes(command: Command, asked: float | None, *, in_amperes: bool = True) -> tuple[str, ...]:
+    """Say what a limit is of where no current is commanded, and where the command's own range is narrower."""
+    notes: list[str] = []
+    key = "current_limit_A" if in_amperes else "command_limit"
+    if asked is not None and in_amperes and command.unit != "A":
+        notes.append(
+            f"current_limit_A = {asked:g} is of what is commanded, {asked:g}{unit_after(command.unit)} of "
+            f"{command.input}: the current itself is not limited; command_limit is the same under its own name"
+        )
+    if command.largest is not None and (asked is None or asked > command.largest):
+        given = "no limit is given" if asked is None else f"{key} = {asked:g} is more than acts"
+        reach = f"{command.largest:.4g}{unit_after(command.unit)}"
+        notes.append(f"{given}: the {command.word} is limited to its range, {reach}")
+    return tuple(notes)
 
 
 def actuation_notes(plant: Plant, command: Command) -> tuple[str, ...]:

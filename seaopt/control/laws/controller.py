@@ -40,12 +40,15 @@ from seaopt.formatting import (
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
+from seaopt.plants.motor.heat_guard import HeatGuard
+from seaopt.plants.motor.thermal import MotorRating, rate_motor
+from seaopt.plants.plant import find_range
 from seaopt.records import record
-from seaopt.units import unit_after
+from seaopt.units import divide_units, unit_after
 
 FRICTION_MARGIN = "friction_margin"  # among what controller.json says is achieved
 CONTROLLER_SCHEMA = "seaopt/controller/2"
-GAIN_UNITS = {"k_i": "1/s", "k_d": "s", "T_f": "s", "T_q": "s"}  # besides those of effort over effort
+GAIN_UNITS = {"T_f": "s", "T_q": "s"}  # besides those of effort over what is measured
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SAME_POLE = 1e-3  # to which poles that are equal are computed
 NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
@@ -129,7 +132,7 @@ class Controller:
             filter_samples, integral = count_filter_samples(law), find_integral_rate(law)
         return MeasuredLoop(
             name=name, figures=figures, port=port, filter_samples=filter_samples, integral_rad_s=integral,
-            effort_unit=self.command.effort_unit,
+            gain_unit=self.command.gain_unit,
         )  # fmt: skip
 
     def _add_friction(self, loop: MeasuredLoop) -> MeasuredLoop:
@@ -178,7 +181,8 @@ class Controller:
         vague = warn_unidentified(values, None if self.robust_to else plant.parameters)
         return (
             *lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command),
-            *limit_notes(self.command, self.spec.current_limit_A), *self._noise_notes(),
+            *limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None),
+            *self._noise_notes(),
         )  # fmt: skip
 
     def _friction_notes(self) -> tuple[str, ...]:
@@ -193,17 +197,34 @@ class Controller:
         if self.spec.level("max_noise_gain") is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
             return ()
         return (
-            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 {called.unit} of "
-            f"noise on {self.spec.measured} makes up to {self.achieved.noise_gain:.3g} {called.unit} of motor "
+            f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 "
+            f"{self.command.reference_unit} of noise on {self.spec.measured} makes up to "
+            f"{self.achieved.noise_gain:.3g} {called.unit} of motor "
             f"{called.word}; give max_noise_gain",
         )
 
     @property
+    def rating(self) -> MotorRating | None:
+        """What the motor of the design plant can do without overheating; None without the part "thermal"."""
+        if self.design is None or self.design[0].winding is None:
+            return None
+        return rate_motor(*self.design)
+
+    @property
+    def heat_guard(self) -> HeatGuard | None:
+        """What may lower the limit of the exported law as the winding warms up; None where no current is commanded."""
+        rating = self.rating
+        return None if rating is None or self.command.unit != "A" else HeatGuard.of_rating(rating, self.sample_time_s)
+
+    @property
+    def command_limit(self) -> float | None:
+        """The limit of the command: what is asked for, and no more than the plant's actuation takes; None for none."""
+        return self.command.limit(self.spec.limit_asked)
+
+    @property
     def engineering(self) -> dict[str, tuple[float, str]]:
         """The gains as a drive is set, values and units: the command per force error, its integral and its rate."""
-        unit, effort = self.command.unit, self.command.effort_unit
-        ratio = self.command.per_effort_unit
-        units = {"k_p": ratio, "k_i": f"{unit}/({effort} s)", "k_d": ratio.replace("/", " s/"), "k_r": ratio}
+        units = _name_rates(self.command.unit, self.command.reference_unit)
         scale = self.command.per_effort
         return {name: (scale * value, units[name]) for name, value in self.gains.items() if name in units}
 
@@ -227,16 +248,19 @@ class Controller:
         return Loop(plant=sliding, law=self.law)
 
     def force_limit(self, frequency_hz: float) -> float | None:
-        """Return the largest amplitude of F_ref (N) at a frequency that `current_limit_A` allows on the design plant.
+        """Return the largest amplitude of F_ref (N) at a frequency that `command_limit` allows on the design plant.
 
-        The motor force per reference is |T_r/P|, a property of the plant whatever the controller; None without a limit.
+        The motor force per reference is |T_r/P|, a property of the plant whatever the controller, and at rest, 0 Hz,
+        1/|P|; None without a limit.
         """
-        if self.spec.current_limit_A is None or self.design is None:
+        if self.command_limit is None or self.design is None:
             return None
         loop = self.close(*self.design)
+        if frequency_hz == 0.0:
+            return float(self.command_limit / self.command.per_effort * abs(loop.plant.static_gain))
         f = np.array([float(frequency_hz)])
         force = np.abs(loop.law.reference_response(f) * loop.sensitivity(f))[0]
-        return float(self.spec.current_limit_A / self.command.per_effort / force)
+        return float(self.command_limit / self.command.per_effort / force)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/2)."""
@@ -259,11 +283,17 @@ class Controller:
             "active_constraints": list(self.active_constraints),
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
             "observer": self._observer_dict(),
+            "heat": self._heat_dict(),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": None if self.possible is None else asdict(self.possible),
             "notes": list(self.notes),
         }
+
+    def _heat_dict(self) -> dict[str, Any] | None:
+        """Return what the motor can do without overheating, and what an exported law takes to keep to it."""
+        rating, guard = self.rating, self.heat_guard
+        return None if rating is None else rating.to_dict() | {"guard": None if guard is None else asdict(guard)}
 
     def _observer_dict(self) -> dict[str, Any] | None:
         """Return the observer's filters, and what it takes to build it again."""
@@ -296,6 +326,11 @@ class Controller:
         from seaopt.control.laws.stored import check_achieved, check_friction_margin, read_controller
 
         stored = read_controller(content)
+        measured = plant.outputs.get(stored["spec"].measured, "")
+        stored["command"] = replace(
+            stored["command"], largest=find_range(plant, params),
+            measured_unit="" if measured == stored["command"].effort_unit else measured,
+        )  # fmt: skip
         gain, spec = stored["command"].per_effort, stored["spec"]
         sliding = take_sliding(plant, params)
         sampled = sample(sliding, params, spec.measured, gain, stored["sample_time_s"], stored["delay_samples"])
@@ -330,6 +365,7 @@ class Controller:
                 f"  {a.describe_margins()}",
                 *self._friction_lines(),
                 *self._force_lines(),
+                *(f"  {line}" for line in (self.rating.describe() if self.rating is not None else ())),
                 f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
                 if self.feasible
                 else f"  {self.explanation}",
@@ -369,7 +405,7 @@ class Controller:
         units = name_gain_units(self.command)
         lines = [
             "  " + ", ".join(f"{name} = {value:.5g} {units.get(name, '')}".rstrip() for name, value in law.items()),
-            "  as current: " + ", ".join(
+            f"  as {self.command.word}: " + ", ".join(
                 f"{name} = {value:.5g} {unit}" for name, (value, unit) in self.engineering.items()
             ),
         ]  # fmt: skip
@@ -382,11 +418,10 @@ class Controller:
         return lines
 
     def _force_lines(self) -> list[str]:
-        slow, fast = self.force_limit(0.01), self.force_limit(self.spec.bandwidth_hz)
-        if slow is None or fast is None:
+        slow, fast = self.force_limit(0.0), self.force_limit(self.spec.bandwidth_hz)
+        if slow is None or fast is None or self.command_limit is None:
             return []
-        limit, band = self.spec.current_limit_A, self.spec.bandwidth_hz
-        unit, most = self.command.effort_unit, f"{limit:g}{unit_after(self.command.unit)}"
+        unit, band, most = self.command.reference_unit, self.spec.bandwidth_hz, self.command.show(self.command_limit)
         return [f"  {most} allow a reference of {slow:.4g} {unit} at rest and {fast:.4g} {unit} at {band:g} Hz"]
 
     def _repr_html_(self) -> str:
@@ -399,7 +434,7 @@ class Controller:
         ]
         explanation = [] if self.feasible else [self.explanation]
         return (
-            html_paragraph(head) + html_table(("gain", "", "as current"), gains)
+            html_paragraph(head) + html_table(("gain", "", f"as {self.command.word}"), gains)
             + html_table(("on the design plant", "achieved", "asked"), self._achieved_rows())
             + html_list([*explanation, *(line.strip() for line in self._force_lines())])
         )  # fmt: skip
@@ -421,7 +456,18 @@ class Controller:
 
 def name_gain_units(command: Command) -> dict[str, str]:
     """Return the units of the gains of a law that gives efforts, by name; what is not there has none."""
-    return GAIN_UNITS | dict.fromkeys(("k_p", "k_r"), command.mechanics.gain)
+    units = _name_rates(command.effort_unit, command.reference_unit)
+    if command.effort_unit == command.reference_unit:
+        units |= {"k_i": "1/s", "k_d": "s"}
+    return GAIN_UNITS | units
+
+
+def _name_rates(unit: str, measured: str) -> dict[str, str]:
+    """Return the units of gains from a measured signal to what has a unit, to its rate, and from its rate."""
+    ratio, seconds = divide_units(unit, measured), f"{unit_after(unit).strip()} s".strip()
+    return {
+        "k_p": ratio, "k_i": divide_units(unit, f"{measured} s"), "k_d": divide_units(seconds, measured), "k_r": ratio
+    }  # fmt: skip
 
 
 def _format_allowed(row: DesignFigure) -> str:

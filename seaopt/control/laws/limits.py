@@ -23,7 +23,7 @@ from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, SHOULDER, SHOULD
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.errors import ControlError
 from seaopt.records import record
-from seaopt.units import LINEAR, mechanics_of
+from seaopt.units import LINEAR
 
 LIMIT_ROUNDING = 1e-6  # by which a figure that lies on its limit may be beyond it
 BANDWIDTH_TOLERANCE = 0.005
@@ -73,8 +73,8 @@ class MeasuredLoop:
         The steepest friction for which stability is shown; infinite where there is none, or none is asked about.
     slope_unit : str
         Its unit; empty without friction.
-    effort_unit : str
-        Of what the law gives: N or N m.
+    gain_unit : str
+        Of what the law gives over what it measures: N/N, N m/(N m), N m/rad.
 
     """
 
@@ -85,12 +85,12 @@ class MeasuredLoop:
     integral_rad_s: float = math.inf
     friction_slope: float = math.inf
     slope_unit: str = ""
-    effort_unit: str = LINEAR.unit
+    gain_unit: str = LINEAR.gain
 
     def unit(self, limit: Limit) -> str:
         """Return the unit of a limit's figure: those of a friction's slope and of the noise gain are the plant's."""
         if limit.name == "max_noise_gain":
-            return mechanics_of(self.effort_unit).gain
+            return self.gain_unit
         return self.slope_unit if self.slope_unit and limit.name == "min_friction_margin" else limit.unit
 
 

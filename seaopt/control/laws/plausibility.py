@@ -169,9 +169,11 @@ class PlausibilityGate:
         require_type(controller, Controller, "controller", "give a Controller", ControlError)
         for name, value in (("ramp_s", ramp_s), ("margin", margin)):
             _check_positive(value, name)
-        limit = controller.spec.current_limit_A
+        limit = controller.command_limit
         if limit is None or controller.design is None:
-            raise ControlError("the controller has no current limit or no design plant; give max_step_N yourself")
+            raise ControlError(
+                "the controller has no current limit (or command_limit), or no design plant; give max_step_N yourself"
+            )
         plant = controller.close(*controller.design).plant
         step = largest_step(plant, limit / controller.command.per_effort)
         return cls(range_N=range_N, max_step_N=margin * step, max_held=max_held, ramp_A_per_s=limit / ramp_s)

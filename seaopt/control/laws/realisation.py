@@ -1,9 +1,9 @@
-r"""The law as it runs: one step a sample, with the motor's current limit and anti-windup.
+r"""The law as it runs: one step a sample, with the command's limit and anti-windup.
 
 .. math::
     u &= C x + D_r r - D_y y, \qquad x^+ = A x + B_r r - B_y y + K (\mathrm{sat}(u) - u)
 
-K does nothing until the current saturates. While it does, the state moves with :math:`A - K C`: K is chosen so that
+K does nothing until the command saturates. While it does, the state moves with :math:`A - K C`: K is chosen so that
 the poles of the m integrators go from 1 to :math:`\lambda = T_t/(T_t + T_s)`, and the others stay:
 :math:`K_j = \binom{m}{j} (1-\lambda)^j` on the chain and zero elsewhere. For one integrator that is back-calculation
 with the tracking time constant T_t (Astrom, Hagglund, PID Controllers, 2nd ed., ISA 1995, integrator windup). Theirs
@@ -30,16 +30,21 @@ the other poles of 1/(1 - Q), about as fast as Q, stay.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import NoneType
 
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
+from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.law import Law
 from seaopt.errors import ControlError, require_number, require_type
+from seaopt.plants.motor.heat_guard import COLD, HeatGuard
 from seaopt.records import record
+from seaopt.units import name_command, show_command
 
 Vector = Float[np.ndarray, " n"]
 
@@ -53,11 +58,13 @@ class LawState:
     x : array, shape (n,)
         State.
     current_A : float
-        The last command.
+        The last command, in its unit.
     held : int
         Samples in a row that were not used because a number in them was not finite.
     gate : GateState
         What the plausibility gate, where there is one, has seen.
+    heat : (float, float)
+        Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
 
     """
 
@@ -65,6 +72,7 @@ class LawState:
     current_A: float = 0.0
     held: int = 0
     gate: GateState = GateState()
+    heat: tuple[float, float] = COLD
 
     @property
     def status(self) -> str:
@@ -89,11 +97,15 @@ class RunnableLaw:
     sample_time_s : float
         Seconds.
     per_effort : float
-        The command is this times F: A/N or A/(N m).
+        The command is this times F: A/N or A/(N m) of a current.
     current_limit_A : float
-        The command's largest magnitude; infinite where there is no limit.
+        The command's largest magnitude, in its unit; infinite where there is no limit.
     gate : PlausibilityGate, optional
         Which readings are believed.
+    command : (str, str)
+        Name and unit of the input that is commanded.
+    heat : HeatGuard, optional
+        What lowers the limit as the winding warms up.
 
     """
 
@@ -110,15 +122,20 @@ class RunnableLaw:
     per_effort: float
     current_limit_A: float
     gate: PlausibilityGate | None = None
+    command: tuple[str, str] = ("I", "A")
+    heat: HeatGuard | None = None
 
     @property
     def force_limit_N(self) -> float:
-        """The motor force at the current limit."""
+        """The motor force at the limit."""
         return self.current_limit_A / self.per_effort
 
     def __repr__(self) -> str:
         tracking = "" if self.tracking_time_s is None else f", tracking time {self.tracking_time_s:.4g} s"
-        limit = "no current limit" if math.isinf(self.current_limit_A) else f"limited to {self.current_limit_A:g} A"
+        limit = (
+            f"no limit of the {name_command(*self.command)}" if math.isinf(self.current_limit_A)
+            else f"limited to {show_command(self.current_limit_A, *self.command)}"
+        )  # fmt: skip
         return (
             f"RunnableLaw of order {self.c.size} ({self.integrators} of it integrators{tracking}) at "
             f"{1 / self.sample_time_s:.6g} Hz, {limit}"
@@ -132,11 +149,15 @@ class RunnableLaw:
         out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
         return out[0], out[1]
 
-    def reset(self, reference: float = 0.0, measurement: float | None = None, current_A: float = 0.0) -> LawState:
+    def reset(
+        self, reference: float = 0.0, measurement: float | None = None, current_A: float = 0.0,
+        heat: tuple[float, float] = COLD,
+    ) -> LawState:  # fmt: skip
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
 
         A law without an integrator cannot be set: its next command follows from the inputs alone. A measurement that
         is left out is zero, and a gate judges the first reading by its range; one that is given, by its jump from it.
+        `heat` is what is known of winding and case above the ambient (K); cold if left out.
 
         Raises
         ------
@@ -154,22 +175,32 @@ class RunnableLaw:
         if not (math.isfinite(reference) and math.isfinite(measurement)):
             raise ControlError(f"reference = {reference:g}, measurement = {measurement:g}: give finite numbers")
         if not abs(current_A) <= self.current_limit_A:
-            raise ControlError(f"current_A = {current_A:g} is above the limit of {self.current_limit_A:g} A; lower it")
+            limit = show_command(self.current_limit_A, *self.command)
+            raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
         per_reference, per_measurement = self.rest()
         x = per_reference * reference - per_measurement * measurement
         if self.integrators:
             force = float(self.c @ x) + self.d_reference * reference - self.d_measurement * measurement
             x[0] = current_A / self.per_effort - force
-        return LawState(x=x, current_A=current_A, gate=seen)
+        return LawState(x=x, current_A=current_A, gate=seen, heat=heat)
 
     def step(self, state: LawState, reference: float, measurement: float) -> tuple[float, LawState]:
-        """Return the current (A) to command at this sample, and the next state.
+        """Return the command (a current in A, as a rule) of this sample, and the next state.
 
         A sample with a number that is not finite, in its inputs or in what would follow, is not used: the last command
         is held, the state stays, and `held` counts. A gate bridges a reading that cannot be true, and takes the
-        command to zero at a fault.
+        command to zero at a fault. A heat guard lowers the limit of each command, and counts what it heats.
         """
-        seen = state.gate
+        if self.heat is None:
+            return self._decide(state, reference, measurement, self.current_limit_A)
+        limit = min(self.current_limit_A, self.heat.limit(state.heat))
+        current, following = self._decide(state, reference, measurement, limit)
+        current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
+        return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
+
+    def _decide(self, state: LawState, reference: float, measurement: float, limit_A: float) -> tuple[float, LawState]:
+        """Return the command within a limit, and the next state."""
+        seen, most = state.gate, limit_A / self.per_effort
         if self.gate is not None:
             measurement, seen = self.gate.screen(seen, measurement)
             if seen.fault:
@@ -177,13 +208,13 @@ class RunnableLaw:
                 return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen)
         with np.errstate(all="ignore"):
             force = float(self.c @ state.x) + self.d_reference * reference - self.d_measurement * measurement
-            applied = min(max(force, -self.force_limit_N), self.force_limit_N)
+            applied = min(max(force, -most), most)
             x = self.a @ state.x + self.b_reference * reference - self.b_measurement * measurement
             x += self.anti_windup * (applied - force)
         if not (math.isfinite(force) and np.all(np.isfinite(x))):
             return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1, gate=seen)
         current = applied * self.per_effort
-        current = min(max(current, -self.current_limit_A), self.current_limit_A)  # a limit to the last bit
+        current = min(max(current, -limit_A), limit_A)  # a limit to the last bit
         return current, LawState(x=x, current_A=current, gate=seen)
 
     def run(
@@ -192,7 +223,7 @@ class RunnableLaw:
         measurements: Float[np.ndarray, " samples"],
         state: LawState | None = None,
     ) -> tuple[Float[np.ndarray, " samples"], LawState]:
-        """Return the currents (A) of a sequence of samples, and the last state; it starts from zero if not given."""
+        """Return the commands of a sequence of samples, and the last state; it starts from zero if not given."""
         state = self.reset() if state is None else state
         out = np.zeros(references.size)
         for i, (reference, measurement) in enumerate(zip(references, measurements, strict=True)):
@@ -202,7 +233,7 @@ class RunnableLaw:
 
 def runnable(
     controller: Controller, *, current_limit_A: float | None = None, tracking_time_s: float | None = None,
-    gate: PlausibilityGate | None = None,
+    gate: PlausibilityGate | None = None, heat: HeatGuard | None = None,
 ) -> RunnableLaw:  # fmt: skip
     """Return a controller's law ready to run.
 
@@ -211,11 +242,14 @@ def runnable(
     controller : Controller
         As tuned or read.
     current_limit_A : float, optional
-        The specification's if left out; infinite where neither is given.
+        Of the command, in its unit: the specification's if left out, and no more than the range of the command;
+        infinite where none of them is given.
     tracking_time_s : float, optional
         T_t of the anti-windup; the module's docstring has the default.
     gate : PlausibilityGate, optional
         Which readings are believed.
+    heat : HeatGuard, optional
+        What lowers the limit as the winding warms up; `controller.heat_guard` of a plant with the part "thermal".
 
     Raises
     ------
@@ -232,19 +266,27 @@ def runnable(
     9.0
 
     """
-    limit = controller.spec.current_limit_A if current_limit_A is None else current_limit_A
     return realise(
         controller.law,
         per_effort=controller.command.per_effort,
-        current_limit_A=limit,
+        current_limit_A=choose_limit(controller.command, controller.spec, current_limit_A),
+        command=(controller.command.input, controller.command.unit),
         tracking_time_s=tracking_time_s,
         gate=gate,
+        heat=heat,
     )
+
+
+def choose_limit(command: Command, spec: ControllerSpec, asked: float | None) -> float | None:
+    """Return the limit of a running law: the one asked for, infinite for none at all, else the controller's own."""
+    if asked is not None and math.isinf(asked):
+        return asked
+    return command.limit(spec.limit_asked if asked is None else asked)
 
 
 def realise(
     law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None,
-    gate: PlausibilityGate | None = None,
+    gate: PlausibilityGate | None = None, command: tuple[str, str] = ("I", "A"), heat: HeatGuard | None = None,
 ) -> RunnableLaw:  # fmt: skip
     """Return a law of one measured signal with limit and anti-windup.
 
@@ -255,11 +297,15 @@ def realise(
     per_effort : float
         The command for one unit of effort: A/N or A/(N m).
     current_limit_A : float, optional
-        None: no limit.
+        Of the command, in its unit; None: no limit.
     tracking_time_s : float, optional
         T_t; the module's docstring has the default.
     gate : PlausibilityGate, optional
         Which readings are believed.
+    command : (str, str)
+        Name and unit of the input that is commanded.
+    heat : HeatGuard, optional
+        What lowers the limit as the winding warms up, of a command in A.
 
     Raises
     ------
@@ -268,6 +314,11 @@ def realise(
 
     """
     require_type(gate, (PlausibilityGate, NoneType), "gate", "give a PlausibilityGate", ControlError)
+    require_type(heat, (HeatGuard, NoneType), "heat", "give a HeatGuard", ControlError)
+    if heat is not None and command[1] != "A":
+        raise ControlError(
+            f"heat: a guard limits a current, and {command[0]} [{command[1]}] is commanded; leave it out"
+        )
     for name, value in (
         ("sample_time_s", law.sample_time_s),
         ("per_effort", per_effort),
@@ -297,6 +348,8 @@ def realise(
         per_effort=per_effort,
         current_limit_A=math.inf if current_limit_A is None else current_limit_A,
         gate=gate,
+        command=command,
+        heat=heat,
     )
 
 

@@ -14,7 +14,7 @@ from seaopt.records import record
 Level = float | Literal[False] | None  # of a limit: None is its default, False lifts it
 LEVELS = tuple(limit for limit in FIELDS if limit.above is not None)
 LIFTABLE = (*(limit.name for limit in LEVELS), "min_sensitivity_bandwidth_hz")
-OPTIONAL = ("current_limit_A", "step_N")
+OPTIONAL = ("current_limit_A", "command_limit", "step_N")
 MAX_DELAY_SAMPLES = 1000
 LOWEST_HZ = 1e-3  # limits are kept from here
 
@@ -67,6 +67,8 @@ class ControllerSpec:
         Least integral over log-frequency of abs(S) from 0.1 Hz to bandwidth_hz on the worst plant, or least noise gain.
     current_limit_A : float, optional
         Of the motor; it does not shape the gains. The controller says which force it leaves (`force_limit`).
+    command_limit : float, optional
+        The same of whatever is commanded, in its unit: a voltage, a duty. Give one of the two.
     step_N : float, optional
         A step of the reference that the current limit must at least hold.
     reserve : float
@@ -100,6 +102,7 @@ class ControllerSpec:
     passive_band_hz: tuple[float, float] | None = None
     objective: Literal["disturbance", "noise"] = "disturbance"
     current_limit_A: float | None = None
+    command_limit: float | None = None
     step_N: float | None = None
     reserve: float = 0.005
 
@@ -152,8 +155,7 @@ class ControllerSpec:
         self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
             raise ControlError(f"step_N = {self.step_N:g} is not positive; give the step's size")
-        if self.current_limit_A is not None and not self.current_limit_A > 0.0:
-            raise ControlError(f"current_limit_A = {self.current_limit_A:g} is not positive; give the motor's limit")
+        check_command_limits(self.current_limit_A, self.command_limit)
         if not 0.0 <= self.reserve < 0.5:
             raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")
 
@@ -188,6 +190,11 @@ class ControllerSpec:
         return 1 if self.delay_samples is None else self.delay_samples
 
     @property
+    def limit_asked(self) -> float | None:
+        """The limit of the command that is asked for, in its unit; None for none."""
+        return self.command_limit if self.current_limit_A is None else self.current_limit_A
+
+    @property
     def sample_time_s(self) -> float:
         """Seconds between samples."""
         return 1.0 / self.sample_rate_hz
@@ -215,6 +222,24 @@ class ControllerSpec:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         notch = None if self.notch is None else asdict(self.notch)
         return values | {"notch": notch, "delay_samples": self.loop_delay_samples}
+
+
+def check_command_limits(current_limit_A: float | None, command_limit: float | None) -> None:
+    """Refuse two limits of the command, and one that is not positive.
+
+    Raises
+    ------
+    ControlError
+        As said.
+
+    """
+    if current_limit_A is not None and command_limit is not None:
+        raise ControlError(
+            f"current_limit_A = {current_limit_A:g} and command_limit = {command_limit:g} are both given; give one"
+        )
+    for name, value in (("current_limit_A", current_limit_A), ("command_limit", command_limit)):
+        if value is not None and not value > 0.0:
+            raise ControlError(f"{name} = {value:g} is not positive; give the motor's limit")
 
 
 def list_lifted(spec: object) -> tuple[str, ...]:

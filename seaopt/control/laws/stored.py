@@ -113,6 +113,8 @@ class StoredCommand(ResultTable):
     unit: str
     per_effort: Annotated[Finite, Field(gt=0.0)]
     effort_unit: str
+    largest: Annotated[Finite, Field(gt=0.0)] | None = None
+    measured_unit: str = ""
 
 
 class StoredSpec(ResultTable):

@@ -24,6 +24,7 @@ from seaopt.plants.friction import (
     friction_states,
 )
 from seaopt.plants.memo import memo
+from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
 
 FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
@@ -189,6 +190,7 @@ def make_friction_loops(
         None where there is no friction.
 
     """
+    plant = freeze_heat(plant)
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
     held = [np.array(find_bristle_stiffness(plant, each)) for each in values]

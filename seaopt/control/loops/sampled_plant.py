@@ -26,6 +26,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, jacobians
 from seaopt.plants.friction import SLIDING, friction_states, remembers, take_at_rest
 from seaopt.plants.memo import memo
+from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import dynamics_function
 from seaopt.records import record
 from seaopt.units import factor
@@ -223,11 +224,12 @@ def linearise(
         The plant has no such output, or cannot rest where it is to be linearised.
 
     """
+    plant = freeze_heat(take_at_rest(plant))
     if measured not in plant.outputs:
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
-    row, plant = list(plant.outputs).index(measured), take_at_rest(plant)
+    row = list(plant.outputs).index(measured)
     a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(plant, p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
@@ -252,8 +254,10 @@ def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarr
 
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name != DELAY}
-    x, u = _solve_rest(take_at_rest(plant), params.vector[:, None], at)
-    return x[:, 0], u[:, 0]
+    cool = freeze_heat(take_at_rest(plant))
+    x, u = _solve_rest(cool, params.vector[:, None], at)
+    rest = dict(zip(cool.states, x[:, 0], strict=True))  # a winding is cold there, though a current flows
+    return np.array([rest.get(name, 0.0) for name in plant.states]), u[:, 0]
 
 
 def _solve_rest(
@@ -291,7 +295,8 @@ def differentiate_linearisation(
     dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
-    row, names, plant = list(plant.outputs).index(measured), list(plant.states), take_at_rest(plant)
+    plant = freeze_heat(take_at_rest(plant))
+    row, names = list(plant.outputs).index(measured), list(plant.states)
     x, u = _solve_rest(plant, p, at)
     a, b, c, d = _evaluate_jacobians(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)

@@ -64,7 +64,7 @@ def _format_data(mpc: ForceMPC) -> str:
         "MAX_HELD": 0 if mpc.gate is None else mpc.gate.max_held,
     }  # fmt: skip
     numbers = {
-        "limit": spec.current_limit_A, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
+        "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
         "offset": float(kalman.offset[0]), "violation": VIOLATION, "rho": RHO,
     }  # fmt: skip
     if mpc.gate is not None:
@@ -74,7 +74,13 @@ def _format_data(mpc: ForceMPC) -> str:
         "A": kalman.A, "B": kalman.B[:, 0], "C": kalman.C[0], "gain": kalman.gain[:, 0], "rest": mpc.rest,
         "F": prediction.F, "M": prediction.M, "shift": mpc.shift,
     }  # fmt: skip
+    units = {
+        "COMMAND": mpc.actuation.word,
+        "COMMAND_UNIT": mpc.actuation.unit,
+        "UNIT": mpc.design[0].outputs[mpc.measured],
+    }
     lines = [f"#define FORCE_MPC_{name} {value}" for name, value in sizes.items()]
+    lines += [f'#define FORCE_MPC_{name} "{text}"' for name, text in units.items()]
     lines += [f"static const OSQPFloat mpc_{name} = {_format_number(value)};" for name, value in numbers.items() if
               np.isfinite(value)]  # fmt: skip
     lines += [_format_array(name, value) for name, value in arrays.items() if value.size]

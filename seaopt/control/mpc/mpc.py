@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.laws.command import command_of
+from seaopt.control.laws.command import Command, command_of, limit_notes
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
@@ -54,9 +54,10 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import require_plant
+from seaopt.plants.motor.thermal import freeze_heat
+from seaopt.plants.plant import find_range, name_input, require_plant
 from seaopt.records import record
-from seaopt.units import mechanics_of
+from seaopt.units import mechanics_of, name_command, show_command, unit_after
 
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
@@ -178,7 +179,10 @@ class ForceMPC:
     @memo
     def measured_loops(self) -> tuple[MeasuredLoop, ...]:
         """These loops as limits are judged on them."""
-        return tuple(MeasuredLoop(name=name, figures=loop.figures()) for name, loop in self.loops.items())
+        return tuple(
+            MeasuredLoop(name=name, figures=loop.figures(), gain_unit=self.actuation.gain_unit)
+            for name, loop in self.loops.items()
+        )
 
     @property
     @memo
@@ -219,9 +223,20 @@ class ForceMPC:
         return self.spec.loop_delay_samples
 
     @property
+    @memo
+    def actuation(self) -> Command:
+        """What is commanded for an effort, of the design plant."""
+        return command_of(*self.design, self.measured)
+
+    @property
     def per_effort(self) -> float:
         """The command for one unit of effort, of the design plant."""
-        return command_of(*self.design, self.measured).per_effort
+        return self.actuation.per_effort
+
+    @property
+    def command_limit(self) -> float:
+        """The limit of the command: what is asked for, and no more than the plant's actuation takes."""
+        return limit_command(self.spec, *self.design)
 
     @property
     def achieved(self) -> LoopFigures:
@@ -256,7 +271,10 @@ class ForceMPC:
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
         proof = () if self.friction is None else (f"{self.friction}, while no limit is active",)
-        return (*describe_lifted(self.spec), *self.warnings, *proof)
+        limit = limit_notes(
+            self.actuation, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None
+        )  # fmt: skip
+        return (*describe_lifted(self.spec), *self.warnings, *limit, *proof)
 
     @property
     def start(self) -> MPCState:
@@ -276,7 +294,7 @@ class ForceMPC:
         began = time.perf_counter()
         if not np.isfinite(reference_N):
             raise ControlError(f"reference_N = {reference_N}: not a force; hold the last one instead")
-        limit, last, seen = self.spec.current_limit_A, state.current_A, state.gate
+        limit, last, seen = self.command_limit, state.current_A, state.gate
         if self.gate is not None:
             _, seen = self.gate.screen(seen, measurement_N)
             measurement_N = np.nan if seen.held else measurement_N
@@ -311,14 +329,14 @@ class ForceMPC:
 
     def admissible(self, current_A: float, last_A: float) -> float:
         """Return the current nearest to one given that slew and size allow after the last."""
-        limit, slew = self.spec.current_limit_A, self.spec.slew_per_sample_A
+        limit, slew = self.command_limit, self.spec.slew_per_sample_A
         return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -limit, limit))
 
     def program(
         self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows."""
-        limit, one = self.spec.current_limit_A, np.ones(self.prediction.knots.size)
+        limit, one = self.command_limit, np.ones(self.prediction.knots.size)
         slopes = np.zeros(len(self.prediction.M))
         if slopes.size:
             slopes[0] = (last_A - u_s) / self.spec.slew_per_sample_A
@@ -343,7 +361,7 @@ class ForceMPC:
         self, ahead: Float[np.ndarray, " n"], reference: float
     ) -> tuple[Float[np.ndarray, " nx"], float, float]:
         """Return the state's distance from its target, the target current, and the force it holds."""
-        limit, nx, drift = self.spec.current_limit_A, self.rest.size, float(ahead[-1])
+        limit, nx, drift = self.command_limit, self.rest.size, float(ahead[-1])
         u_s = float(np.clip(reference / self.static_gain - drift, -limit, limit))
         return ahead[:nx] - self.rest * (u_s + drift), u_s, self.static_gain * (u_s + drift)
 
@@ -368,7 +386,7 @@ class ForceMPC:
 
     def unlimited(self) -> Law:
         """Return what the controller is as long as no limit is active: from reference and measurement to current."""
-        gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.spec.current_limit_A
+        gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.command_limit
         n, delay = len(self.kalman.A), self.delay_samples
         past = max(delay, 1)  # of which the last command is one
 
@@ -408,6 +426,11 @@ class ForceMPC:
         law, scale = self.unlimited(), self.per_effort
         return replace(law, b=law.b / scale, d=law.d / scale)
 
+    def describe_limits(self) -> str:
+        """Return the limits of the command and its rate, as text."""
+        slew, rate = self.spec.current_slew_A_per_s, f"{unit_after(self.actuation.unit) or ' 1'}/s"
+        return self.actuation.show(self.command_limit) + ("" if slew is None else f", {slew:g}{rate}")
+
     def describe_figures(self) -> list[str]:
         """Return a line of margins for each loop of the design plant: with friction sliding and stuck."""
         lines: list[str] = []
@@ -418,17 +441,16 @@ class ForceMPC:
         return lines
 
     def __repr__(self) -> str:
-        s, slew = self.spec, self.spec.current_slew_A_per_s
+        s = self.spec
         unit = self.design[0].outputs[s.measured]
-        limits = f"{s.current_limit_A:g} A" + ("" if slew is None else f", {slew:g} A/s")
         verdict = "every limit met" if self.feasible else f"NOT FEASIBLE: {join_labels(self.broken)}"
         lines = [
             f"ForceMPC on {s.measured} of {self.design[0].name} at {s.sample_rate_hz:g} Hz, "
             f"delay of {format_count(self.delay_samples, 'sample')}: {verdict}",
-            f"  within {limits}, which hold {self.static_gain * s.current_limit_A:.4g} {unit}",
+            f"  within {self.describe_limits()}, which hold {self.static_gain * self.command_limit:.4g} {unit}",
             f"  bandwidth {format_number(self.achieved.bandwidth_hz, missing='none')} Hz (asked {s.bandwidth_hz:g}) "
-            f"while no limit of the current is active; horizon {1e3 * s.horizon_s:g} ms, "
-            f"{self.prediction.knots.size} free currents",
+            f"while no limit of the {self.actuation.word} is active; horizon {1e3 * s.horizon_s:g} ms, "
+            f"{self.prediction.knots.size} moves",
             *(f"  {line}" for line in self.describe_figures()),
             *([] if self.feasible else [f"  {self.explanation}"]),
             *(f"  note: {note}" for note in self.notes),
@@ -450,7 +472,7 @@ def force_mpc(
     ----------
     plant, params
         The design plant, the test stand as a rule, and its parameters or a fit, whose experiments' delay is taken where
-        the specification leaves it out; its first input is the motor current.
+        the specification leaves it out; its first input is what is commanded.
     spec : MPCSpec
         Limits and bandwidth.
     gate : PlausibilityGate, optional
@@ -505,10 +527,11 @@ def _design(
 ) -> ForceMPC:  # fmt: skip
     """Return the controller of a specification whose delay is settled; friction slides in its model."""
     design = (plant, values)
-    plant = take_sliding(plant, values)
+    plant = freeze_heat(take_sliding(plant, values))
     completed = plant.complete(values)
     digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
-    gain = _static_gain(plant, digital, spec)
+    limit = limit_command(spec, plant, completed)
+    gain = _static_gain(plant, digital, spec, limit)
     noise = spec.noise or NoiseModel(
         sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={_drive(plant): 1.0},
         input_drift={_drive(plant): 3.0},
@@ -525,7 +548,7 @@ def _design(
     weighted = c + spec.decay / (2 * np.pi * spec.bandwidth_hz) * _rate(plant, completed, spec.measured)
     regulator = tune_regulator(a, b, c, weighted, gain, spec.bandwidth_hz, spec.sample_time_s)
     knots = spread_knots(spec.samples, spec.moves)
-    prediction = condense(a, b, weighted, gain, regulator, knots, spec.current_limit_A, spec.slew_per_sample_A)
+    prediction = condense(a, b, weighted, gain, regulator, knots, limit, spec.slew_per_sample_A)
     shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec, design=design, kalman=kalman, regulator=regulator, prediction=prediction, static_gain=gain,
@@ -544,26 +567,32 @@ def _drive(plant: Plant) -> str:
     return next(iter(plant.inputs))
 
 
-def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec) -> float:
+def limit_command(spec: MPCSpec, plant: Plant, values: ParameterSet) -> float:
+    """Return the limit of the command: what is asked for, and no more than the plant's actuation takes."""
+    return min(spec.limit_asked, find_range(plant, values) or np.inf)
+
+
+def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec, limit: float) -> float:
     """Return N/A of the measured force, or say why it cannot be controlled so."""
     unit = plant.outputs[spec.measured]
-    word = mechanics_of(unit).word
+    word, source = mechanics_of(unit).word, name_command(*name_input(plant))
     if np.max(np.abs(np.linalg.eigvals(digital.a))) > 1.0 - 1e-9:
         raise ControlError(
-            f"{plant.name} does not come to rest by itself, so that no current belongs to a {word}; design on the stand"
+            f"{plant.name} does not come to rest by itself, so that no {source} belongs to a {word}; design on the "
+            "stand"
         )
     gain = float(digital.c @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
     if abs(gain) < 1e-9:
-        raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant current; design on the stand")
+        raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant {source}; design on the stand")
     if digital.d != 0.0:
         raise ControlError(
-            f"{spec.measured} of {plant.name} follows the current at once (d = {digital.d:.3g}); "
+            f"{spec.measured} of {plant.name} follows the {source} at once (d = {digital.d:.3g}); "
             f"control the spring's {word}"
         )
-    largest = abs(gain) * spec.current_limit_A
+    largest = abs(gain) * limit
     if spec.largest_force_N is not None and spec.largest_force_N > largest:
         raise ControlError(
-            f"current_limit_A = {spec.current_limit_A:g} holds {largest:.4g} {unit}, less than largest_force_N = "
-            f"{spec.largest_force_N:g}; raise the one or lower the other"
+            f"a limit of {show_command(limit, *name_input(plant))} holds {largest:.4g} {unit}, less than "
+            f"largest_force_N = {spec.largest_force_N:g}; raise the one or lower the other"
         )
     return gain

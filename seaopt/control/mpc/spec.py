@@ -36,10 +36,10 @@ class MPCSpec:
 
     Parameters
     ----------
-    current_limit_A : float
-        The command stays within plus and minus this.
+    current_limit_A, command_limit : float
+        The command, a current or whatever the plant's first input is, stays within plus and minus this. Give one.
     current_slew_A_per_s : float, optional
-        Largest rate of change of the command; None: no limit.
+        Largest rate of change of the command, in its unit over s; None: no limit.
     measured : str
         The output that is fed back, F1 as a rule.
     bandwidth_hz : float
@@ -75,7 +75,8 @@ class MPCSpec:
 
     """
 
-    current_limit_A: float
+    current_limit_A: float | None = None
+    command_limit: float | None = None
     current_slew_A_per_s: float | None = None
     measured: str = "F1"
     bandwidth_hz: float = 30.0
@@ -95,9 +96,13 @@ class MPCSpec:
     min_sensitivity_bandwidth_hz: Level = None
 
     def __post_init__(self) -> None:
-        for name in ("current_limit_A", "bandwidth_hz", "sample_rate_hz", "horizon_s"):
+        if (self.current_limit_A is None) == (self.command_limit is None):
+            raise ControlError(
+                f"current_limit_A = {self.current_limit_A}, command_limit = {self.command_limit}: give one of the two"
+            )
+        for name in ("bandwidth_hz", "sample_rate_hz", "horizon_s"):
             self._positive(name)
-        for name in ("current_slew_A_per_s", "largest_force_N"):
+        for name in ("current_limit_A", "command_limit", "current_slew_A_per_s", "largest_force_N"):
             if getattr(self, name) is not None:
                 self._positive(name)
         require_type(self.noise, (NoiseModel, NoneType), "noise", "give a NoiseModel", ControlError)
@@ -137,6 +142,13 @@ class MPCSpec:
     def allowed(self, limit: Limit) -> float | None:
         """Return the value that one of `MPC_LIMITS` allows; None where it is not imposed."""
         return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)
+
+    @property
+    def limit_asked(self) -> float:
+        """The limit of the command that is asked for, in its unit."""
+        limit = self.command_limit if self.current_limit_A is None else self.current_limit_A
+        assert limit is not None
+        return limit
 
     @property
     def sample_time_s(self) -> float:

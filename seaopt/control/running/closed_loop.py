@@ -42,8 +42,9 @@ from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import SLIDING, friction_states
-from seaopt.plants.plant import ENERGY, Matrices
+from seaopt.plants.plant import ENERGY, Matrices, name_input
 from seaopt.records import record
+from seaopt.units import name_command, unit_after
 
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
@@ -92,22 +93,26 @@ class LoopRun:
     error: float
     substeps: int
     wall_s: float
+    command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
         return describe_runs(
-            "LoopRun", f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s", self.current, self.peaks, self.error
-        )
+            "LoopRun", f"from {self.time[0]:.4g} to {self.time[-1]:.4g} s", self.current, self.peaks, self.error,
+            self.command,
+        )  # fmt: skip
 
 
 def describe_runs(
-    kind: str, span: str, current: Rows, peaks: Mapping[str, Float[np.ndarray, " runs"]], error: float, more: str = ""
-) -> str:
+    kind: str, span: str, current: Rows, peaks: Mapping[str, Float[np.ndarray, " runs"]], error: float,
+    command: tuple[str, str], more: str = "",
+) -> str:  # fmt: skip
     """Describe simulated runs in one line: how many, of how many samples, and the largest magnitudes."""
     runs, samples = current.shape
     largest = ", ".join(f"{name} {np.max(value):.4g}" for name, value in peaks.items())
     return (
         f"{kind} of {format_count(runs, 'run')} of {samples} samples, {span}: largest magnitudes {largest}, "
-        f"current {np.max(np.abs(current)):.4g} A; {more}integration error {error:.1g}"
+        f"{name_command(*command)} {np.max(np.abs(current)):.4g}{unit_after(command[1])}; "
+        f"{more}integration error {error:.1g}"
     )
 
 
@@ -253,6 +258,7 @@ def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, subst
         peaks={name: arrays.peak[:, i] for i, name in enumerate(names)},
         end=LoopState(x=arrays.x, z=arrays.z),
         error=error,
+        command=name_input(loop.plant),
         substeps=2 * substeps,
         wall_s=wall_s,
     )

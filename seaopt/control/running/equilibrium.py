@@ -20,8 +20,9 @@ from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
+from seaopt.plants.plant import name_input
 from seaopt.records import record
-from seaopt.units import LINEAR
+from seaopt.units import LINEAR, show_command
 
 Runs = Float[np.ndarray, " runs"]
 
@@ -47,10 +48,13 @@ class Equilibrium:
     current_A: Runs
     energy_J: Runs
     unit: str = LINEAR.unit
+    command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
         rows = zip(self.force, self.current_A, strict=True)
-        return "Equilibrium at " + ", ".join(f"{force:.4g} {self.unit}, {current:.4g} A" for force, current in rows)
+        return "Equilibrium at " + ", ".join(
+            f"{force:.4g} {self.unit}, {show_command(current, *self.command)}" for force, current in rows
+        )
 
 
 def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
@@ -90,16 +94,21 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
             continue
         y = np.array(observe(x, u, values.vector)).ravel()
         force = float(y[names.index(loop.measured)])
-        inner, reference = _law_at_rest(law, force, float(u[0]), plant.outputs[loop.measured])
+        inner, reference = _law_at_rest(law, force, float(u[0]), plant, loop.measured)
         z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])
         figures[run] = reference, force, u[0], y[-1]
     reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
     unit = plant.outputs[loop.measured]
-    return Equilibrium(state=state, reference=reference, force=force, current_A=current, energy_J=energy, unit=unit)
+    return Equilibrium(
+        state=state, reference=reference, force=force, current_A=current, energy_J=energy, unit=unit,
+        command=name_input(plant),
+    )  # fmt: skip
 
 
-def _law_at_rest(law: RunnableLaw, force: float, current_A: float, unit: str) -> tuple[Float[np.ndarray, " n"], float]:
+def _law_at_rest(
+    law: RunnableLaw, force: float, current_A: float, plant: Plant, measured: str
+) -> tuple[Float[np.ndarray, " n"], float]:
     """Return the law's state and the reference at which it commands a current, unlimited, under a constant force."""
     n = law.c.size
     left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
@@ -110,7 +119,8 @@ def _law_at_rest(law: RunnableLaw, force: float, current_A: float, unit: str) ->
         rest = np.full(n + 1, np.nan)
     if not np.all(np.isfinite(rest)):
         raise ControlError(
-            f"no reference makes the law command the {current_A:.4g} A that rest takes at {force:.4g} {unit}; its "
+            f"no reference makes the law command the {show_command(current_A, *name_input(plant))} that rest takes at "
+            f"{force:.4g} {plant.outputs[measured]}; its "
             "reference path is blocked at 0 Hz"
         )
     return rest[:-1], float(rest[-1])

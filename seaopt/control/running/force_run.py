@@ -25,9 +25,9 @@ from seaopt.errors import ControlError, SimulationError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import output_function
+from seaopt.plants.plant import name_input, output_function
 from seaopt.records import record
-from seaopt.units import LINEAR, mechanics_of
+from seaopt.units import LINEAR, mechanics_of, name_command, unit_after
 
 State = TypeVar("State")
 FIRST_SUBSTEPS = 2  # coarse steps per sample to begin with
@@ -62,6 +62,7 @@ class ForceRun:
     error: float
     substeps: int
     unit: str = LINEAR.unit
+    command: tuple[str, str] = ("I", "A")
 
     @property
     def overshoot(self) -> float:
@@ -74,7 +75,7 @@ class ForceRun:
         return (
             f"ForceRun of {self.time.size} samples, {self.time[-1]:.4g} s: reference to {self.reference[-1]:.4g} "
             f"{unit}, {word} up to {np.max(np.abs(self.force)):.4g} {unit} and {self.force[-1]:.4g} {unit} at the end, "
-            f"current up to {np.max(np.abs(self.current)):.4g} A"
+            f"{name_command(*self.command)} up to {np.max(np.abs(self.current)):.4g}{unit_after(self.command[1])}"
         )
 
     def settling_time_s(self, band: float = 0.02) -> float:
@@ -170,6 +171,7 @@ def close_loop(
     return ForceRun(
         time=time_s, reference=reference, force=force, current=current, law_time_s=law_time_s, state=states,
         error=integrator.error, substeps=2 * integrator.substeps, unit=plant.outputs[measured],
+        command=name_input(plant),
     )  # fmt: skip
 
 
@@ -189,7 +191,7 @@ def _check(plant: Plant, params: CompletedParameters, measured: str, delay_sampl
     row = plant.output[list(plant.outputs).index(measured)]
     if not delay_samples and not extra_delay_s and ca.depends_on(row, plant.u[0]):
         raise ControlError(
-            f"{measured} of {plant.name} contains the present current, which a law without delay sets from it; give "
+            f"{measured} of {plant.name} contains the present command, which a law without delay sets from it; give "
             "delay_samples = 1 or more, or measure another output"
         )
     return extra_delay_s

@@ -17,6 +17,7 @@ from seaopt.plants.friction import can_stick
 from seaopt.plants.plant import ENERGY
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
+from seaopt.units import show_command
 
 
 @record(eq=False)
@@ -26,7 +27,7 @@ class SampledLoop:
     Parameters
     ----------
     plant : Plant
-        Its first input is the motor current.
+        Its first input is what the law commands, the motor current as a rule.
     law : RunnableLaw
         As exported.
     measured : str
@@ -37,7 +38,8 @@ class SampledLoop:
         Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from:
         these round, and their noise is the output's.
     current_step_A : float
-        What the current is rounded to; 0 for not at all. The largest is the last whole step within the law's limit.
+        What the command is rounded to, in its unit; 0 for not at all. The largest is the last whole step within the
+        law's limit.
     longest_delay_s : float
         The longest `delay_s` of any run's parameters: delay besides `delay_samples`, of any length.
     sticks : bool
@@ -69,6 +71,8 @@ class SampledLoop:
             )
         if self.law.gate is not None:
             raise SimulationError("law has a plausibility gate, which this simulation leaves out; use close_loop")
+        if self.law.heat is not None:
+            raise SimulationError("law has a heat guard, which this simulation leaves out; use close_loop")
         if self.sticks and not can_stick(plant):
             raise SimulationError(
                 f"sticks = True, but {plant.name} has no friction that jumps at rest; give its Friction a jump"
@@ -80,14 +84,15 @@ class SampledLoop:
             if not getattr(self.sensors, what).get(self.measured, 0.0) >= 0.0:
                 raise SimulationError(f"{what} of {self.measured} is negative; give zero or more")
         if self.current_step_A and not self.most_A:
+            limit = show_command(self.law.current_limit_A, *self.law.command)
             raise SimulationError(
-                f"current_step_A = {self.current_step_A:g} is above the limit of {self.law.current_limit_A:g} A, so "
-                "that every current but zero is; give the amplifier's step"
+                f"current_step_A = {self.current_step_A:g} is above the limit of {limit}, so that every command but "
+                "zero is; give the amplifier's step"
             )
         row = plant.output[list(plant.outputs).index(self.measured)]
         if self.delay_samples == 0 and ca.depends_on(row, plant.u[0]):
             raise SimulationError(
-                f"{self.measured} of {plant.name} contains the present current, which a law without delay sets from "
+                f"{self.measured} of {plant.name} contains the present command, which a law without delay sets from "
                 "it; give delay_samples = 1 or more, or measure another output"
             )
 

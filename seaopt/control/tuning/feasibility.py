@@ -99,6 +99,12 @@ def check_delay(spec: ControllerSpec, plant: DigitalPlant) -> None:
     )
 
 
+def _advise(spec: ControllerSpec, limit: float) -> str:
+    if spec.limit_asked is None or spec.limit_asked > limit:
+        return "that is the whole range of the command"
+    return f"raise {'command_limit' if spec.current_limit_A is None else 'current_limit_A'}"
+
+
 def check_current(spec: ControllerSpec, k_ff: float, command: Command, friction: Mapping[str, float]) -> None:
     """Refuse a current limit that does not hold the step, or does not overcome dry friction.
 
@@ -108,18 +114,18 @@ def check_current(spec: ControllerSpec, k_ff: float, command: Command, friction:
         As said.
 
     """
-    limit, per_effort, unit = spec.current_limit_A, command.per_effort, command.effort_unit
+    limit, per_effort, unit = command.limit(spec.limit_asked), command.per_effort, command.effort_unit
     if limit is None:
         return
     if limit <= per_effort * sum(friction.values()):
         levels = " and ".join(f"{name} of {effort:.4g} {unit}" for name, effort in friction.items())
         raise ControlError(
-            f"current_limit_A = {limit:g} makes {limit / per_effort:.4g} {unit}, no more than the friction {levels}: "
-            "nothing moves; raise it"
+            f"a {command.word} of up to {command.show(limit)} makes {limit / per_effort:.4g} {unit}, no more than the "
+            f"friction {levels}: nothing moves; {_advise(spec, limit)}"
         )
     held = limit / (per_effort * abs(k_ff))
     if spec.step_N is not None and spec.step_N > held:
         raise ControlError(
-            f"step_N = {spec.step_N:g} takes {limit * spec.step_N / held:.4g} A at rest, more than current_limit_A = "
-            f"{limit:g}: no controller makes it; ask for {held:.4g} {unit} at most"
+            f"step_N = {spec.step_N:g} takes {command.show(limit * spec.step_N / held)} at rest, more than the limit "
+            f"of {command.show(limit)}: no controller makes it; ask for {held:.4g} {unit} at most"
         )

@@ -34,6 +34,7 @@ from seaopt.estimation.result.covariance import Covariance
 from seaopt.formatting import format_count, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.plant import find_range
 from seaopt.records import record
 
 
@@ -84,7 +85,7 @@ class Design:
     peaks : mapping of signal to float
         Largest magnitude of the input and of each limited signal.
     limits : Limits
-        As given.
+        As given, the input's peak within its range.
 
     """
 
@@ -214,6 +215,7 @@ def design_experiment(
     (1.7, True)
 
     """
+    limits = _keep_range(limits, plant, params, input_name)
     bench = make_bench(
         plant, params, sigma, duration_s=limits.duration_s, rate_hz=limits.rate_hz, offset=offset,
         initial_state=initial_state, input_name=input_name, watched=_limited_signals(plant, limits),
@@ -275,6 +277,14 @@ def expected_covariance(
     )  # fmt: skip
     u = bench.samples(excitation, seed)
     return Covariance(names=bench.model.free, matrix=bench.refine_steps(u).run(u).covariance)
+
+
+def _keep_range(limits: Limits, plant: Plant, params: ParameterSet, input_name: str | None) -> Limits:
+    """Return limits whose peak is no more than acts on the plant: of a duty, 1."""
+    most = find_range(plant, params) if input_name in (None, next(iter(plant.inputs), None)) else None
+    if most is None:
+        return limits
+    return replace(limits, peak=most if limits.peak is None else min(limits.peak, most))
 
 
 def _limited_signals(plant: Plant, limits: Limits) -> tuple[str, ...]:

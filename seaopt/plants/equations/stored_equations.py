@@ -131,8 +131,11 @@ def store_plant(plant: Any) -> dict[str, Any]:
     content |= {"derived": store(plant.derived, p), "energy": store(plant.energy, x, p)}
     if plant.actuation is not None:
         content["actuation"] = replace(
-            plant.actuation, effort=store(plant.actuation.effort, p), speed=store(plant.actuation.speed, x, p)
-        )
+            plant.actuation, effort=store(plant.actuation.effort, p), speed=store(plant.actuation.speed, x, p),
+            largest=store(plant.actuation.largest, p),
+        )  # fmt: skip
+    if plant.winding is not None:
+        content["winding"] = replace(plant.winding, effort=store(plant.winding.effort, p))
     if plant.spring is not None:
         content["spring"] = replace(plant.spring, deflection=store(plant.spring.deflection, x, p))
     content["ports"] = tuple(store_port(one) for one in plant.ports)

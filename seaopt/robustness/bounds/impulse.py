@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from seaopt.control import Controller
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.plants import Plant, jacobians
+from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
 from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, count_halvings, enclose
 from seaopt.robustness.bounds.region import Boxes, Region
@@ -55,6 +56,7 @@ def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: B
         The plant's equations have an instruction without an enclosure, or cannot rest at a box's centre.
 
     """
+    plant = freeze_heat(plant)
     degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
     uncertain = within.enclose(boxes, degree)
     count, over = boxes.centre.shape[0], build_basis(within.size, degree)

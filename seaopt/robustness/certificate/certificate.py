@@ -49,7 +49,7 @@ SEARCHED_DELAYS = 3.0  # how far beyond the classical delay margin, and two samp
 ROBUSTNESS_SCHEMA = "seaopt/robustness/2"
 MIN_FRICTION_MARGIN = "min_friction_margin"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
-LIMIT_CYCLE = "limit_cycle_N"
+LIMIT_CYCLE = "limit_cycle"
 DESIGN_NAMES = ("design", "design plant")  # of the design plant where the caller does not list it
 _REPORTED = (
     "stable", "bandwidth_hz", "tracking_band_hz", "ms", "mt", "gain_margin_db", "phase_margin_deg", "delay_margin_s",

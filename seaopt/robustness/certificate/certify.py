@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float
 from seaopt.control import Controller
 from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
-from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_number, require_type
@@ -26,6 +25,7 @@ from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
+from seaopt.plants.motor.thermal import find_resistance_range
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
@@ -177,7 +177,8 @@ def certify(
     asked = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     models, others = _with_design(controller, plants, others or ParameterSet())
-    unknown = combine_uncertainty(parameters, others, ranges or {}, models)
+    warmed = _find_warm_ranges(controller, others)
+    unknown = combine_uncertainty(parameters, others, warmed | dict(ranges or {}), models)
     _check_delay(controller, unknown.ranges)
     nominal, varied = unknown.nominal, unknown.varied()
     plants = split_friction(models, nominal, [row.name for row in varied])
@@ -218,6 +219,13 @@ def certify(
     return certificate.with_steps()
 
 
+def _find_warm_ranges(controller: Controller, others: ParameterSet) -> dict[str, tuple[float, float]]:
+    """Return the range of the winding's resistance, cold to hot, where a voltage or a duty is commanded."""
+    assert controller.design is not None
+    plant, values = controller.design
+    return find_resistance_range(plant, others.with_parameters(*values.values()))
+
+
 def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tuple[str, ...]:
     """Return a warning where the controller counts on less delay than the fit's experiments have."""
     assert controller.design is not None
@@ -232,7 +240,7 @@ def _remark_amplitude(controller: Controller, models: Mapping[str, Plant], nomin
     """
     assert controller.design is not None
     name, plant = next((name, plant) for name, plant in models.items() if plant is controller.design[0])
-    rest, sliding = controller.force_limit(LOWEST_HZ), controller.achieved.bandwidth_hz
+    rest, sliding = controller.force_limit(0.0), controller.achieved.bandwidth_hz
     if rest is None or sliding is None or not has_friction(plant, nominal):
         return ()
     low, high = STEP_SHARES[0], STEP_SHARES[-1]

@@ -29,8 +29,8 @@ SIMULATION_FAILURES = "simulation_failures"
 STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
 # Kinds of fault that have a figure of their own are requirements by these names; all others are counted.
 NAMED_FAULTS = {
-    "overshoot": STEP_OVERSHOOT, "settling": STEP_SETTLING, "steady error": "steady_error_N",
-    "oscillation": "sustained_oscillation_N",
+    "overshoot": STEP_OVERSHOOT, "settling": STEP_SETTLING, "steady error": "steady_error",
+    "oscillation": "sustained_oscillation",
 }  # fmt: skip
 
 
@@ -261,7 +261,7 @@ def _list_sweeps(
     assert controller.design is not None
     design, values = controller.design
     rub = any(has_friction(plant, parameters) for plant in plants.values())
-    if controller.spec.current_limit_A is None and not rub:  # one reason for all of them
+    if controller.command_limit is None and not rub:  # one reason for all of them
         return [(design.name, (design, values), "large signals")]
     known = next((name for name, plant in plants.items() if plant is design), design.name)
     on = {known: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != known}

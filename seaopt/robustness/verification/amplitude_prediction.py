@@ -51,7 +51,7 @@ def predict_gain(
     loop = controller.close(take_sliding(plant, values), values)
     p, s = loop.plant.response(f), loop.sensitivity(f)
     c_y, c_r = loop.open_loop(f) / p, loop.tracking(f) / (p * s)
-    limit = controller.spec.current_limit_A
+    limit = controller.command_limit
     most = np.inf if limit is None else limit / controller.command.per_effort
     friction = _Friction.of(controller, plant, values, f)
     gains = SATURATION_GAINS if limit is not None else SATURATION_GAINS[:1]

@@ -192,7 +192,7 @@ def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int,
     controller, plant = stage.controller, stage.plant
     force = float(trace.peaks[controller.spec.measured][run])
     angles = [float(trace.peaks[name][run]) for name, unit in plant.outputs.items() if unit == "rad"]
-    current, limit = np.abs(trace.current[run]), controller.spec.current_limit_A
+    current, limit = np.abs(trace.current[run]), controller.command_limit
     most = largest_current(math.inf if limit is None else limit, stage.current_step_A)
     hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[run]), default=None)
     findings.figures.update(
@@ -205,9 +205,13 @@ def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int,
         contact_loss_J=None if hardest is None else float(hardest.loss_J[run]),
     )
     if np.max(current) > most * (1 + 1e-9):
-        findings.add("current", f"the current reaches {np.max(current):.4g} A, above its limit of {most:.4g} A")
+        findings.add(
+            "current",
+            f"the {controller.command.word} reaches {controller.command.show(np.max(current))}, above its limit of "
+            f"{controller.command.show(most)}",
+        )
     for what, value, allowed, unit in (
-        (controller.spec.measured, force, scenario.max_force_N, controller.command.effort_unit),
+        (controller.spec.measured, force, scenario.max_force_N, controller.command.reference_unit),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
         if allowed is not None and not value <= allowed:
@@ -220,13 +224,14 @@ def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int,
 
 def _judge_rest(stage: Stage, trace: Playback, run: int, drawn: ParameterSet, findings: _Findings) -> None:
     """Check that the motor can hold the plant where the draw puts it at rest."""
-    limit = stage.controller.spec.current_limit_A
+    limit, show = stage.controller.command_limit, stage.controller.command.show
     if trace.rest is None or limit is None or abs(trace.rest.current_A[run]) <= limit * (1 + 1e-9):
         return
     where = format_values({name: drawn[name].value for name in stage.plant.states if name in drawn}, missing="")
     findings.add(
         "rest",
-        f"to rest at {where} takes {trace.rest.current_A[run]:.4g} A, above the limit of {limit:g} A; narrow its range",
+        f"to rest at {where} takes {show(trace.rest.current_A[run])}, above the limit of {show(limit)}; narrow its "
+        "range",
     )
 
 
@@ -260,7 +265,7 @@ def _judge_outbreak(
     before, after = max(float(np.max(off[:half])), float(np.max(alone))), float(np.max(off[half:]))
     allowed = OUTBREAK * before + OUTLIER * view.force_std()
     if not after <= allowed:
-        unit = stage.controller.command.effort_unit
+        unit = stage.controller.command.reference_unit
         end = f"{after:.4g} {unit} in the end, without noise by {np.max(alone):.4g} {unit}"
         findings.add("outbreak", f"{name} is off by up to {end}")
 
@@ -288,7 +293,7 @@ def _judge_oscillation(
         if line is not None and (line.sustained or line.growing):
             findings.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
             what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
-            unit = stage.controller.command.effort_unit
+            unit = stage.controller.command.reference_unit
             text = f"an oscillation of {line.amplitude:.3g} {unit} at {line.frequency_hz:.4g} Hz {what}"
             findings.add("oscillation", text, line.amplitude)
             return
@@ -327,7 +332,7 @@ def _noise_floor(stage: Stage, trace: Playback, run: int) -> float:
 
 def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:
     """Tell whether a step overshoots further than is allowed in a run whose current reaches its limit."""
-    limit, allowed = stage.controller.spec.current_limit_A, scenario.max_overshoot
+    limit, allowed = stage.controller.command_limit, scenario.max_overshoot
     if limit is None or allowed is None:
         return False
     at_limit = np.max(np.abs(trace.current), axis=1) >= limit * (1 - 1e-9)
@@ -353,7 +358,7 @@ def _judge_step(
     """Judge a step from rest by its largest force, between samples too, and by when it has settled."""
     if scenario.settling_s is None:
         return
-    step, last, unit = scenario.phases[-1].force_N, trace.last, stage.controller.command.effort_unit
+    step, last, unit = scenario.phases[-1].force_N, trace.last, stage.controller.command.reference_unit
     response, largest = _respond(stage, scenario, trace, run), _find_peak(stage, scenario, trace, run)
     outside = np.flatnonzero(np.abs(response[last] - 1.0) > SETTLED)
     settled = outside.size == 0 or outside[-1] + 1 < last.stop - last.start

@@ -139,7 +139,7 @@ def large_signal(
     Raises
     ------
     ControlError
-        The controller has no current limit and the plant no friction, the linear loop is unstable, or an amplitude or
+        The controller has no limit and the plant no friction, the linear loop is unstable, or an amplitude or
         frequency is out of range.
 
     Examples
@@ -152,11 +152,13 @@ def large_signal(
     (30, True)
 
     """
-    limit, period, band = controller.spec.current_limit_A, controller.sample_time_s, controller.spec.bandwidth_hz
+    limit, period, band = controller.command_limit, controller.sample_time_s, controller.spec.bandwidth_hz
     values = plant.complete(parameters)
     friction = sum(find_dry_friction(plant, values).values())
     if limit is None and not friction:
-        raise ControlError("the controller has no current_limit_A, so that nothing saturates; give one in its spec")
+        raise ControlError(
+            "the command has no limit, so that nothing saturates; give current_limit_A (command_limit) in the spec"
+        )
     linear = controller.close(take_sliding(plant, values), values)
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
@@ -194,7 +196,7 @@ def large_signal(
         plant=plant.name, frequency_hz=f, amplitude_N=amplitude, gain=gain, saturated=saturated, onset_N=onset,
         bandwidth_hz=tuple(_find_bandwidth(f, np.abs(row), static, plant.moves) for row in gain),
         predicted_hz=tuple(_find_bandwidth(dense, row, static, plant.moves) for row in predicted),
-        friction_N=friction, unit=controller.command.effort_unit,
+        friction_N=friction, unit=controller.command.reference_unit,
     )  # fmt: skip
 
 
@@ -232,7 +234,7 @@ def _choose_amplitudes(at_band: float, friction: float) -> Float[np.ndarray, " a
 
 def _compute_onset(controller: Controller, loop: Loop, f: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
     """Return the amplitude (N) at which the linear loop's current saturates; infinite without a limit."""
-    limit = controller.spec.current_limit_A
+    limit = controller.command_limit
     effort = np.abs(loop.tracking(f) / loop.plant.response(f))
     return np.full(f.size, np.inf) if limit is None else limit / controller.command.per_effort / effort
 

@@ -113,7 +113,7 @@ def seek_limit_cycles(
     """
     predicted = () if shown else predict_limit_cycles(controller, plant, params)
     predicted += predict_play_cycles(controller, plant, params)
-    unit = controller.command.effort_unit
+    unit = controller.command.reference_unit
     return tuple(replace(_simulate(controller, plant, params, cycle), unit=unit) for cycle in predicted)
 
 

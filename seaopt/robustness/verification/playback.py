@@ -75,9 +75,10 @@ class Stage:
 
     @property
     def unlimited(self) -> Stage:
-        """The stage with no current limit."""
-        spec = replace(self.controller.spec, current_limit_A=None)
-        return replace(self, controller=replace(self.controller, spec=spec))
+        """The stage with no limit of the command."""
+        spec = replace(self.controller.spec, current_limit_A=None, command_limit=None)
+        command = replace(self.controller.command, largest=None)
+        return replace(self, controller=replace(self.controller, spec=spec, command=command))
 
     @property
     def is_ideal(self) -> bool:
@@ -143,10 +144,13 @@ class Playback:
     error: float
     substeps: int
     wall_s: float
+    command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
         contacts = f"{len(self.contacts)} contacts; "
-        return describe_runs("Playback", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, contacts)
+        return describe_runs(
+            "Playback", f"{self.time[-1]:.4g} s", self.current, self.peaks, self.error, self.command, contacts
+        )
 
     @property
     def last(self) -> slice:
@@ -291,6 +295,7 @@ def _join_phases(
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
         error=max(run.error for run in runs),
+        command=runs[0].command,
         substeps=max(run.substeps for run in runs),
         wall_s=sum(run.wall_s for run in runs),
     )  # fmt: skip

@@ -215,7 +215,7 @@ def default_scenarios(
     ['2 % step', '10 % step', '50 % step', 'unsaturated step', 'saturating doublet', 'saturating hold', 'chirp']
 
     """
-    step, rest = find_step_limit(controller), controller.force_limit(0.01)
+    step, rest = find_step_limit(controller), controller.force_limit(0.0)
     band = controller.spec.bandwidth_hz
     small = 0.5 * step if step is not None else NOMINAL_EFFORT[controller.command.mechanics]
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
@@ -269,7 +269,7 @@ def step_scenarios(controller: Controller, plant: Plant, sets: Sequence[Paramete
     steps = [_step(controller, plant, name, force, tail) for name, force in sizes.items()]
     if stuck:
         if not plant.moves and _integrates(controller):
-            least = LEAST_STEP * (controller.force_limit(0.01) or 0.0)
+            least = LEAST_STEP * (controller.force_limit(0.0) or 0.0)
             small = {f"step of {share:g} times the friction": share * stuck for share in STUCK_STEPS}
             sizes |= {name: force for name, force in small.items() if force > least}
         sticking = (_step(controller, plant, name, force, tail) for name, force in sizes.items())
@@ -323,7 +323,7 @@ def _stick(controller: Controller, step: Scenario, friction: float) -> Scenario:
 
 def _size_steps(controller: Controller) -> dict[str, float]:
     """Return the forces (N) of steps by name."""
-    limit, rest = find_step_limit(controller), controller.force_limit(0.01)
+    limit, rest = find_step_limit(controller), controller.force_limit(0.0)
     if limit is not None and rest is not None:
         shares = {f"{100 * share:g} % step": share * rest for share in STEP_SHARES}
         return shares | {"unsaturated step": UNSATURATED * limit}
@@ -336,7 +336,7 @@ def _size_steps(controller: Controller) -> dict[str, float]:
 
 def list_left_out(controller: Controller, plant: Plant) -> tuple[str, ...]:
     """Return the names of the default scenarios that are left out because the controller has no current limit."""
-    if controller.spec.current_limit_A is not None:
+    if controller.command_limit is not None:
         return ()
     saturating = _doublet(1.0, 1.0, 1.0), _hold(1.0, 1.0, 1.0)
     return tuple(scenario.name for scenario in saturating if scenario.obstacle(plant, plant) is None)
@@ -354,13 +354,13 @@ def find_step_limit(controller: Controller) -> float | None:
         The controller does not know its design plant.
 
     """
-    limit = controller.spec.current_limit_A
+    limit = controller.command_limit
     plant, params = _require_design(controller)
     if limit is None:
         return None
     sliding = take_sliding(plant, params)
     if not controller.close(sliding, params).figures().stable:
-        return controller.force_limit(0.01)
+        return controller.force_limit(0.0)
     loop = SampledLoop(
         plant=sliding,
         law=runnable(controller, current_limit_A=math.inf),
@@ -369,7 +369,7 @@ def find_step_limit(controller: Controller) -> float | None:
     )
     tried = NOMINAL_EFFORT[controller.command.mechanics]
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
-    step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.01)
+    step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.0)
     assert held is not None
     return step if step > LEAST_STEP * held else held  # with play it may run away where the loop at rest is stable
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller
+from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
 from seaopt.formatting import format_number, format_table, html_text
 from seaopt.parameters import ParameterSet
@@ -19,7 +20,7 @@ from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
-from seaopt.units import LINEAR, Mechanics
+from seaopt.units import LINEAR, Mechanics, unit_after
 
 ChooseScenarios = Callable[[Controller, Plant, Sequence[ParameterSet]], Sequence[Scenario]]
 TOO_STEEP = "friction is smoothed over too small a speed to be simulated so; it is played as friction that sticks"
@@ -65,9 +66,16 @@ class Verification:
 
     @property
     def mechanics(self) -> Mechanics:
-        """Units and words of what the controller commands."""
+        """Units and words of the effort that the controller makes."""
+        return self.command.mechanics
+
+    @property
+    def command(self) -> Command:
+        """What the controller commands."""
         stage = next(iter(self.stages.values()), None)
-        return LINEAR if stage is None else stage.controller.command.mechanics
+        if stage is None:
+            return Command(input="I", unit="A", per_effort=1.0, effort_unit=LINEAR.unit)
+        return stage.controller.command
 
     def scenario(self, row: Outcome) -> Scenario:
         """Return the scenario of a row."""
@@ -145,7 +153,7 @@ class Verification:
             sizes = [self.scenario(row).phases[-1].force_N for row in rows]
             settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
             ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
-            unit = self.mechanics.unit
+            unit = self.command.reference_unit
             lines.append(f"steps on {plant}, {ends} {unit}: overshoot up to {100 * over:.3g} %{limited}, {settled}")
         return lines
 
@@ -261,7 +269,7 @@ def verify(
         possible = [scenario for scenario, obstacle in obstacles if obstacle is None]
         done: list[Scenario] = []
         if scenarios is None:
-            reason = "nothing saturates without current_limit_A"
+            reason = "nothing saturates without a limit of the command"
             skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
         skipped += [(scenario.name, name, obstacle) for scenario, obstacle in obstacles if obstacle is not None]
         simulated = wall = 0.0
@@ -347,7 +355,8 @@ def _format_worst(verification: Verification) -> list[str]:
     called = verification.mechanics
     unit = called.unit
     head = (
-        "plant", "scenario", "size", "", f"{called.word} {unit}", "overshoot", "settles s", "current A", "angle deg",
+        "plant", "scenario", "size", "", f"{called.word} {unit}", "overshoot", "settles s",
+        f"{verification.command.word}{unit_after(verification.command.unit)}", "angle deg",
         "energy J", "at limit", f"ends off {unit}", f"allowed {unit}", "draw",
     )  # fmt: skip
     cells: list[tuple[str, ...]] = []

@@ -69,7 +69,7 @@ def test_time_goes_on(thor):
     [
         ({"f_c": 500.0, "v_s": 1e-9}, SimulationError, "smooth the friction"),
         ({"measured": "F9"}, ControlError, "F9"),
-        ({"measured": "F2", "delay_samples": 0}, ControlError, "present current"),
+        ({"measured": "F2", "delay_samples": 0}, ControlError, "present command"),
         ({"phi": 0.3}, ControlError, "hold phi"),
         ({"law": 1e3}, SimulationError, "does not run away"),
     ],

@@ -43,7 +43,7 @@ def test_an_amplifier_that_rounds_stays_within_the_limit(controller, stand, thor
 
 
 def test_a_step_above_the_limit_leaves_no_current(controller, stand, thor):
-    with pytest.raises(SimulationError, match="every current but zero"):
+    with pytest.raises(SimulationError, match="every command but zero"):
         verify(controller, {"stand": stand}, thor, current_step_A=9.5)
 
 

@@ -135,7 +135,7 @@ def test_a_cycle_that_the_current_holds_fails_the_certificate(blind, stand, rubb
     assert friction["sector_stable"] is None
     cycle = friction["limit_cycles"][0]
     assert cycle["simulated"]["frequency_hz"] == pytest.approx(cycle["predicted"]["frequency_hz"], rel=0.1)
-    (row,) = [row for row in certificate.requirements if row.name == "limit_cycle_N"]
+    (row,) = [row for row in certificate.requirements if row.name == "limit_cycle"]
     assert not row.met and row.value == cycle["simulated"]["force_N"]
 
 

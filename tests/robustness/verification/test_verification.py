@@ -208,7 +208,7 @@ def test_what_a_missing_current_limit_leaves_out_is_said(controller, stand, swin
     assert [skipped[:2] for skipped in verification.skipped] == [(name, "stand") for name in list_left_out(free, stand)]
     assert list_left_out(free, stand) == ("saturating doublet", "saturating hold")
     assert list_left_out(free, swing) == ("saturating doublet",)
-    assert "saturating hold on stand, nothing saturates without current_limit_A" in repr(verification)
+    assert "saturating hold on stand, nothing saturates without a limit of the command" in repr(verification)
 
 
 def test_a_trace_is_printed_short(verification):

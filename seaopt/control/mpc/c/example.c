@@ -1,4 +1,4 @@
-/* Lines of reference and measurement (N) in; current (A), solved, iterations, the step's time (s) and status out. */
+/* Lines of reference and measurement in; command, solved, iterations, the step's time (s) and status out. */
 #include <stdio.h>
 #include <time.h>
 
@@ -10,9 +10,9 @@ int main(void) {
   force_mpc_reset(&controller);
   while (scanf("%lf %lf", &reference, &measurement) == 2) {
     clock_t began = clock();
-    double current = (double)force_mpc_step(&controller, (OSQPFloat)reference, (OSQPFloat)measurement);
+    double command = (double)force_mpc_step(&controller, (OSQPFloat)reference, (OSQPFloat)measurement);
     double took = (double)(clock() - began) / CLOCKS_PER_SEC;
-    printf("%.17g %d %d %.9f %d\n", current, controller.solved, controller.iterations, took, controller.status);
+    printf("%.17g %d %d %.9f %d\n", command, controller.solved, controller.iterations, took, controller.status);
   }
   return 0;
 }

@@ -47,7 +47,7 @@ static int solve(force_mpc *s, const OSQPFloat *error, OSQPFloat rest) {
   }
 #if ROWS > KNOTS
   for (int i = KNOTS; i < ROWS; i++) {
-    OSQPFloat start = i == KNOTS ? (s->current - rest) / mpc_slew : 0;
+    OSQPFloat start = i == KNOTS ? (s->command - rest) / mpc_slew : 0;
     low[i] = start - 1;
     high[i] = start + 1;
   }
@@ -98,34 +98,34 @@ OSQPFloat force_mpc_step(force_mpc *s, OSQPFloat reference, OSQPFloat measuremen
   s->status = used ? FORCE_MPC_OK : FORCE_MPC_HELD;
   if (used)
     for (int i = 0; i < STATES; i++) s->z[i] += mpc_gain[i] * innovation;
-  s->force = dot(mpc_C, s->z, STATES);
+  s->estimate = dot(mpc_C, s->z, STATES);
 
   memcpy(ahead, s->z, sizeof ahead);
   for (int i = 0; i < DELAY; i++) advance(ahead, s->past[i]);
   OSQPFloat drift = ahead[STATES - 1];
   OSQPFloat rest = clip(s->reference / mpc_static_gain - drift, -mpc_limit, mpc_limit);
   for (int i = 0; i < PLANT; i++) error[i] = ahead[i] - mpc_rest[i] * (rest + drift);
-  error[PLANT] = s->current - rest;
+  error[PLANT] = s->command - rest;
 
   s->solved = solve(s, error, rest);
 #if FORCE_MPC_GATE
   if (s->refused > FORCE_MPC_MAX_HELD) {
     s->status = FORCE_MPC_FAULT;
     s->solved = 0;
-    rest = s->current > mpc_ramp ? s->current - mpc_ramp : s->current < -mpc_ramp ? s->current + mpc_ramp : 0;
+    rest = s->command > mpc_ramp ? s->command - mpc_ramp : s->command < -mpc_ramp ? s->command + mpc_ramp : 0;
   }
 #endif
   if (!s->solved) {
     for (int i = 0; i < KNOTS; i++) s->plan[i] = rest;
     memset(s->dual, 0, sizeof s->dual);
   }
-  OSQPFloat current = s->plan[0];
+  OSQPFloat command = s->plan[0];
 #if ROWS > KNOTS
-  current = clip(current, s->current - mpc_slew, s->current + mpc_slew);
+  command = clip(command, s->command - mpc_slew, s->command + mpc_slew);
 #endif
-  s->current = clip(current, -mpc_limit, mpc_limit);
-  s->past[DELAY] = s->current;
+  s->command = clip(command, -mpc_limit, mpc_limit);
+  s->past[DELAY] = s->command;
   advance(s->z, s->past[0]);
   memmove(s->past, s->past + 1, DELAY * sizeof *s->past);
-  return s->current;
+  return s->command;
 }

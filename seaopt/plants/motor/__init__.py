@@ -1,0 +1,1 @@
+"""What drives an actuator: its motor, as it warms up."""

@@ -1,0 +1,386 @@
+r"""What the current heats: a winding in a case, for any plant whose motor is commanded a current inside.
+
+Two masses of heat, the winding on the case on the ambient air; their temperatures are counted from the ambient's, so
+that a motor at rest is at zero:
+
+.. math::
+    C_w \dot\vartheta_w &= R(\vartheta_w) I^2 - (\vartheta_w - \vartheta_c)/R_{wc} \\
+    C_c \dot\vartheta_c &= (\vartheta_w - \vartheta_c)/R_{wc} - \vartheta_c/R_{ca} \\
+    R(\vartheta_w) &= R \, (1 + \alpha (T_a + \vartheta_w - 25\,\mathrm{°C}))
+
+R is the winding's resistance at 25 °C, that of ``voltage_input`` and ``duty_input`` where one of them is there: the
+warm winding then takes less current. (Winding and case of data sheets; e.g. R. Valentine, Motor Control Electronics
+Handbook, McGraw-Hill 1998, ch. 3.)
+
+Without a current to first order, :math:`I^2 = 0`, heat and motion do not see each other where a plant is linearised at
+rest: `freeze_heat` is the plant with the winding at the ambient's temperature, for what looks at linear loops.
+
+At a constant current all is linear, :math:`\dot\vartheta = (A_0 + e_1 e_1^T R \alpha I^2/C_w)\vartheta + b I^2`: the
+figures of a `MotorRating` are exact. The matrix is similar to a symmetric one, so that its two eigenvalues are real:
+two time constants. Where the feedback of the resistance makes one positive the winding runs away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.errors import PlantError, require_number
+from seaopt.formatting import html_text
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.plants.memo import memo
+from seaopt.plants.plant import Plant, find_range
+from seaopt.plants.roles import Friction, PlantMaker, Winding
+from seaopt.records import record
+
+COPPER = 0.00393  # 1/K, at 20 to 25 degC
+REFERENCE_DEGC = 25.0
+PEAK_S = 10.0
+RISES = ("rise_winding", "rise_case")
+TEMPERATURES = ("T_winding", "T_case")
+RESISTANCE = Parameter(
+    name="R", value=1.0, unit="ohm", min=1e-9, description="winding resistance", plausible=(1e-3, 1e3)
+)
+PARAMETERS = (
+    RESISTANCE,
+    Parameter(name="alpha_cu", value=COPPER, unit="1/K", min=0.0, description="of the winding's resistance"),
+    Parameter(name="R_wc", value=1.0, unit="K/W", min=1e-9, description="from winding to case", plausible=(1e-3, 1e3)),
+    Parameter(name="R_ca", value=4.0, unit="K/W", min=1e-9, description="from case to air", plausible=(1e-3, 1e3)),
+    Parameter(name="C_w", value=20.0, unit="J/K", min=1e-9, description="heat of the winding", plausible=(1e-2, 1e5)),
+    Parameter(name="C_c", value=400.0, unit="J/K", min=1e-9, description="heat of the case", plausible=(1e-1, 1e6)),
+    Parameter(name="T_ambient", value=25.0, unit="degC", min=-273.15, description="of the air", plausible=(-60, 80)),
+    Parameter(name="T_max", value=125.0, unit="degC", min=-273.15, description="largest of the winding"),
+)
+
+
+def find_resistance(winding: Winding | None, x: Any, p: Any) -> Any:
+    """Return the resistance (ohm) of a winding at a state, as an expression; at the ambient temperature for x None."""
+    if winding is None:
+        return p.R
+    rise = 0.0 if x is None else getattr(x, winding.rises[0])
+    return p.R * (1.0 + p.alpha_cu * (p.T_ambient - REFERENCE_DEGC + rise))
+
+
+def _warm(current: Any, x: Any, p: Any) -> dict[str, Any]:
+    """Return how fast winding and case warm up."""
+    loss = p.R * (1.0 + p.alpha_cu * (p.T_ambient - REFERENCE_DEGC + x.rise_winding)) * current**2
+    to_case, to_air = (x.rise_winding - x.rise_case) / p.R_wc, x.rise_case / p.R_ca
+    return dict(zip(RISES, ((loss - to_case) / p.C_w, (to_case - to_air) / p.C_c), strict=True))
+
+
+def _read_temperatures(x: Any, p: Any) -> dict[str, Any]:
+    return dict(zip(TEMPERATURES, (p.T_ambient + x.rise_winding, p.T_ambient + x.rise_case), strict=True))
+
+
+def winding() -> Plant:
+    """Return the winding and its case alone, from the current I (A): for logs of temperatures, which take minutes.
+
+    Its parameters are those of the part "thermal", so that one fit may hold slow logs of this plant, and fast logs of
+    the whole actuator.
+
+    Returns
+    -------
+    Plant
+        Input I (A); outputs T_winding and T_case (degC).
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> list(so.plants.winding().outputs)
+    ['T_winding', 'T_case']
+
+    """
+    return Plant(
+        name="winding", states=dict.fromkeys(RISES, "K"), inputs={"I": "A"},
+        outputs=dict.fromkeys(TEMPERATURES, "degC"), parameters={item.name: item for item in PARAMETERS},
+        f=lambda t, x, u, p: _warm(u.I, x, p), h=lambda t, x, u, p: _read_temperatures(x, p),
+    )  # fmt: skip
+
+
+def add_heat(plant: Plant) -> Plant:
+    """Return a plant whose motor warms up.
+
+    Raises
+    ------
+    PlantError
+        The plant's actuation is no current, or it has one of the names.
+
+    """
+    actuation = plant.actuation
+    if actuation is None or plant.inputs[actuation.input] != "A":
+        raise PlantError(
+            f'plant {plant.name}: part "thermal" needs the current that heats the winding; give the role '
+            "actuation = Actuation(input, effort) with an input in A"
+        )
+    taken = {*plant.states, *plant.outputs, *plant.parameters, *plant.inputs}
+    clash = [name for name in (*RISES, *TEMPERATURES, *(item.name for item in PARAMETERS)) if name in taken]
+    if clash:
+        raise PlantError(f'plant {plant.name}: part "thermal" has "{clash[0]}", which the plant has, too')
+    source = actuation.input
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {**plant.f(t, x, u, p), **_warm(getattr(u, source), x, p)}
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {**plant.h(t, x, u, p), **_read_temperatures(x, p)}
+
+    return replace(
+        plant, name=f"{plant.name} with heat", f=f, h=h,
+        winding=Winding(rises=RISES, temperatures=TEMPERATURES, effort=actuation.effort, unit=actuation.unit),
+        states={**plant.states, **dict.fromkeys(RISES, "K")},
+        outputs={**plant.outputs, **dict.fromkeys(TEMPERATURES, "degC")},
+        parameters={**plant.parameters, **{item.name: item for item in PARAMETERS}},
+        ports=tuple(
+            port if port.held is None else replace(port, held=partial(_add_again, port.held)) for port in plant.ports
+        ),
+    )  # fmt: skip
+
+
+def _add_again(make: PlantMaker) -> Plant:
+    return add_heat(make())
+
+
+@memo
+def freeze_heat(plant: Plant) -> Plant:
+    """Return the plant with its winding at the ambient temperature, without heat among states and outputs."""
+    winding = plant.winding
+    if winding is None:
+        return plant
+    still = dict.fromkeys(winding.rises, 0.0)
+
+    def fill(x: Any) -> SimpleNamespace:
+        return SimpleNamespace(**{**vars(x), **still})
+
+    def freeze(one: Friction) -> Friction:
+        velocity, loads = one.velocity, one.loads
+        return replace(
+            one, velocity=lambda x, p: velocity(fill(x), p),
+            loads=None if loads is None else lambda x, u, p: loads(fill(x), u, p),
+        )  # fmt: skip
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {name: rate for name, rate in plant.f(t, fill(x), u, p).items() if name not in still}
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {name: value for name, value in plant.h(t, fill(x), u, p).items() if name not in winding.temperatures}
+
+    return replace(
+        plant, f=f, h=h, winding=None,
+        states={name: unit for name, unit in plant.states.items() if name not in still},
+        outputs={name: unit for name, unit in plant.outputs.items() if name not in winding.temperatures},
+        friction={name: freeze(one) for name, one in plant.friction.items()},
+        ports=tuple(
+            port if port.held is None else replace(port, held=partial(_freeze_again, port.held)) for port in plant.ports
+        ),
+    )  # fmt: skip
+
+
+def _freeze_again(make: PlantMaker) -> Plant:
+    return freeze_heat(make())
+
+
+@record
+class MotorRating:
+    """What a motor can do without overheating, in numbers: its network of heat, and the effort of an ampere.
+
+    Parameters
+    ----------
+    resistance : float
+        Of the winding at the ambient temperature, ohm.
+    slope : float
+        How it grows with the winding's temperature, ohm/K.
+    to_case, to_air : float
+        K/W.
+    winding, case : float
+        J/K.
+    ambient, hottest : float
+        degC.
+    per_ampere : float
+        The effort at the spring that an ampere makes.
+    unit : str
+        Of the effort.
+    largest_A : float or None
+        The largest current that can be commanded, where that is known.
+
+    """
+
+    resistance: float
+    slope: float
+    to_case: float
+    to_air: float
+    winding: float
+    case: float
+    ambient: float
+    hottest: float
+    per_ampere: float
+    unit: str
+    largest_A: float | None = None
+
+    @property
+    def allowed_rise(self) -> float:
+        """How far the winding may be above the ambient, K."""
+        return self.hottest - self.ambient
+
+    @property
+    def continuous_A(self) -> float:
+        """The current that holds the winding at its largest temperature for ever.
+
+        All of the loss flows through both resistances: R(T_max) I^2 (R_wc + R_ca) = T_max - T_ambient.
+        """
+        loss = self.allowed_rise / (self.to_case + self.to_air)
+        return self._limit(math.sqrt(loss / (self.resistance + self.slope * self.allowed_rise)))
+
+    @property
+    def continuous_effort(self) -> float:
+        """The effort of that current at the spring."""
+        return self.continuous_A * self.per_ampere
+
+    def peak_A(self, duration_s: float = PEAK_S, start: tuple[float, float] = (0.0, 0.0)) -> float:
+        """Return the constant current after which, from temperatures above the ambient, the winding is at its largest.
+
+        Parameters
+        ----------
+        duration_s : float
+            How long it flows.
+        start : (float, float)
+            Winding and case above the ambient, K; both cold if left out.
+
+        Raises
+        ------
+        PlantError
+            The duration is not positive, or the winding is too hot already.
+
+        """
+        if not 0.0 < require_number(duration_s, "duration_s", PlantError) < math.inf:
+            raise PlantError(f"duration_s = {duration_s:g} is not positive; give how long the peak lasts")
+
+        def excess(current_A: float) -> float:
+            return float(self.rises(current_A, duration_s, start)[0]) - self.allowed_rise
+
+        if not (start[0] < self.allowed_rise and excess(0.0) < 0.0):
+            raise PlantError(
+                f"start = ({start[0]:g}, {start[1]:g}) K above the ambient: the winding is at {self.hottest:g} degC or "
+                "above without a current; let it cool"
+            )
+        from scipy.optimize import brentq  # deferred: it takes long to import
+
+        high = max(self.continuous_A, 1e-6)
+        while excess(high) < 0.0:
+            high *= 2.0
+        root: Any = brentq(excess, 0.0, high, xtol=1e-12 * high)
+        return self._limit(float(root))
+
+    def peak_effort(self, duration_s: float = PEAK_S, start: tuple[float, float] = (0.0, 0.0)) -> float:
+        """Return the effort of that current at the spring."""
+        return self.peak_A(duration_s, start) * self.per_ampere
+
+    def rises(
+        self, current_A: float, duration_s: float, start: tuple[float, float] = (0.0, 0.0)
+    ) -> Float[np.ndarray, " 2"]:
+        """Return how far winding and case are above the ambient (K) after a constant current."""
+        heating = np.array([self.resistance * current_A**2 / self.winding, 0.0])
+        rates, modes = np.linalg.eig(self.matrix(current_A))  # two different ones: the module's docstring
+        with np.errstate(over="ignore", invalid="ignore"):  # a winding that runs away
+            grown, collected = np.exp(rates * duration_s), np.expm1(rates * duration_s) / rates
+            return modes @ (grown * np.linalg.solve(modes, start) + collected * np.linalg.solve(modes, heating))
+
+    def matrix(self, current_A: float = 0.0) -> Float[np.ndarray, "2 2"]:
+        """Return what heat does by itself, 1/s, with what the growing resistance adds at a constant current."""
+        flow = 1.0 / self.to_case
+        fed_back = self.slope * current_A**2
+        return np.array([
+            [(fed_back - flow) / self.winding, flow / self.winding],
+            [flow / self.case, -(flow + 1.0 / self.to_air) / self.case],
+        ])  # fmt: skip
+
+    def time_constants_s(self, current_A: float = 0.0) -> tuple[float, float]:
+        """Return the two time constants, the shorter first; infinite where the winding runs away."""
+        rates = np.sort(np.linalg.eigvals(self.matrix(current_A)).real)
+        short, long = (-1.0 / rate if rate < 0.0 else math.inf for rate in rates)
+        return short, long
+
+    def describe(self) -> list[str]:
+        """Return the continuous and the peak effort, a line each, with the currents that make them."""
+        fast, slow = self.time_constants_s()
+        return [
+            f"continuous {self.continuous_effort:.4g} {self.unit} ({self.continuous_A:.4g} A) at a winding of "
+            f"{self.hottest:g} degC in {self.ambient:g} degC",
+            f"peak {self.peak_effort():.4g} {self.unit} ({self.peak_A():.4g} A) for {PEAK_S:g} s from cold; time "
+            f"constants {fast:.3g} and {slow:.3g} s",
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what goes into controller.json: the network, and what it allows."""
+        return asdict(self) | {
+            "continuous_A": self.continuous_A, "continuous_effort": self.continuous_effort,
+            "peak_s": PEAK_S, "peak_A": self.peak_A(), "peak_effort": self.peak_effort(),
+            "time_constants_s": list(self.time_constants_s()),
+        }  # fmt: skip
+
+    def _limit(self, current_A: float) -> float:
+        return current_A if self.largest_A is None else min(current_A, self.largest_A)
+
+    def __repr__(self) -> str:
+        return "MotorRating: " + "\n  ".join(self.describe())
+
+    _repr_html_ = html_text
+
+
+def rate_motor(plant: Plant, params: ParameterSet) -> MotorRating:
+    """Return the continuous and peak currents and efforts of a motor, by the part "thermal".
+
+    Parameters
+    ----------
+    plant : Plant
+        With that part.
+    params : ParameterSet
+        Its parameters, or those of a fit.
+
+    Raises
+    ------
+    PlantError
+        The plant has no such part, or its largest temperature is not above the ambient's.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> plant = so.plants.rotary(link="locked", parts=["thermal"])
+    >>> rating = rate_motor(plant, plant.defaults)
+    >>> print(f"{rating.continuous_A:.3f} A, {rating.peak_A(10.0):.3f} A for 10 s")
+    3.789 A, 14.446 A for 10 s
+
+    """
+    winding = plant.winding
+    if winding is None:
+        raise PlantError(f'plant {plant.name} has no winding that warms up; give it parts = ["thermal"]')
+    values = plant.complete(params)
+    p = values.by_attribute
+    if not p.T_max > p.T_ambient:
+        raise PlantError(f"T_max = {p.T_max:g} degC is not above T_ambient = {p.T_ambient:g} degC; raise the one")
+    resistance = float(find_resistance(winding, None, p))
+    if not resistance > 0.0:
+        raise PlantError(f"R = {p.R:g} ohm at 25 degC is {resistance:g} ohm at T_ambient = {p.T_ambient:g} degC; check")
+    commands_current = plant.actuation is not None and plant.inputs[plant.actuation.input] == "A"
+    return MotorRating(
+        resistance=resistance, slope=p.R * p.alpha_cu, to_case=p.R_wc, to_air=p.R_ca, winding=p.C_w, case=p.C_c,
+        ambient=p.T_ambient, hottest=p.T_max, per_ampere=float(winding.effort(p)), unit=winding.unit,
+        largest_A=find_range(plant, values) if commands_current else None,
+    )  # fmt: skip
+
+
+def find_resistance_range(plant: Plant, params: ParameterSet) -> dict[str, tuple[float, float]]:
+    """Return the range of the resistance's parameter that a loop meets between the ambient temperature and T_max.
+
+    It is empty where the winding does not warm up, or a current is commanded, which it does not change.
+    """
+    if plant.winding is None or plant.actuation is None or plant.inputs[plant.actuation.input] == "A":
+        return {}
+    rating, p = rate_motor(plant, params), plant.complete(params).by_attribute
+    hot = rating.resistance + rating.slope * rating.allowed_rise
+    return {RESISTANCE.name: (float(p.R), float(p.R * hot / rating.resistance))}
