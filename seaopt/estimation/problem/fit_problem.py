@@ -161,6 +161,12 @@ class FitProblem:
         plays = {spring.play for spring in springs if spring is not None}
         return any(name in plays for name in self.unknowns.names[: self.unknowns.shared])
 
+    def find_stopped(self) -> list[int]:
+        """Return the unknowns that are speeds at a start which friction that sticks can stop: those with a prior."""
+        unknowns = self.unknowns
+        pairs = enumerate(zip(unknowns.names, unknowns.prior_std, strict=True))
+        return [i for i, (name, std) in pairs if i >= unknowns.shared and ".initial" in name and np.isfinite(std)]
+
     def take_step(self, step: TrustRegionStep[Evaluation]) -> Evaluation:
         """Return the evaluation at the end of a step."""
         return self.evaluate(step.end)

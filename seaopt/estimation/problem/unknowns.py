@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -15,10 +17,12 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.plant import fill_vector
 from seaopt.records import record
-from seaopt.simulation import Model, depends_on_time, make_model
+from seaopt.simulation import Clock, Model, depends_on_time, linearise, make_model, transition
+from seaopt.simulation.simulate import input_samples
 from seaopt.units import factor
 
 REACH = 1e9  # times its first value, or what is plausible: a parameter without a bound of its own is held there
+REACHED_SAMPLES = 256  # within which an input brings a joint to speed
 NOISE_START, NOISE_PRIOR = math.log(1e-2), 3.0  # of the logarithm of process noise over the state's size
 
 
@@ -210,7 +214,7 @@ def _make_slots(
     return Slots(
         delay=delay, gain=gain, offset=_add_offsets(builder, experiment, level),
         drift=_add_drifts(builder, experiment) if level else no_drift,
-        initial=_add_initial(builder, experiment, model.linear, forgotten),
+        initial=_add_initial(builder, experiment, model, forgotten),
         noise=_add_noise(builder, experiment) if noise else (),
     )  # fmt: skip
 
@@ -238,20 +242,58 @@ def _add_drifts(builder: _Builder, experiment: Experiment) -> tuple[tuple[Slot, 
 
 
 def _add_initial(
-    builder: _Builder, experiment: Experiment, linear: bool, forgotten: bool
+    builder: _Builder, experiment: Experiment, model: Model, forgotten: bool
 ) -> tuple[tuple[Slot, ...], ...]:
-    """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones."""
+    """A known initial state is that of each stretch of the log; shots within a stretch start from unknown ones.
+
+    Friction that sticks soon stops a joint whatever its speed was: where nothing else tells it, it started at rest.
+    """
     plant, initial = experiment.plant, experiment.initial_state
     known = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)
     starts = {stretch.start for stretch in experiment.stretches}
     rows: list[tuple[Slot, ...]] = []
+    stopped = _scale_stopped_speeds(builder, experiment, model)
     for number, piece in enumerate(experiment.pieces):
         if forgotten or (initial != "estimate" and piece.start in starts):
             rows.append(tuple(Slot(value=float(v)) for v in known))
             continue
         label = f"{experiment.name}.initial{number + 1 if number else ''}"
-        rows.append(tuple(_add_zero(builder, f"{label}.{state}", unit, linear) for state, unit in plant.states.items()))
+        unknown = [
+            Parameter(name=f"{label}.{state}", value=0.0, unit=unit, free=True, prior_std=stopped.get(state))
+            for state, unit in plant.states.items()
+        ]
+        rows.append(tuple(builder.add(entry, model.linear) for entry in unknown))
     return tuple(rows)
+
+
+def _scale_stopped_speeds(builder: _Builder, experiment: Experiment, model: Model) -> dict[str, float]:
+    """Return how fast the states that sticking friction stops could move without it, where anything drives them.
+
+    That is what the log's largest input makes of the linearised plant within some hundred samples, at the first values
+    of what is free: a speed that no joint has at its start, and that holds one which no sample shows.
+    """
+    plant = experiment.plant
+    if not model.sticks:
+        return {}
+    space = [
+        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
+        for names, symbols in ((plant.states, plant.x), (plant.parameters, plant.p))
+    ]
+    velocities = ca.vertcat(*(one.velocity(*space) for one in plant.friction.values() if one.jump is not None))
+    values = {entry.name: entry.value for entry in builder.entries}
+    own = experiment.list_own()
+    theta = np.array([values[own[name].name if name in own else name] for name in model.free])
+    step = transition(linearise(replace(model, sticks=False, memory={})), theta, Clock(period=experiment.log.period))[0]
+    nx, largest = model.nx, np.array([np.max(np.abs(samples)) for samples in input_samples(plant, experiment.log)])
+    reached, moved = np.zeros(nx), step[:nx, nx : nx + largest.size]
+    for _ in range(REACHED_SAMPLES):
+        reached += np.abs(moved) @ largest
+        moved = step[:nx, :nx] @ moved
+    return {
+        state: float(size)
+        for state, size, symbol in zip(plant.states, reached, ca.vertsplit(plant.x), strict=True)
+        if ca.depends_on(velocities, symbol) and 0.0 < size < np.inf
+    }
 
 
 def _forgets_start(

@@ -53,8 +53,24 @@ class Solved:
 
 
 def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
-    """Minimise; estimate the unknown sigmas and refine the step until neither changes."""
-    return sharpen(problem, start, lambda stage, here: _settle(stage, here, max_iterations, callback))
+    """Minimise; estimate the unknown sigmas and refine the step until neither changes.
+
+    What friction that sticks soon stops is at rest at first: a search that is far off would throw the joint, and end
+    where it swings in place of what drives it.
+    """
+
+    def solve(stage: FitProblem, here: Evaluation) -> Solved:
+        return _settle(stage, here, max_iterations, callback)
+
+    places, unknowns = problem.find_stopped(), problem.unknowns
+    if not places or np.any(start.z[places] != 0.0):
+        return sharpen(problem, start, solve)
+    low, high = unknowns.low.copy(), unknowns.high.copy()
+    low[places] = high[places] = 0.0
+    resting = sharpen(replace(problem, unknowns=replace(unknowns, low=low, high=high)), start, solve)
+    solved = sharpen(replace(resting.problem, unknowns=unknowns), resting.solution.evaluation, solve)
+    iterations = resting.solution.iterations + solved.solution.iterations
+    return replace(solved, solution=replace(solved.solution, iterations=iterations))
 
 
 def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem, Evaluation], Solved]) -> Solved:

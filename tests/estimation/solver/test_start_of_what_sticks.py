@@ -1,0 +1,58 @@
+"""The unknown initial speed of a joint that sticks: at rest where the log does not tell, found where it does.
+
+The log is of a time-stepping simulation written here (Moreau's, in which friction is what stops the rotor within a
+step, as far as its level reaches), of a knee with its link held.
+"""
+
+import numpy as np
+import pytest
+
+import seaopt as so
+
+PERIOD, N, PARTS = 1e-3, 4000, 20
+TRUTH = {"J_m": 1e-4, "k_s": 300.0, "f_c": 0.03, "b_r": 1e-4}
+GEAR, K_TAU, C_S = 50.0, 0.05, 0.3
+
+
+def simulate_rotor(current, speed):
+    h, angle, out = PERIOD / PARTS, 0.0, np.empty((N, 2))
+    for k in range(N):
+        out[k] = angle, TRUTH["k_s"] * angle / GEAR + C_S * speed / GEAR
+        for _ in range(PARTS):
+            torque = (TRUTH["k_s"] * angle + C_S * speed) / GEAR
+            free = speed + h / TRUTH["J_m"] * (K_TAU * current[k] - torque / GEAR - TRUTH["b_r"] * speed)
+            most = h / TRUTH["J_m"] * TRUTH["f_c"]
+            before, speed = speed, np.sign(free) * max(abs(free) - most, 0.0)
+            angle += 0.5 * h * (before + speed)
+    return out
+
+
+def fit_start(seed, output, speed, quiet_s):
+    rng, t = np.random.default_rng(seed), np.arange(N) * PERIOD
+    lines = (0.7, 1.9, 4.1, 7.3, 12.1, 20.0)
+    current = (t > quiet_s) * sum(0.6 * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in lines)
+    angle, torque = simulate_rotor(current, speed).T
+    reading, noise = (angle, 0.01) if output == "theta_m" else (torque, 0.05)
+    log = so.Log.from_arrays(time=t, I=current, **{output: reading + noise * rng.normal(size=N)})
+    plant = so.plants.let_stick(so.plants.rotary(link="locked"))
+    start = plant.defaults.update(c_s=C_S, J_m=2e-4, k_s=200.0, f_c=0.01, b_r=3e-4).free(*TRUTH)
+    return so.fit([so.Experiment(plant=plant, log=log, outputs=(output,))], start, diagnostics=False)
+
+
+@pytest.mark.parametrize(("seed", "output"), [(0, "theta_m"), (1, "theta_m"), (2, "tau_s")])
+def test_a_joint_that_is_held_starts_at_rest(seed, output):
+    """With its initial speed looked for at once, three of eight such fits ended at 20 rad/s, ten stds off in the rest."""
+    fit = fit_start(seed, output, speed=0.0, quiet_s=0.4)
+    assert fit.status == "converged"
+    (state,) = fit.nuisance["experiment"].initial_state
+    assert abs(state["thetad_m"]) < 5.0
+    for name, true in TRUTH.items():
+        assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
+
+
+def test_one_that_is_thrown_is_found_to_be():
+    fit = fit_start(3, "tau_s", speed=8.0, quiet_s=0.0)
+    (state,) = fit.nuisance["experiment"].initial_state
+    assert state["thetad_m"] == pytest.approx(8.0, abs=0.5)
+    for name, true in TRUTH.items():
+        assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
