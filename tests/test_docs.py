@@ -26,6 +26,12 @@ def blocks(name, language):
     return re.findall(rf"```{language}\n(.*?)```", (DOCS / name).read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
+def test_the_speed_by_difference_of_the_docs_is_declared():
+    space = {}
+    exec(blocks("plants.md", "python")[0], space)
+    assert space["bench"].outputs == ("speed",)
+
+
 def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log):
     (text,) = blocks("problem_file.md", "toml")
     path = tmp_path / "problem.toml"

@@ -10,6 +10,7 @@ from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_spa
 from seaopt.plants.published import thor
 from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring, Winding
 from seaopt.plants.rotary import rotary
+from seaopt.plants.sensors.difference import Difference
 from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "PARTS",
     "Actuation",
     "CompletedParameters",
+    "Difference",
     "Friction",
     "Mode",
     "Modes",

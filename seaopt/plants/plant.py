@@ -23,7 +23,7 @@ from seaopt.formatting import html_text, join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.equations.stored_equations import store_plant
 from seaopt.plants.memo import memo
-from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sensing, SeriesSpring, Winding
+from seaopt.plants.roles import Actuation, Expression, Friction, Mode, Port, Sampling, Sensing, SeriesSpring, Winding
 from seaopt.records import record
 from seaopt.units import DIMENSIONLESS, factor, si_unit, unit_after
 
@@ -68,6 +68,8 @@ class Plant:
     sticks : bool
         Simulate and fit friction that declares its `jump` as it is, a joint at rest standing still; else as its
         smoothed curve.
+    sampling : Sampling, optional
+        States that hold what was sampled; f is zero for them.
 
     Raises
     ------
@@ -111,6 +113,7 @@ class Plant:
     mode: Mode | None = field(default=None, repr=False)
     winding: Winding | None = field(default=None, repr=False)
     sticks: bool = False
+    sampling: Sampling | None = field(default=None, repr=False)
     t: Any = field(init=False, repr=False)
     x: Any = field(init=False, repr=False)
     u: Any = field(init=False, repr=False)
@@ -410,7 +413,16 @@ def state_space(
     x: Mapping[str, float] | None = None,
     u: Mapping[str, float] | None = None,
 ) -> Matrices:
-    """Return (A, B, C, D) of a plant at an operating point, as `Plant.linearize` but plain arrays."""
+    """Return (A, B, C, D) of a plant at an operating point, as `Plant.linearize` but plain arrays.
+
+    Raises
+    ------
+    PlantError
+        The plant holds samples.
+
+    """
+    if plant.sampling is not None:
+        raise PlantError(f"plant {plant.name} holds samples, which no linear system in time does; give it without")
     at = (fill_vector("state", plant.states, x), fill_vector("input", plant.inputs, u), plant.complete(params).vector)
     a, b, c, d = (np.array(block) for block in jacobians(plant)(*at))
     return a, b, c, d
@@ -630,7 +642,10 @@ def _check_structure(plant: Plant) -> None:
     for index, name in enumerate(plant.outputs):
         if not ca.depends_on(plant.output[index], moved_by):
             raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
+    held = plant.sampling.sets if plant.sampling is not None else {}
     for index, name in enumerate(plant.states):
+        if name in held:
+            continue
         others = ca.vertcat(plant.t, *(x for k, x in enumerate(ca.vertsplit(plant.x)) if k != index), plant.u)
         free = not plant.inputs  # a plant without inputs may decay by itself
         if not ca.depends_on(plant.dynamics[index], moved_by if free else others):

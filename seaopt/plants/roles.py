@@ -7,11 +7,14 @@ inputs, outputs and parameters, whose units the plant knows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from seaopt.records import record
 from seaopt.units import mechanics_of
@@ -297,6 +300,28 @@ class Winding:
     temperatures: tuple[str, str]
     effort: Expression
     unit: str
+
+
+@record(eq=False)
+class Sampling:
+    """States that stand still between samples, and are set at each: memories of a device that samples.
+
+    Parameters
+    ----------
+    period_s : float
+        Between samples; such a plant is simulated with this period alone.
+    sets : mapping of state to mapping of state to float
+        What each becomes after a sample: a combination of states as they were at the sample.
+
+    """
+
+    period_s: float
+    sets: Mapping[str, Mapping[str, float]]
+
+    def matrix(self, states: Sequence[str]) -> tuple[list[int], Float[np.ndarray, "m nx"]]:
+        """Return which states are set, and their combinations of all."""
+        rows = [list(states).index(name) for name in self.sets]
+        return rows, np.array([[weights.get(name, 0.0) for name in states] for weights in self.sets.values()])
 
 
 @record

@@ -30,7 +30,7 @@ from seaopt.files import check_regular
 from seaopt.formatting import join_words
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Plant, known_parameters, plant_of_kind
+from seaopt.plants import Difference, Plant, known_parameters, plant_of_kind
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
 from seaopt.problem.references import check_references, range_remarks
@@ -50,6 +50,7 @@ from seaopt.problem.schema import (
 )
 from seaopt.records import record
 from seaopt.robustness import place_value
+from seaopt.signals import Signal
 from seaopt.units import ROTARY, factor, same_dimension, unit_after
 
 MAX_BYTES = 4 << 20
@@ -220,7 +221,7 @@ class Problem:
         plant = self.plants[table.plant]
         if table.virtual:
             own = {name: given for name, given in table.parameters.items() if isinstance(given, float | int)}
-            log = self._simulate_bench(plant, table.virtual, own)
+            log = _compute_speeds(self._simulate_bench(plant, table.virtual, own), table)
         else:
             log = self._read_log(table)
         if table.slice_s is not None:
@@ -232,11 +233,13 @@ class Problem:
                 sigma[name] = column.sigma
         measured = tuple(table.outputs) if not table.virtual else _virtual_outputs(plant, table.virtual)
         own = {name: self._make_own(plant, table, name, log) for name in table.parameters}
+        differences = {name: Difference(**one.model_dump()) for name, one in table.differences.items()}
         return Experiment(
             plant=plant, log=log, name=table.name, outputs=measured, sigma=sigma, initial_state=table.initial_state,
             offset=table.offset, gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
             delay_s=_make_unknown("delay_s", "s", table.delay_s), hold=table.hold, gaps=table.gaps,
             drift=table.drift, shots=table.shots, saturation=table.saturation, mask=table.mask, parameters=own,
+            differences=differences,
         )  # fmt: skip
 
     def _make_own(self, plant: Plant, table: ExperimentTable, name: str, log: Log) -> float | Parameter:
@@ -301,9 +304,28 @@ class Problem:
         )  # fmt: skip
 
 
+def _compute_speeds(log: Log, table: ExperimentTable) -> Log:
+    """Return a virtual log with the speeds that a device computes from the positions as they were read."""
+    speeds: dict[str, Signal] = {}
+    for name, one in table.differences.items():
+        if one.of not in log.signals:
+            raise ProblemError(
+                f'experiment {table.name}: differences: {name} is of "{one.of}"; {suggestion(one.of, log.signals)}'
+            )
+        values = Difference(**one.model_dump()).read(log[one.of], log.period)
+        speeds[name] = Signal(name=name, values=values, unit=f"{log.signals[one.of].unit}/s")
+    return replace(log, signals={**log.signals, **speeds}) if speeds else log
+
+
 def _resample(log: Log, table: ExperimentTable) -> Log:
     """Return the log on the uniform clock that the file asks for; as it is, if it asks for none."""
     resample = table.resample
+    anew = table.decimate > 1 or (resample is not None and resample != "restamp" and resample.rule != "restamp")
+    if table.differences and anew:
+        raise ProblemError(
+            f"experiment {table.name}: {next(iter(table.differences))} is a difference over samples as they were "
+            "taken, which decimate and resample do not keep; leave them out, or fit the position"
+        )
     if resample is None:
         return log
     if resample == "restamp":

@@ -120,7 +120,7 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
         check_inside(place, experiment)
     for kind, names, known in (
         ("inputs", experiment.inputs, plant.inputs),
-        ("outputs", experiment.outputs, plant.outputs),
+        ("outputs", experiment.outputs, {**plant.outputs, **experiment.differences}),
     ):
         for name in names:
             if name not in known:

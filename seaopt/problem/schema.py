@@ -240,6 +240,14 @@ class CounterTable(_Strict):
     samples_per_count: Annotated[Whole, Field(ge=1)] = 1
 
 
+class DifferenceTable(_Strict):
+    """A measured speed that a device computed from a position, sample by sample."""
+
+    of: str
+    samples: Annotated[Whole, Field(ge=1, le=100)] = 1
+    lag_hz: Annotated[Number, Field(gt=0)] | None = None
+
+
 class UnknownTable(_Strict):
     """A value of an experiment that may be estimated."""
 
@@ -321,6 +329,7 @@ class ExperimentTable(_Strict):
     rate_hz: Annotated[Number, Field(gt=0, le=1e9)] | None = None
     inputs: dict[str, Header | ColumnTable] = {}
     outputs: dict[str, Header | ColumnTable] = {}
+    differences: dict[str, DifferenceTable] = {}
     align: AlignTable | None = None
     window_s: tuple[Number, Number] | None = None
     counter: CounterTable | None = None

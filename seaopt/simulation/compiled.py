@@ -62,13 +62,13 @@ def kernel_source(model: Model, layout: Layout, delayed: int) -> str:
         "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": layout.shared, "NQ": model.np, "ND": layout.drift_terms,
         "LINEAR": int(model.linear), "STEPPED": int(model.sticks), "CORRECT": int(layout.corrected), "DELAYED": delayed,
     }  # fmt: skip
-    generated = ""
+    generated = _write_sampling(model)
     if model.linear:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     elif model.sticks:
         step, output = step_function(model), output_function(model)
         plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]
-        generated = generate_code(step, output, *plain)
+        generated += generate_code(step, output, *plain)
     else:
         rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
@@ -77,8 +77,21 @@ def kernel_source(model: Model, layout: Layout, delayed: int) -> str:
             _chain_code("rate", rates.rate_pattern, model.nx),
             _chain_code("output", rates.output_pattern, model.ny),
         )
-        generated = "\n".join((generate_code(rates.rate, rates.output), *chains))
+        generated += "\n".join((generate_code(rates.rate, rates.output), *chains))
     return "\n".join((define_constants(constants), _text("layout.h"), generated, _text("pass.c")))
+
+
+def _write_sampling(model: Model) -> str:
+    """Return the states that are set at samples and their combinations, as C; nothing where there are none."""
+    sampling = model.plant.sampling
+    if sampling is None or model.linear:
+        return ""
+    rows, weights = sampling.matrix(tuple(model.plant.states))
+    table = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in weights.tolist())
+    return (
+        f"#define SAMPLED {len(rows)}\nstatic const int sampled_state[SAMPLED] = {{{', '.join(map(str, rows))}}};\n"
+        f"static const double sampled_from[SAMPLED][NX] = {{{table}}};\n"
+    )
 
 
 def _drop_derivatives(function: ca.Function, name: str) -> ca.Function:

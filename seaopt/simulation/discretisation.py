@@ -21,6 +21,7 @@ from seaopt.records import record
 from seaopt.simulation.model import Model
 
 Hold = Literal["zero", "first"]
+SAME_PERIOD = 1e-6
 REACH, DEGREE = 0.125, 10  # 0.125^11 / 11! = 3e-18
 
 
@@ -106,6 +107,23 @@ def expm_with_derivatives(
     return e[0, :m, :m], e[1:, :m, m:]
 
 
+def check_period(model: Model, clock: Clock) -> None:
+    """Refuse a plant that holds samples of another period.
+
+    Raises
+    ------
+    SimulationError
+        It does.
+
+    """
+    sampling = model.plant.sampling
+    if sampling is not None and abs(sampling.period_s / clock.period - 1.0) > SAME_PERIOD:
+        raise SimulationError(
+            f"plant {model.plant.name} samples every {sampling.period_s:g} s, and is simulated every {clock.period:g} "
+            "s; make the difference anew for this period"
+        )
+
+
 @np.errstate(all="ignore")
 def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> Float[np.ndarray, "..."]:
     """Return the sampled model and its derivatives.
@@ -116,7 +134,13 @@ def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> F
         First x+ = F w over y = H w with w = [x, u_a, u_b, ..., 1], an input for each of ``clock.lags``; then the
         derivatives with respect to theta, and with respect to the delay where ``clock.delay_free``.
 
+    Raises
+    ------
+    SimulationError
+        The plant samples with another period.
+
     """
+    check_period(model, clock)
     nx, nu = model.nx, model.nu
     g, dg = model.matrices(theta)
     generator = _augment(np.concatenate([g[None, :nx], dg[:, :nx]]), nu, joined=clock.hold == "first")
@@ -128,6 +152,7 @@ def transition(model: Model, theta: Float[np.ndarray, " np"], clock: Clock) -> F
         chained[1:] += step[0, :, :nx] @ first[1:]
         chained[:, :, nx:] += step[:, :, nx:]
         step = chained
+    model.set_samples(step)
     blocks = np.concatenate([step, np.zeros((len(step), model.ny, step.shape[2]))], axis=1)
     # At the sample itself the older input still acts, if for any time at all.
     line = (older if clock.fraction_s > 0.0 or (clock.split and clock.hold == "first") else newer)[:, nx : nx + nu]

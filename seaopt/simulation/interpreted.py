@@ -241,7 +241,11 @@ def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
                 forced.append(ca.mtimes(b[:, model.np :], along))
             s = ca.mtimes(a, s) + ca.horzcat(*forced, rest)
             t = t + h
-    return ca.horzcat(x, s)
+    after, sampling = ca.horzcat(x, s), model.plant.sampling
+    if sampling is not None:
+        rows, weights = sampling.matrix(tuple(model.plant.states))
+        after[rows, :] = ca.mtimes(ca.DM(weights), z)
+    return after
 
 
 def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:

@@ -98,6 +98,14 @@ class Model:
         """Return the values of `p`."""
         return np.concatenate([theta, self.constants])
 
+    def set_samples(self, step: Float[np.ndarray, "... nx w"]) -> None:
+        """Put what a device samples into a linear step x+ = step [x; ...] and its derivatives, which come behind it."""
+        if self.plant.sampling is None:
+            return
+        rows, weights = self.plant.sampling.matrix(tuple(self.plant.states))
+        step[..., rows, :] = 0.0
+        (step[0] if step.ndim == 3 else step)[rows, : self.nx] = weights
+
     def matrices(self, theta: Float[np.ndarray, " np"]) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
         """Return the affine model [f; h] = G [x; u; 1] and its derivatives, for a linear model.
 

@@ -249,6 +249,18 @@ INLINE void output(hot *q, double t, const double *u, const double *du, const do
 }
 #endif
 
+#ifdef SAMPLED
+/* A device that samples sets its memories: from the state as it was at the sample. */
+INLINE void set_samples(hot *q, const double (*restrict before)[NJP], int wide) {
+    for (int s = 0; s < SAMPLED; s++)
+        for (int j = 0; j < wide; j++) {
+            vec sum = {0.0, 0.0, 0.0, 0.0};
+            for (int i = 0; i < NX; i++) sum += sampled_from[s][i] * ((const vec *)before[i])[j];
+            ((vec *)q->z[sampled_state[s]])[j] = sum;
+        }
+}
+#endif
+
 INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP], int wide) {
     const double *m = a->model, t = a->t0 + k * m[1];
     double u[NU], du[NU], older[NU];
@@ -269,6 +281,10 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
     const long steps = (long)m[0];
     const int foh = m[3] > 0.5;
     double t = a->t0 + k * m[1], ua[NU], ub[NU], uc[NU];
+#ifdef SAMPLED
+    hot_columns before;
+    memcpy(before, q->z, sizeof before);
+#endif
     at(a, k, a->lag_a, ua);
     at(a, k, a->lag_b, ub);
     at(a, k, a->lag_c, uc);
@@ -290,6 +306,9 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
             t += h;
         }
     }
+#ifdef SAMPLED
+    set_samples(q, (const double (*)[NJP])before, wide);
+#endif
 }
 #endif
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.simulation.compiled import Program
+from seaopt.simulation.discretisation import check_period
 from seaopt.simulation.interpreted import interpreted_passes
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Pass, Point, Segment, Weights
@@ -53,6 +54,7 @@ def run_passes(
         Numbers that are not finite where the simulation left what floats can hold.
 
     """
+    check_period(model, point.clock)
     chosen = weights if weights is not None else Weights.plain(model.ny)
     rows = edges if edges is not None else np.array([0, segment.n])
     program = Program.make(model, segment, point, chosen)

@@ -664,7 +664,11 @@ def _share_parameter(name: str, one: Plant, other: Plant) -> bool:
 
 def _change_plant(experiments: tuple[Experiment, ...], params: ParameterSet, plant: Plant) -> Iterator[_Candidate]:
     """Yield another plant in place of the experiments' own."""
-    if any(e.plant.name == plant.name or not set(e.outputs) <= set(plant.outputs) for e in experiments):
+    if any(e.plant.name == plant.name for e in experiments):
+        return
+    if any(not set(e.outputs) - set(e.differences) <= set(plant.outputs) for e in experiments):
+        return
+    if any(difference.of not in plant.states for e in experiments for difference in e.differences.values()):
         return
     if any(not set(plant.inputs) <= {*e.log.signals, *plant.optional_inputs} for e in experiments):
         return

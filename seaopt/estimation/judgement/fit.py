@@ -95,6 +95,7 @@ def fit(
     if not 0.0 <= holdout <= 0.9:
         raise EstimationError(f"holdout = {holdout:g} is not a fraction; give 0 (none) to 0.9")
     check_choices(chosen, loss, band_hz)
+    _check_differences(named, chosen)
     _check_motion(named)
     problem = pose_problem(
         named, complete_parameters(named, params), loss=loss if loss is not None else Squares(), band_hz=band_hz,
@@ -123,6 +124,17 @@ def check_choices(method: Any, loss: Any, band_hz: Any) -> None:
             f"band_hz = {band_hz!r} does not go with {type(method).__name__}, whose filter models the noise; leave it "
             "out"
         )
+
+
+def _check_differences(experiments: tuple[Experiment, ...], method: Method) -> None:
+    """Refuse speeds by difference where the noise is taken for white: a difference has each position's noise twice."""
+    for experiment in experiments if method.models_noise else ():
+        if experiment.differences:
+            raise EstimationError(
+                f"experiment {experiment.name}: differences do not go with {type(method).__name__}(), whose filter "
+                "takes each reading's noise for independent of the last; use OutputError() or MultipleShooting(), or "
+                "fit the position itself"
+            )
 
 
 def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:

@@ -17,6 +17,7 @@ from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.sensors.difference import Difference, add_difference
 from seaopt.records import record
 from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
@@ -73,6 +74,9 @@ class Experiment:
     parameters : mapping of name to float or Parameter
         Parameters of the plant in this log alone, in the plant's units: a payload, a gain of the firmware. A free
         Parameter is estimated from this log alone, and stands among the fit's parameters as EXPERIMENT.NAME.
+    differences : mapping of output to Difference
+        Measured speeds that are differences of a position over samples of this log: outputs that the plant then has
+        besides its own. What the device held before a stretch's first sample is part of the initial state.
 
     Attributes
     ----------
@@ -104,6 +108,7 @@ class Experiment:
     mask: Mask = "auto"
     shots: int = 1
     parameters: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
+    differences: Mapping[str, Difference] = field(default_factory=dict[str, Difference])
     stretches: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -116,6 +121,7 @@ class Experiment:
             raise EstimationError(
                 f'experiment name "{self.name[:40]}" is not a name; start with a letter, then letters, digits, _ and -'
             )
+        self._add_differences()
         chosen = self.outputs or tuple(name for name in self.plant.outputs if name in self.log.signals)
         if not chosen:
             raise EstimationError(
@@ -154,6 +160,21 @@ class Experiment:
             value = value.value if isinstance(value, Parameter) else float(value)
             own.append(Parameter(name=name, value=value, unit=self.plant.parameter_unit(name)))
         return params.with_parameters(*own)
+
+    def _add_differences(self) -> None:
+        """Give the plant the outputs that are differences; one of theirs that it has already is there to stay."""
+        where = f"experiment {self.name}: differences"
+        require_type(self.differences, Mapping, where, "give a mapping", EstimationError)
+        plant, initial = self.plant, self.initial_state
+        for name, difference in self.differences.items():
+            require_type(difference, Difference, f"{where}: {name}", "give a Difference", EstimationError)
+            if plant.sampling is None or name not in plant.outputs:
+                plant = add_difference(plant, name, difference, self.log.period)
+            if isinstance(initial, Mapping) and difference.of in initial:  # known to be there, and taken to rest there
+                held = {f"{name}_held_{i}": initial[difference.of] for i in range(1, difference.samples + 1)}
+                initial = {**held, **initial}
+        object.__setattr__(self, "plant", plant)
+        object.__setattr__(self, "initial_state", initial)
 
     def _check_parameters(self) -> None:
         require_type(self.parameters, Mapping, f"experiment {self.name}: parameters", "give a mapping", EstimationError)

@@ -90,6 +90,7 @@ class SteadyStateFilter:
                 continue
             f, h = self._mean_derivatives(model, theta, clock.period)
             a[i], _ = expm_with_derivatives(f * clock.period, np.zeros((0, nx, nx)))
+            model.set_samples(a[i])
             c[i] = h
         return a, c
 

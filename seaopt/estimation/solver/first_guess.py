@@ -20,6 +20,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.frequency.response import FrequencyResponse, responses
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import remove_friction
+from seaopt.plants.sensors.difference import read_positions
 from seaopt.records import record
 from seaopt.simulation import Model, linearise, make_model
 
@@ -105,9 +106,16 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
     s = 2j * np.pi * estimates[0].frequency_hz[rows]
     gain = np.array([experiment.slots.gain[o].value for o in chosen])
     # Dry friction at rest is a damper of f_c/v_s, which is no more there once the actuator moves.
-    model = experiment.model
-    if not model.linear and data.plant.friction:
-        model = make_model(remove_friction(data.plant), data.apply_own(params), model.free, model.outputs)
+    model, plant, shift = experiment.model, data.plant, np.exp(-s * delay)[:, None] * gain
+    if data.differences:
+        plant = read_positions(plant, data.differences)
+        for column, o in enumerate(chosen):
+            if (difference := data.differences.get(data.outputs[o])) is not None:
+                shift[:, column] *= difference.respond(s, log.period)
+    if not model.linear and plant.friction:
+        plant = remove_friction(plant)
+    if plant is not data.plant:
+        model = make_model(plant, data.apply_own(params), model.free, model.outputs)
     model = linearise(model)
     return _Target(
         model=model,
@@ -115,7 +123,7 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
         input=list(data.plant.inputs).index(active[0]),
         outputs=list(chosen),
         s=s,
-        shift=np.exp(-s * delay)[:, None] * gain,
+        shift=shift,
         log_response=np.log(np.where(used, response, 1.0)),
         weight=np.where(used, 1.0 / spread, 0.0),
     )

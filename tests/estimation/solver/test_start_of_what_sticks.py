@@ -41,7 +41,7 @@ def fit_start(seed, output, speed, quiet_s):
 
 @pytest.mark.parametrize(("seed", "output"), [(0, "theta_m"), (1, "theta_m"), (2, "tau_s")])
 def test_a_joint_that_is_held_starts_at_rest(seed, output):
-    """With its initial speed looked for at once, three of eight such fits ended at 20 rad/s, ten stds off in the rest."""
+    """With its initial speed looked for at once, three of eight such fits ended at 20 rad/s, ten stds off."""
     fit = fit_start(seed, output, speed=0.0, quiet_s=0.4)
     assert fit.status == "converged"
     (state,) = fit.nuisance["experiment"].initial_state
