@@ -158,6 +158,9 @@ def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
     if len(names) == 2 and abs(abs(direction[names[0]]) - abs(direction[names[1]])) < 1e-2:
         how = "product" if direction[names[0]] * direction[names[1]] < 0.0 else "ratio"
         return f"{names[0]} and {names[1]} enter only together, as their {how}"
+    weights = list(direction.values())
+    if min(weights) > 0.99 * max(weights) > 0.0:
+        return f"{join_words(names)} are known only in their ratios: all of them times one factor change no output"
     changes = ", ".join(f"{name} {100 * direction[name]:+.3g} %" for name in names)
     return f"{join_words(names)} enter only together: {changes} change no output"
 
