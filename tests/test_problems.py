@@ -41,6 +41,7 @@ def test_twomass_resonances(data):
     assert all(item.band_fit_percent > 85 for item in fit.outputs["multisine"].values())
 
 
+@pytest.mark.slow
 def test_twomass_misfit_is_the_coupling(data):
     """The residual repeats; the load's balance by least squares, without a simulation, gives the cause and 53.8 Hz."""
     twomass = script("twomass")
@@ -75,6 +76,7 @@ def smoothed_inertia(log):
     return np.linalg.lstsq(np.stack(terms, axis=1)[inner], tau[inner], rcond=None)[0][:2]
 
 
+@pytest.mark.slow
 def test_ak80_in_stretches(data):
     """Half a log in stretches gives the inertia that one pass misses, and that linear regression gives too."""
     ak80 = script("ak80")

@@ -112,7 +112,7 @@ def test_coloured_noise_does_not_buy_a_useless_parameter(stand, thor):
         one, more = (
             so.fit(
                 [so.Experiment(plant=stand, log=noisy, outputs=("F1",), gain=gain, drift=drift)],
-                thor.free("J", "b_r"), method=so.OutputError(search=False),
+                thor.free("J", "b_r"), method=so.OutputError(search=False), diagnostics=False,
             )
             for gain, drift in (({}, 0), ({"F1": free}, 1))
         )  # fmt: skip

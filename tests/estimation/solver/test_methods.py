@@ -482,7 +482,7 @@ def test_a_band_without_0_hz_leaves_the_level_to_the_rest(stand, thor):
     assert fit.outputs["log"]["F1"].rms_residual < 3
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["output_error", "multiple_shooting", pytest.param("prediction_error", marks=SLOW)])
 def test_noise_alone_is_not_called_a_fit(stand, thor, method):
     rng = np.random.default_rng(3)
     n = 2000
