@@ -45,8 +45,9 @@ from jaxtyping import Int, Shaped
 from seaopt.records import record
 
 THREAD_NAME = "seaopt-native"
-COMPILER_S = 60.0  # that a compiler gets for one library
-HUNG_S = 86_400.0  # for which one that took longer is not asked again
+COMPILER_S = 60.0  # that a compiler gets for one library,
+PER_CHARACTER_S = 5e-4  # and for its source: ten times what an idle machine takes
+HUNG_S = 3_600.0  # for which one that took longer is not asked again
 ORPHAN_S = 3_600.0  # after which a folder of the compiler's has nobody who waits for it
 BUILD = "build-"  # begins the names of those folders
 FLAGS = ("-O3", "-std=gnu99", "-fPIC", "-shared", "-fno-math-errno", "-fvisibility=hidden")
@@ -189,7 +190,7 @@ def _run_compiler(command: list[str], source: str, library: Path) -> bool:
     with tempfile.TemporaryDirectory(dir=library.parent, prefix=BUILD, ignore_cleanup_errors=True) as folder:
         code, built, beside = (Path(folder) / name for name in ("kernel.c", "kernel.so", "kernel.sha256"))
         code.write_text(source, encoding="utf-8")
-        _wait_for([*command, str(code), "-o", str(built), "-lm"])
+        _wait_for([*command, str(code), "-o", str(built), "-lm"], COMPILER_S + PER_CHARACTER_S * len(source))
         if not built.exists():
             return False
         beside.write_text(hashlib.sha256(built.read_bytes()).hexdigest(), encoding="ascii")
@@ -201,11 +202,11 @@ def _run_compiler(command: list[str], source: str, library: Path) -> bool:
     return True
 
 
-def _wait_for(command: list[str]) -> None:
+def _wait_for(command: list[str], limit_s: float) -> None:
     silent = subprocess.DEVNULL
     process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)  # noqa: S603
     try:
-        process.wait(COMPILER_S)
+        process.wait(limit_s)
     except BaseException:
         with suppress(OSError):
             os.killpg(process.pid, signal.SIGKILL)  # a compiler's driver starts others
