@@ -10,6 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, Notch
 from seaopt.control import draw as draw_values
@@ -55,6 +57,7 @@ from seaopt.units import ROTARY, factor, same_dimension, unit_after
 
 MAX_BYTES = 4 << 20
 OWN = "parameter "  # before the name of a parameter that is read as a channel
+ROUNDED = 1e-9  # relative: a constant column that was interpolated to another clock
 
 
 @record(eq=False)
@@ -260,13 +263,14 @@ class Problem:
                 f'experiment {table.name}: parameters: {name} is in {unit or "no unit"}, and column "{given.column}" '
                 f"in {read}; correct the column's unit"
             )
-        values = set(log[OWN + name].tolist())
-        if len(values) != 1:
+        values = log[OWN + name]
+        value = float(np.median(values))
+        if not np.all(np.abs(values - value) <= ROUNDED * abs(value)):
             raise ProblemError(
                 f'experiment {table.name}: parameters: {name} is not one value throughout column "{given.column}"; '
                 "make it an input"
             )
-        return values.pop()
+        return value
 
     def _read_log(self, table: ExperimentTable) -> Log:
         check_links(self.folder, list_log_files(table))

@@ -224,6 +224,8 @@ def test_json_lines_and_entries(tmp_path):
         np.testing.assert_array_equal(one(path, "imu.F", time=S), F)
     np.testing.assert_array_equal(one(lines, "v[1]", time=S), 2 * F)
     assert contents(whole).notes == ("header: mass = 0.49",)
+    mass = Column(column="mass", unit="kg", from_header=True)
+    assert set(read_log(whole, time=S, channels={"m": mass})["m"]) == {0.49}
 
 
 @pytest.mark.parametrize(

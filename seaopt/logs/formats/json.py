@@ -23,17 +23,22 @@ JsonEntry = Mapping[str, Any]
 
 def open_json(path: Path) -> Source:
     """List the keys of a JSON log; nested objects become dotted paths, lists carry an index."""
-    columns, notes, length = _list_columns(path)
+    header: dict[str, Any] = {}
+    columns, length = _list_columns(path, header)
     fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
-    return Source(path=path, format="JSON", fields=fields, load=partial(_load, path), notes=tuple(notes))
+    listed = ", ".join(f"{key} = {value}" for key, value in header.items())
+    constants = {key: (float(one), header_unit(key)) for key, one in header.items() if name_kind(one) == "float64"}
+    return Source(
+        path=path, format="JSON", fields=fields, load=partial(_load, path), constants=constants,
+        notes=(f"header: {listed}"[:400],) if header else (),
+    )  # fmt: skip
 
 
-def _list_columns(path: Path) -> tuple[dict[str, str], list[str], int]:
-    """Return each key with its kind, what the header says, and the number of entries."""
-    notes: list[str] = []
+def _list_columns(path: Path, header: dict[str, Any]) -> tuple[dict[str, str], int]:
+    """Return each key with its kind, and the number of entries; what the header says goes into `header`."""
     columns: dict[str, str] = {}
     length = 0
-    with closing(_read_entries(path, notes)) as records:
+    with closing(_read_entries(path, header)) as records:
         for _, record in records:
             length += 1
             for name, value in flatten(record):
@@ -43,12 +48,12 @@ def _list_columns(path: Path) -> tuple[dict[str, str], list[str], int]:
                     columns.setdefault(name, "empty")
     if not length:
         raise LogError(f"{path}: holds no entries; record the log again")
-    return columns, notes, length
+    return columns, length
 
 
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
     columns: dict[str, list[float]] = {name: [] for name in names}
-    with closing(_read_entries(path, [])) as records:
+    with closing(_read_entries(path, {})) as records:
         for place, record in records:
             row = dict(flatten(record))
             for name, values in columns.items():
@@ -71,12 +76,12 @@ def _to_number(path: Path, place: str, name: str, value: Any) -> float:
     return float(value)
 
 
-def _read_entries(path: Path, notes: list[str]) -> Generator[tuple[str, JsonEntry]]:
-    """Return the entries with their places; of a header, a note."""
+def _read_entries(path: Path, header: dict[str, Any]) -> Generator[tuple[str, JsonEntry]]:
+    """Return the entries with their places; what stands beside them goes into `header`."""
     with path.open("rb") as stream:
         first = _read_line(path, stream, 1)
         if not _is_entry(first) or not any(line.strip() for line in stream):
-            yield from _read_whole(path, notes)
+            yield from _read_whole(path, header)
             return
         stream.seek(0)
         number = 1
@@ -101,7 +106,7 @@ def _is_entry(line: bytes) -> bool:
         return False
 
 
-def _read_whole(path: Path, notes: list[str]) -> Iterator[tuple[str, JsonEntry]]:
+def _read_whole(path: Path, header: dict[str, Any]) -> Iterator[tuple[str, JsonEntry]]:
     size = path.stat().st_size
     if size > MAX_WHOLE:
         raise LogError(f"{path}: is {size >> 20} MiB of JSON in one piece; save it as JSON lines, one entry per line")
@@ -109,9 +114,7 @@ def _read_whole(path: Path, notes: list[str]) -> Iterator[tuple[str, JsonEntry]]
     entries = content
     if isinstance(content, dict):
         entries = content["entries"] if "entries" in content else _transpose(path, content)
-        header = [f"{key} = {value}" for key, value in content.items() if isinstance(value, str | int | float)]
-        if header:
-            notes.append(f"header: {', '.join(header)}"[:400])
+        header |= {key: value for key, value in content.items() if isinstance(value, str | int | float)}
     if not isinstance(entries, list):
         raise LogError(
             f'{path}: holds no list of entries; write {{"entries": [{{"time": 0.0, ...}}, ...]}} or JSON lines'
