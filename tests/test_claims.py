@@ -99,7 +99,13 @@ class Scratch:
 
 
 @pytest.mark.parametrize(
-    ("structure", "bandwidth", "delay"), [("pid", 30, 1), ("pd", 15, 1), ("pid", 60, 1), ("pd", 45, 2)]
+    ("structure", "bandwidth", "delay"),
+    [
+        ("pid", 60, 1),
+        ("pd", 45, 2),
+        pytest.param("pid", 30, 1, marks=pytest.mark.slow),
+        pytest.param("pd", 15, 1, marks=pytest.mark.slow),
+    ],
 )
 def test_what_the_tuner_and_the_certificate_claim(stand, swing, thor, structure, bandwidth, delay):
     spec = so.ControllerSpec(structure=structure, bandwidth_hz=bandwidth, delay_samples=delay, **LIMITS)

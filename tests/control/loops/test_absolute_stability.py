@@ -90,7 +90,10 @@ def closed_loop_matrices(law, substeps):
     return first @ transition, first @ efforts, out_state, out_effort, h
 
 
-@pytest.mark.parametrize("gains", [(0.53, 0.018), (3.0, 0.018), (1.2, 0.03), (0.1, 0.002)])
+@pytest.mark.parametrize(
+    "gains",
+    [(0.53, 0.018), (3.0, 0.018), *(pytest.param(g, marks=pytest.mark.slow) for g in ((1.2, 0.03), (0.1, 0.002)))],
+)
 def test_the_test_agrees_with_a_fine_lifted_discretisation(gains):
     """At every angle the sign is that of the Hermitian part of a matrix with 120 substeps."""
     law = pid(*gains)
@@ -232,7 +235,7 @@ def read_multiplier(name):
     return np.ones_like
 
 
-@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0, 100.0])
+@pytest.mark.parametrize("factor", [0.1, 10.0, *(pytest.param(f, marks=pytest.mark.slow) for f in (1.0, 100.0))])
 def test_what_a_multiplier_asks_of_the_feedback_is_the_circle_criterion(factor):
     """|C_y| below level |1 + plant C_y| at an angle, for laws and multipliers of every kind."""
     rng, theta = np.random.default_rng(1), np.linspace(0.01, 3.1, 20)

@@ -78,7 +78,7 @@ def exact(mpc, x0, u_last, reference, drift, samples):
     return float(found["x"][0])
 
 
-@pytest.mark.parametrize("slew", [500.0, 2000.0])
+@pytest.mark.parametrize("slew", [500.0, pytest.param(2000.0, marks=pytest.mark.slow)])
 def test_with_limits_it_is_what_another_solver_finds(stand, thor, slew):
     """From 25 random states, every sample free, no delay: within 5 mA, which OSQP's tolerance leaves."""
     mpc = made(stand, thor, horizon_s=0.03, moves=30, current_slew_A_per_s=slew, delay_samples=0)
