@@ -173,6 +173,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     rate = sensing.motor_speed if sensing.motor_position else (plant.port.rate if plant.port else None)
     source = next(iter(plant.inputs))
     integral, limited = "servo_integral" in parts, "servo_limit" in parts
+    commanded = {} if source in plant.outputs else {source: plant.inputs[source]}  # a log may hold it, too
 
     def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
         without = SimpleNamespace(**{**vars(u), source: 0.0})
@@ -182,7 +183,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
         command += p.g_s * p.k_i * x.error_sum if integral else 0.0
         held = ca.fmin(ca.fmax(command, -p.c_max), p.c_max) if limited else command
         winds_up = ca.logic_and(held != command, command * error > 0.0)
-        return held, {"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {}, {}
+        return held, {"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {}, dict.fromkeys(commanded, held)
 
     own = [
         item for part in ("position_servo", "servo_integral", "servo_limit") if part in parts for item in PARTS[part]
@@ -190,7 +191,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     unit = plant.outputs.get(position) or plant.states[position]
     return _put_before(plant, _Drive(
         name="position_servo", input="goal", unit=unit, states={"error_sum": f"{unit} s"} if integral else {},
-        outputs={}, parameters=tuple(item for item in own if rate or item.name != "k_d"), solve=solve,
+        outputs=commanded, parameters=tuple(item for item in own if rate or item.name != "k_d"), solve=solve,
         effort=lambda p: p.g_s * p.k_p,
     ), partial(_drive_again, add_servo, tuple(parts)))  # fmt: skip
 

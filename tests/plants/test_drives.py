@@ -122,6 +122,38 @@ def test_fit_of_a_log_that_holds_goal_and_position_alone():
         assert abs(found.value - truth[name].value) < 4.0 * found.std < 0.3 * truth[name].value
 
 
+@pytest.mark.parametrize("inside", ["I", "duty"])
+def test_what_a_servo_commands_may_be_logged_beside_its_goal(inside):
+    """Goal in, current out: integrated here, then fitted from the current alone."""
+    plant = so.plants.rotary(parts=["position_servo", *(["duty_input"] if inside == "duty" else [])])
+    gain = 1.5 if inside == "I" else 0.05
+    goal = np.convolve(np.random.default_rng(7).normal(size=1500), np.ones(20) / 5.0, mode="same")
+
+    def command_of(x, k):
+        return gain * (goal[k] - x[0])
+
+    def current_of(x, k):
+        if inside == "I":
+            return command_of(x, k)
+        return (MOTOR["V_s"] * np.clip(command_of(x, k), -1.0, 1.0) - MOTOR["K_tau"] * x[1]) / MOTOR["R"]
+
+    path = integrate(lambda t, x, k: motion(t, x, current_of(x, k), MOTOR), 4, goal.size)
+    current = np.array([current_of(x, k) for k, x in enumerate(path)])
+    command = np.array([command_of(x, k) for k, x in enumerate(path)])
+    t = np.arange(goal.size) / RATE_HZ
+    truth = values_of(plant, k_p=gain, g_s=1.0)
+    run = so.simulate(plant, truth, so.Log.from_arrays(time=t, goal=goal), rtol=1e-6)
+    for name, expected in (("I", current), (inside, command)):
+        assert np.max(np.abs(run[name] - expected)) < 2e-4 * np.max(np.abs(expected))
+    noise = 1e-3 * np.std(current) * np.random.default_rng(8).normal(size=goal.size)
+    log = so.Log.from_arrays(time=t, goal=goal, I=current + noise)
+    start = truth.update(k_s=1.3 * MOTOR["k_s"], J_l=1.2 * MOTOR["J_l"]).free("k_s", "J_l")
+    one = so.Experiment(plant=plant, log=log, outputs=("I",), initial_state="rest", offset=False)
+    fit = so.fit([one], start, diagnostics=False)
+    for name in ("k_s", "J_l"):
+        assert abs(fit.parameters[name].value - MOTOR[name]) < 4.0 * fit.parameters[name].std + 1e-3 * MOTOR[name]
+
+
 def test_a_torque_controller_commands_the_voltage():
     plant = so.plants.rotary(link="locked", parts=["voltage_input"])
     assert plant.actuation.input == "V"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Literal
 
 import numpy as np
@@ -321,7 +321,22 @@ class Experiment:
             if name in log.signals and is_constant(log[name]):
                 text = f"{name}: is constant at {np.fmax.reduce(log[name]):.6g} {log.signal(name).unit}".rstrip()
                 notes += [text] if text not in notes else []  # reading a file says it already
-        return tuple(notes)
+        return (*notes, *self._note_same_columns())
+
+    def _note_same_columns(self) -> list[str]:
+        """Return what to know of channels with the same samples."""
+        named = [name for name in (*self.plant.inputs, *self.outputs) if name in self.log.signals]
+        pairs = [(a, b) for a, b in combinations(named, 2) if np.array_equal(self.log[a], self.log[b], equal_nan=True)]
+        pairs = [(a, b) for a, b in pairs if b in self.outputs and not is_constant(self.log[b])]
+        return [
+            f"{a} and {b} are the same samples: "
+            + (
+                "their noise is one, and the stds count it once"
+                if a in self.outputs
+                else "as an input it is taken for exact, noise included; name another column if that is not what drives"
+            )
+            for a, b in pairs
+        ]
 
     def segments(self, holdout: float = 0.0) -> list[Segment]:
         """Return the log's stretches between gaps; the last fraction `holdout` of the time gets no weight."""
