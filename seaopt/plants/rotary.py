@@ -80,10 +80,10 @@ _PARTS: dict[str, tuple[Parameter, ...]] = {
             plausible=(0, 1000),
         ),
         Parameter(
-            name="sigma_0", value=20.0, unit="N m/rad", min=0.0, description="stiffness of the bristles, at the motor"
+            name="sigma_0", value=5.0, unit="N m/rad", min=0.0, description="stiffness of the bristles, at the motor"
         ),
         Parameter(
-            name="sigma_1", value=0.02, unit="N m s/rad", min=0.0, description="damping of the bristles, at the motor"
+            name="sigma_1", value=0.01, unit="N m s/rad", min=0.0, description="damping of the bristles, at the motor"
         ),
     ),
     "hysteresis": (

@@ -190,6 +190,24 @@ def test_a_servo_without_its_gain_is_asked_for_it(write):
         joint.complete(joint.defaults)
 
 
+def test_a_file_names_springs_and_friction_that_remember(write):
+    text = (
+        'schema = 1\n[plant.joint]\nkind = "rotary"\nlink = "locked"\nparts = ["lugre", "hysteresis"]\n[parameters]\n'
+    )
+
+    def complete(content):
+        problem = so.read_problem(write(content))
+        return problem.plants["joint"].complete(problem.parameters)
+
+    values = complete(text + 'k_h = { value = 60, free = true }\nsigma_0 = { value = 9, unit = "N m/rad" }\n')
+    assert {"z_f", "z_h"} <= set(values.plant.states)
+    assert values["k_h"].unit == "N m/rad"
+    for wrong, named in (('sigma_0 = { value = 9, unit = "N/m" }', "sigma_0"), ("f_c = 0.0", "f_c")):
+        with pytest.raises(so.SeaoptError, match=named) as raised:
+            complete(text + wrong + "\n")
+        assert "\n" not in str(raised.value)
+
+
 OWN = """states = { v = "rad/s" }
 inputs = { I = "A" }
 outputs = { v = "rad/s" }

@@ -23,6 +23,7 @@ MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trus
 NEARBY = 10.0  # standard deviations, over which a step error does not change
 # Of an order: where a joint that sticks stops, residuals jump, and finer steps make that no better for ever.
 MOST_STEPS = {4: MAX_SUBSTEPS, 2: 32}
+SAME_COST = 1e-2  # relative change of a cost, with steps of half the length, that bristles at the start may make
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
 
 
@@ -80,19 +81,24 @@ def _choose_first_steps(experiment: FitExperiment, here: Evaluation, most: int) 
 def hold_bristles(problem: FitProblem) -> FitProblem:
     """Return the problem with steps short enough for bristles at the start, which are stiff where they slip.
 
-    How fast they slip only a simulation tells, and with steps too long for it that overflows.
+    How fast they slip only a simulation tells: with steps too long for it that overflows, or makes a cost that half as
+    long ones change.
     """
-    bristled = any(remembers(experiment.data.plant) for experiment in problem.experiments)
-    while bristled and not np.isfinite(problem.evaluate(problem.unknowns.start).cost):
-        steps = [experiment.count_steps(problem.unknowns.start) for experiment in problem.experiments]
+    if not any(remembers(experiment.data.plant) for experiment in problem.experiments):
+        return problem
+    z, cost = problem.unknowns.start, np.nan
+    while True:
+        here = problem.evaluate(z).cost
+        if np.isfinite(here) and abs(here - cost) <= SAME_COST * here:
+            return problem
+        steps = [experiment.count_steps(z) for experiment in problem.experiments]
         finer = [
             min(2 * count, MAX_SUBSTEPS) if remembers(experiment.data.plant) else count
             for experiment, count in zip(problem.experiments, steps, strict=True)
         ]
         if finer == steps:
-            break
-        problem = _with_substeps(problem, finer)
-    return problem
+            return problem
+        problem, cost = _with_substeps(problem, finer), here
 
 
 def refine_steps(problem: FitProblem, here: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
