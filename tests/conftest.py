@@ -45,7 +45,7 @@ PARTS = (
     "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
     "spring_damping", "screw_mode", "current_loop", "load_cell", "command_delay", "measurement_delay",
     "voltage_input", "duty_input", "inductance", "position_servo", "servo_integral", "servo_limit", "servo_delay",
-    "deflection_sensor",
+    "deflection_sensor", "thermal",
 )  # fmt: skip
 OVERRIDES = FrozenDict({Literal[choices]: str for choices in (*CHOICES, PARTS)})
 checker = ModuleType("seaopt_type_checker")
