@@ -258,8 +258,9 @@ def _add_initial(
             rows.append(tuple(Slot(value=float(v)) for v in known))
             continue
         label = f"{experiment.name}.initial{number + 1 if number else ''}"
+        scales = stopped if piece.start in starts else {}  # a shot within a stretch starts in the middle of a motion
         unknown = [
-            Parameter(name=f"{label}.{state}", value=0.0, unit=unit, free=True, prior_std=stopped.get(state))
+            Parameter(name=f"{label}.{state}", value=0.0, unit=unit, free=True, prior_std=scales.get(state))
             for state, unit in plant.states.items()
         ]
         rows.append(tuple(builder.add(entry, model.linear) for entry in unknown))

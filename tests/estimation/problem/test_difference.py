@@ -3,6 +3,8 @@
 The logs are of matrices written here, discretised by scipy, and differenced by NumPy.
 """
 
+import pickle
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -252,6 +254,13 @@ excitation = { noise = { std = 1.0, band_hz = 30 } }
     path.write_text(text.replace('name = "shake"', 'name = "shake"\ndecimate = 2'))
     with pytest.raises(so.SeaoptError, match="decimate"):
         so.read_problem(path).experiments()
+
+
+def test_it_survives_pickling():
+    plant = add_difference(so.plants.rotary(), "speed", CASES["with a lag"], PERIOD)
+    log = so.Log.from_arrays(time=np.arange(50) * PERIOD, I=np.sin(np.arange(50.0)))
+    runs = [so.simulate(each, plant.defaults, log)["speed"] for each in (plant, pickle.loads(pickle.dumps(plant)))]
+    np.testing.assert_array_equal(*runs)
 
 
 def test_a_plant_of_one_s_own_in_symbols_has_one():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.problem.unknowns import collect
 
 PERIOD, N, PARTS = 1e-3, 4000, 20
 TRUTH = {"J_m": 1e-4, "k_s": 300.0, "f_c": 0.03, "b_r": 1e-4}
@@ -48,6 +49,15 @@ def test_a_joint_that_is_held_starts_at_rest(seed, output):
     assert abs(state["thetad_m"]) < 5.0
     for name, true in TRUTH.items():
         assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
+
+
+def test_shots_within_a_stretch_start_in_motion():
+    plant = so.plants.let_stick(so.plants.rotary(link="locked"))
+    log = so.Log.from_arrays(time=np.arange(60) * PERIOD, I=np.sin(np.arange(60.0)), theta_m=np.cos(np.arange(60.0)))
+    one = so.Experiment(plant=plant, log=log, outputs=("theta_m",), shots=3)
+    unknowns = collect((one,), plant.defaults.update(f_c=0.1).free("k_s"))[0]
+    known = {name for name, std in zip(unknowns.names, unknowns.prior_std, strict=True) if np.isfinite(std)}
+    assert known == {"experiment.initial.thetad_m"}
 
 
 def test_one_that_is_thrown_is_found_to_be():
