@@ -42,7 +42,7 @@ def test_a_loop_that_is_fine_at_rest_and_rings_once_it_slides_fails(thor):
     assert certificate.plants["stand stuck"].ms <= 1.7
     assert certificate.plants["stand sliding"].ms > 2.0
     assert any("stand sliding" in where for where in failing(certificate))
-    assert any(row.plant == "stand" and not row.passed for row in certificate.steps.rows)
+    assert max(row.overshoot for row in certificate.steps.rows) > 0.35, "steps are played"
 
 
 def test_a_spring_with_hysteresis_is_certified_at_its_stiffest_and_its_softest(thor):
