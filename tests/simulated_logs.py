@@ -21,6 +21,7 @@ PENDULUM = {"I_p": 0.19, "mgL": 3.7, "d": 1e-3, "tau_c": 0.18, "v_s": 0.1}
 LINK = {"K": 43.0, "d": 19.0, "f_c": 22.0, "v_s": 0.05, "mu": 0.85, "k": (2 * np.pi * 2.94) ** 2, "c": 0.3}
 SERVO = {"kt": 0.158, "R": 0.666, "J": 0.00205, "f_c": 0.005, "d": 0.016, "q_0": -0.03, "c_m": 0.5, "c_g": 0.1}
 COUNTS_PER_RAD, FULL_DUTY = 4096 / (2 * np.pi) / 256, 885.0
+RECORDED = ("28m10", "28m17", "28m24", "28m32", "29m14", "29m21", "29m29", "29m37")  # of the measured servo's files
 
 
 def write_twomass(folder: Path, periods: int = 20, seed: int = 0, **changed: float) -> None:
@@ -153,7 +154,7 @@ def write_xl330(folder: Path, duration_s: float = 2.4) -> None:
              "timestamp": float(t), "goal_position": float(d), "torque_enable": bool(e)} for t, a, b, c, d, e in rows
         ]  # fmt: skip
         header = {"mass": 0.49, "length": 0.1, "kp": kp, "vin": 7.4, "motor": "xl330", "trajectory": name}
-        (folder / f"log_{number}.json").write_text(json.dumps(header | {"entries": entries}))
+        (folder / f"2026-01-15_10h{RECORDED[number]}.json").write_text(json.dumps(header | {"entries": entries}))
 
 
 def swing(time, goal, kp, off_s):
@@ -166,7 +167,7 @@ def swing(time, goal, kp, off_s):
         motor = p["kt"] / p["R"] * (7.4 * duty - p["kt"] * x[1]) * (t < off_s)
         gravity = weight * np.sin(x[0] - p["q_0"])
         load = np.sqrt((p["c_m"] * motor + p["c_g"] * gravity) ** 2 + 1e-6)
-        friction = (p["f_c"] + load) * np.tanh(x[1] / 0.02) + p["d"] * x[1]
+        friction = (p["f_c"] + load) * np.tanh(x[1] / 0.002) + p["d"] * x[1]
         return x[1], (motor - gravity - friction) / inertia
 
     return odeint(motion, [0.0, 0.0], time, rtol=1e-8, atol=1e-9, hmax=0.01, tcrit=[off_s] if off_s < 9 else None).T
