@@ -310,6 +310,7 @@ class Session:
             experiments,
             self.problem.parameters,
             callback=lambda iteration, cost: tell(f"iteration {iteration}, cost {cost:.6g}"),
+            progress=lambda kind, text: self._note(text) if kind == "advice" else tell(text),
             alternatives=tuple(self.problem.plants.values()),
             **self.problem.fit_options,
         )

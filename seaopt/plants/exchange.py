@@ -9,6 +9,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import casadi as ca
 import numpy as np
@@ -16,7 +17,10 @@ import numpy as np
 from seaopt.errors import PlantError
 from seaopt.files import write_bytes
 from seaopt.parameters import ParameterSet
+from seaopt.plants.friction import can_stick, list_smoothing
 from seaopt.plants.plant import CompletedParameters, Plant
+
+DESCRIPTION = "modelDescription.xml"
 
 
 def to_control(plant: Plant, params: ParameterSet) -> Any:
@@ -64,7 +68,8 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
 
     Notes
     -----
-    States start at zero. An output with the name of a state is called NAME_out.
+    States start at zero. An output with the name of a state is called NAME_out. Friction is its smoothed curve: of a
+    plant that sticks the model's description says so, for there the FMU creeps.
 
     """
     if ca.depends_on(ca.vertcat(plant.dynamics, plant.output), plant.t):
@@ -84,10 +89,25 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
             raise PlantError(
                 f"plant {plant.name}: the FMU cannot be made ({reason}); check compiler and include"
             ) from error
+        described = next(Path(source) for source in content if Path(source).name == DESCRIPTION)
+        text = described.read_text(encoding="utf-8")
+        remark = f"<fmiModelDescription description={quoteattr(_describe(plant))} "
+        described.write_text(text.replace("<fmiModelDescription ", remark, 1), encoding="utf-8")
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
             for source, place in content.items():
                 packed.write(source, str(Path(place)))
     return write_bytes(target, archive.getvalue())
+
+
+def _describe(plant: Plant) -> str:
+    """Return what the model is, and what it leaves out of the plant."""
+    if not (plant.sticks and can_stick(plant)):
+        return plant.name
+    over = " and ".join(list_smoothing(plant))
+    return (
+        f"{plant.name}. Friction that sticks is not in this FMU: it is smoothed over {over}, so that a joint that "
+        "stands still in seaopt creeps here"
+    )
 
 
 def _builder(plant: Plant, params: CompletedParameters, name: str) -> Any:

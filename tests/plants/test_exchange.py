@@ -100,3 +100,18 @@ def test_a_free_mass_has_no_static_gain():
     assert found["F1", "Fe2"] == pytest.approx(1.0, rel=1e-3)  # the spring holds what is pushed
     assert found["F1", "I"] == 0.0  # the motor alone runs away
     assert np.isinf(found["q", "I"])
+
+
+def test_an_fmu_says_that_it_does_not_stick(stand, thor, tmp_path):
+    import xml.etree.ElementTree as ElementTree
+    import zipfile
+
+    def describe(plant):
+        path = export_fmu(plant, thor.update(f_c=300.0), tmp_path / "plant.fmu")
+        with zipfile.ZipFile(path) as packed:
+            return ElementTree.fromstring(packed.read("modelDescription.xml")).attrib["description"]
+
+    assert "creeps" not in describe(stand)
+    said = describe(so.plants.let_stick(stand))
+    assert "creeps" in said
+    assert "v_s" in said

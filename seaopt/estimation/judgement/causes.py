@@ -50,6 +50,7 @@ CLIPPED_SAMPLES = 20  # that have to be beyond a level
 CLIPPED_POWER = 0.2  # of a residual's
 
 V = TypeVar("V")
+Progress = Callable[[str, str], None]  # what it is about, "advice" or "causes", and a text
 
 
 @record(eq=False)
@@ -109,7 +110,7 @@ class _Candidate:
 
 def find_causes(
     fit: Fit, residuals: ResidualsByExperiment, suspects: Mapping[str, ScoreTest], alternatives: Sequence[Plant], *,
-    poor: bool,
+    poor: bool, progress: Progress | None = None,
 ) -> list[Cause]:  # fmt: skip
     """Return what explains the logs better than the fit, the best first.
 
@@ -125,13 +126,18 @@ def find_causes(
         Other plants that may have been on the bench.
     poor : bool
         Whether the fit explains so little that its estimates are no start: what searches does so from its own.
+    progress : callable, optional
+        Called with ("causes", text) before each that is tried.
 
     """
     minimum = fit.require_minimum("find_causes")
     whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
     colour = _measure_colour(fit)
     causes: list[Cause] = []
-    for candidate in _list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor):
+    candidates = _list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor)
+    for number, candidate in enumerate(candidates, 1):
+        if progress is not None:
+            progress("causes", f"fitted; looking for causes of what it does not explain, the {number}. is tried")
         try:
             solved = _refit(minimum, candidate)
         except SeaoptError:  # what does not make a problem explains nothing

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from seaopt.errors import EstimationError, require_type
+from seaopt.estimation.judgement.causes import Progress
 from seaopt.estimation.judgement.judge import judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
@@ -22,10 +24,12 @@ from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.estimation.solver.step_size import hold_bristles
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import list_smoothing
+from seaopt.plants.friction import can_stick, list_smoothing
 from seaopt.plants.plant import require_plant
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
+
+SLOW_STEPS, SLOW = 2.0, 1e5  # steps in a sample, and in a pass, from which smoothed friction is said to be slow
 
 
 def fit(
@@ -39,6 +43,7 @@ def fit(
     diagnostics: bool = True,
     alternatives: Sequence[Plant] = (),
     callback: Callback | None = None,
+    progress: Progress | None = None,
 ) -> Fit:
     """Fit the free parameters of `params` to one or several experiments that share them.
 
@@ -64,6 +69,9 @@ def fit(
         Other plants that may have been on the bench: where a log is not explained, they are tried.
     callback : callable, optional
         Called with (iteration, cost).
+    progress : callable, optional
+        Called with ("advice", text) where the search could be quicker, and with ("causes", text) as causes of what is
+        not explained are tried.
 
     Returns
     -------
@@ -103,9 +111,12 @@ def fit(
     )  # fmt: skip
     _check_samples(problem)
     _check_stiffness(problem)
+    if progress is not None:
+        for advice in _advise_sticking(problem):
+            progress("advice", advice)
     solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
-    return judge(result, alternatives) if diagnostics else result
+    return judge(result, alternatives, progress) if diagnostics else result
 
 
 def check_choices(method: Any, loss: Any, band_hz: Any) -> None:
@@ -194,6 +205,21 @@ def complete_parameters(experiments: tuple[Experiment, ...], params: ParameterSe
     for name in params.free_names:
         parameters.setdefault(name, params[name])
     return ParameterSet(parameters.values())
+
+
+def _advise_sticking(problem: FitProblem) -> Iterator[str]:
+    """Yield where smoothed friction makes a search slow that a sticking joint makes in fewer steps."""
+    for experiment in problem.experiments:
+        plant = experiment.data.plant
+        steps = experiment.count_stable_steps(problem.unknowns.start)
+        samples = sum(segment.samples.n for segment in experiment.segments)
+        if plant.sticks or not can_stick(plant) or steps < SLOW_STEPS or steps * samples < SLOW:
+            continue
+        over = " and ".join(list_smoothing(plant))
+        yield (
+            f"experiment {experiment.name}: friction smoothed over {over} takes {math.ceil(steps)} steps in each of "
+            f"{samples} samples; where the joint sticks, sticks = true (so.plants.let_stick) is quicker"
+        )
 
 
 def _check_stiffness(problem: FitProblem) -> None:

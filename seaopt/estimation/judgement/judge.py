@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.estimation.judgement.causes import Cause, find_causes, free_delay
+from seaopt.estimation.judgement.causes import Cause, Progress, find_causes, free_delay
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.problem.fit_experiment import FitExperiment
@@ -49,7 +49,7 @@ RIVAL_SHARE = 0.9  # of what the best cause gains: no reason to prefer one
 FAR = 3.0  # times beyond a plausible range
 
 
-def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
+def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress | None = None) -> Fit:
     """Return the fit with what its outputs explain, and what is wrong with it.
 
     Parameters
@@ -58,6 +58,8 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
         With its minimum.
     alternatives : sequence of Plant
         Other plants that may have been on the bench, tried where this one does not explain the logs.
+    progress : callable, optional
+        As in `seaopt.fit`.
 
     """
     minimum = fit.require_minimum("judge")
@@ -80,7 +82,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = ()) -> Fit:
     )
     if wrong:
         poor = any(finding.kind == "explained" for finding in findings) or fit.status == "not_identifiable"
-        causes = find_causes(fit, residuals, suspects, alternatives, poor=poor)
+        causes = find_causes(fit, residuals, suspects, alternatives, poor=poor, progress=progress)
         findings += _name_causes(fit, causes, suspects)
     return _conclude(fit, findings)
 

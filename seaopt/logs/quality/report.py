@@ -17,6 +17,7 @@ from seaopt.formatting import format_table, html_list, html_paragraph, html_tabl
 from seaopt.logs.quality.channel import ChannelQuality, assess_channel, keep_runs_while_others_move
 from seaopt.logs.quality.clock import ClockQuality, assess_clock
 from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
+from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.findings import (
     Finding,
     count_findings,
@@ -32,7 +33,8 @@ from seaopt.records import record
 from seaopt.signals import Recording
 
 QUALITY_SCHEMA = "seaopt/quality/1"
-INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u"})  # names of inputs, in any case
+INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})  # names of inputs, in any case
+HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for as long as they like
 INPUT_UNITS = frozenset({"A", "V"})
 MOST_PAIRED = 100  # outputs; of more only F1 and F2 are correlated with each other
 ENOUGH_SAMPLES = FEWEST_STRETCHES * SHORTEST_STRETCH  # for spectra, in one stretch
@@ -145,7 +147,8 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     data : Log or Table
         `log.quality` is this with its defaults.
     inputs : sequence of str, optional
-        Channels that drive the others. Left out: those named I, Fe1, Fe2 or u, or else those in A or V.
+        Channels that drive the others, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u, or
+        else those in A or V.
 
     Raises
     ------
@@ -173,7 +176,11 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
             )
     clock = assess_clock(data.time, data.source)
     channels = {name: assess_channel(signal) for name, signal in data.signals.items()}
-    channels = {name: _judge_stuck_runs(channel, channels, data) for name, channel in channels.items()}
+    holding = {*(inputs or ()), *(name for name in channels if name.lower() in HOLDING_NAMES)}
+    channels = {
+        name: replace(channel, stuck=RowRanges()) if name in holding else _judge_stuck_runs(channel, channels, data)
+        for name, channel in channels.items()
+    }
     # A constant has no spectrum, and a counter one that means nothing.
     varying = {name: data.signals[name].values for name, channel in channels.items() if _varies(channel)}
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)

@@ -1,0 +1,46 @@
+"""What a fit tells while it runs."""
+
+import numpy as np
+import pytest
+
+import seaopt as so
+
+PLANT = so.plants.rotary(link="locked")
+VALUES = PLANT.defaults.update(f_c=0.02, v_s=0.0625, J_m=4e-5)
+
+
+class Heard(Exception):
+    """Ends a fit when it says something."""
+
+
+def stop(kind, text):
+    raise Heard(kind, text)
+
+
+def make_experiment(plant, samples, disturbance=0.0):
+    """Return a log of the plant with noise, and with a square wave that no model explains."""
+    time = np.arange(samples) / 1000.0
+    current = 2.0 * np.sin(2 * np.pi * 1.3 * time) + np.sin(2 * np.pi * 0.21 * time)
+    run = so.simulate(so.plants.let_stick(PLANT), VALUES, so.Log.from_arrays(time=time, I=current))
+    noise = np.random.default_rng(1).normal(0.0, 0.02, time.size)
+    torque = run["tau_s"] + noise + disturbance * np.sign(np.sin(2 * np.pi * 0.4 * time))
+    return so.Experiment(plant=plant, log=so.Log.from_arrays(time=time, I=current, tau_s=torque))
+
+
+def test_smoothed_friction_that_makes_a_search_slow_is_advised_to_stick():
+    with pytest.raises(Heard) as heard:
+        so.fit([make_experiment(PLANT, 40_000)], VALUES.free("b_r"), progress=stop)
+    kind, text = heard.value.args
+    assert kind == "advice"
+    assert "sticks = true" in text
+    assert "v_s" in text
+
+
+@pytest.mark.parametrize(("plant", "samples"), [(so.plants.let_stick(PLANT), 40_000), (PLANT, 4000)])
+def test_what_sticks_or_is_short_gets_no_advice(plant, samples):
+    so.fit([make_experiment(plant, samples)], VALUES.free("b_r"), diagnostics=False, progress=stop)
+
+
+def test_causes_that_are_tried_are_told():
+    with pytest.raises(Heard, match="causes"):
+        so.fit([make_experiment(so.plants.let_stick(PLANT), 3000, 1.0)], VALUES.free("b_r"), progress=stop)
