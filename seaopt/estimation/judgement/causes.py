@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from itertools import combinations, zip_longest
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -316,14 +317,14 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
 
 
 def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
-    """Yield each effort at the spring as made of its deflection by two encoders, where the model has more in it."""
+    """Yield the effort at the spring as made of its deflection by two encoders, where the model has a damper in it."""
     first = experiments[0].plant
     sensing, spring = first.sensing, first.spring
     if sensing is None or spring is None or spring.stiffness is None or any(e.plant is not first for e in experiments):
         return
     stiffness, deflection = spring.stiffness, spring.deflection
     for output in experiments[0].outputs:
-        if output not in sensing.regulated or output in sensing.from_encoders:
+        if output not in sensing.regulated or not _adds_damping(first, output, stiffness):
             continue
 
         def h(t: Any, x: Any, u: Any, p: Any, output: str = output) -> Mapping[str, Any]:
@@ -342,6 +343,21 @@ def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet)
             where=output, experiments=tuple(replace(e, plant=plant) for e in experiments), params=params,
             describe=describe,
         )  # fmt: skip
+
+
+def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
+    """Tell whether an output is the spring's stiffness times its deflection at rest, and more in motion."""
+    assert plant.spring is not None
+    x, p = (
+        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
+        for names, symbols in ((plant.states, plant.x), (plant.parameters, plant.p))
+    )
+    row = plant.output[list(plant.outputs).index(output)] - getattr(p, stiffness) * plant.spring.deflection(x, p)
+    more = ca.Function("more", [plant.t, plant.x, plant.u, plant.p], [row])
+    still = np.array([0.0 if unit.endswith("/s") else 1.0 for unit in plant.states.values()])
+    ones = np.ones(len(plant.parameters))
+    rest, motion = (abs(float(more(0.0, at, 0.0, ones))) for at in (still, 1.0 + np.arange(still.size)))
+    return rest < 1e-12 < motion
 
 
 def _load_friction(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[_Candidate]:
