@@ -375,8 +375,8 @@ def _judge_step(
                 text += '; tune with reference_weights = "measurement" or objective = "noise", whose integral is slower'
             findings.add("overshoot", text, largest, allowed)
     if settling_s > scenario.settling_s:
-        when = f"after {settling_s:.3g} s" if settled else "not at all"
-        text = f"a step of {step:.3g} {unit} settles {when}, {scenario.settling_s:.3g} s are allowed"
+        when = f"after {settling_s:.4g} s" if settled else "not at all"
+        text = f"a step of {step:.3g} {unit} settles {when}, {scenario.settling_s:.4g} s are allowed"
         findings.add("settling", text, settling_s, scenario.settling_s)
 
 

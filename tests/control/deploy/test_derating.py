@@ -151,6 +151,8 @@ def test_the_file_has_what_the_code_needs(controller, tmp_path):
     content = json.loads(json.dumps(plain(controller.to_dict())))
     assert content["heat"]["continuous_A"] == pytest.approx(continuous_current(), rel=1e-12)
     assert content["heat"]["hottest"] == 120.0
+    assert content["heat"]["peak_A"] <= LIMIT_A  # what can be commanded
+    assert controller.rating.peak_A(1e-3) == LIMIT_A
     for folder, source in (("a", controller), ("b", content)):
         export(source, tmp_path / folder, name="law", derate=True)
     code = [(tmp_path / folder / "law.c").read_text() for folder in "ab"]
