@@ -279,8 +279,8 @@ def runnable(
 
 def choose_limit(command: Command, spec: ControllerSpec, asked: float | None) -> float | None:
     """Return the limit of a running law: the one asked for, infinite for none at all, else the controller's own."""
-    if asked is not None and math.isinf(asked):
-        return asked
+    if asked is not None and not 0.0 < require_number(asked, "current_limit_A", ControlError) < math.inf:
+        return asked  # none at all, or for `realise` to refuse
     return command.limit(spec.limit_asked if asked is None else asked)
 
 

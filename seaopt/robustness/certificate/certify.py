@@ -177,8 +177,9 @@ def certify(
     asked = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     models, others = _with_design(controller, plants, others or ParameterSet())
-    warmed = _find_warm_ranges(controller, others)
-    unknown = combine_uncertainty(parameters, others, warmed | dict(ranges or {}), models)
+    require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
+    ranges = {**_find_warm_ranges(controller, others), **(ranges or {})}
+    unknown = combine_uncertainty(parameters, others, ranges, models)
     _check_delay(controller, unknown.ranges)
     nominal, varied = unknown.nominal, unknown.varied()
     plants = split_friction(models, nominal, [row.name for row in varied])
