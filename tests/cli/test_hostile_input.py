@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -231,8 +232,9 @@ def test_a_full_disk_under_stdout_is_one_line(folder, options):
 def test_names_that_are_not_utf8_are_files_too(folder):
     write_csv(folder / "ok.csv", ["time [s]", "F1 [N]"])
     shutil.copy(folder / "ok.csv", os.fsencode(folder) + b"/l\xff.csv")
-    done = run_inspect(folder, b"l\xff.csv", "--json", "-o", b"out\xfe", stdout=subprocess.PIPE)
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert json.loads(done.stdout.decode("utf-8"))["schema"] == "seaopt/quality/1"
+    for options in (("-o", b"out\xfe"), ("--json",)):
+        done = run_inspect(folder, b"l\xff.csv", *options, stdout=subprocess.PIPE)
+        assert (done.returncode, done.stderr) == (0, b"")
+        io.TextIOWrapper(io.BytesIO(done.stdout), encoding="utf-8").read()
     assert (os.fsencode(folder) + b"/out\xfe/quality.json").decode("utf-8", "surrogateescape")
     assert os.path.exists(os.fsencode(folder) + b"/out\xfe/quality.json")  # noqa: PTH110

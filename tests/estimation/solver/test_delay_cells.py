@@ -66,7 +66,9 @@ def log_of_lines(samples_late: float, seed: int) -> so.Log:
     return so.Log.from_arrays(time=np.arange(current.size) / RATE, I=current, F1=outputs[:, 0], F2=outputs[:, 1])
 
 
-@pytest.mark.parametrize(("samples_late", "start"), [(0.0, 1.9), (2.7, 0.2)])
+@pytest.mark.parametrize(
+    ("samples_late", "start"), [(0.0, 1.9), pytest.param(2.0, 4.0, marks=pytest.mark.slow), (2.7, 0.2)]
+)
 def test_a_delay_of_an_input_of_straight_lines_is_found(samples_late, start):
     delay = so.Parameter(name="delay_s", value=start / RATE, unit="s", free=True, min=0.0, max=0.05)
     experiment = so.Experiment(plant=drive(), log=log_of_lines(samples_late, 1), delay_s=delay, hold="first")
