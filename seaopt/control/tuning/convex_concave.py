@@ -259,15 +259,18 @@ def solve_qp(
     quadratic: Float[np.ndarray, "n n"], linear: Float[np.ndarray, " n"], matrix: Float[np.ndarray, "m n"],
     lower: Float[np.ndarray, " m"], upper: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, " n"] | None:  # fmt: skip
-    """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where its status is not one of a solution."""
+    """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where it refuses, or its status is no solution."""
     import osqp
     from scipy.sparse import csc_matrix
 
     solver = osqp.OSQP(algebra="builtin")  # else it looks for others at every program
-    solver.setup(
-        P=csc_matrix(np.triu(quadratic)), q=linear, A=csc_matrix(matrix), l=lower, u=upper, verbose=False, eps_abs=1e-5,
-        eps_rel=1e-5, max_iter=500, check_termination=10,
-    )  # fmt: skip
+    try:
+        solver.setup(
+            P=csc_matrix(np.triu(quadratic)), q=linear, A=csc_matrix(matrix), l=lower, u=upper, verbose=False,
+            eps_abs=1e-5, eps_rel=1e-5, max_iter=500, check_termination=10,
+        )  # fmt: skip
+    except osqp.OSQPException:  # ends that have crossed by a rounding, or numbers that are not finite
+        return None
     result = solver.solve(raise_error=False)
     status: Any = osqp.SolverStatus
     usable = result.info.status_val in (

@@ -10,6 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Controller
+from seaopt.control.tuning.convex_concave import solve_qp
 from seaopt.errors import ControlError, FileError
 from tests.control.loops.test_loop import independent
 
@@ -248,3 +249,11 @@ def test_a_derivative_that_nothing_filters_is_said(controller, stand, thor):
     for spec in ({"max_noise_gain": 25}, {"objective": "noise"}):
         assert so.tune(stand, thor, so.ControllerSpec(**unfiltered, **spec)).notes == (lifted,)
     assert controller.notes == ()
+
+
+def test_a_program_that_the_solver_refuses_has_no_answer():
+    """Ends that have crossed, and what is not finite, are no step; they are not an exception of the solver's either."""
+    one, free = np.eye(2), np.full(2, np.inf)
+    assert solve_qp(one, np.zeros(2), one, np.full(2, 0.5), np.full(2, 0.4)) is None
+    assert solve_qp(one * np.nan, np.zeros(2), one, -free, free) is None
+    np.testing.assert_allclose(solve_qp(one, -np.ones(2), one, -free, free), 1.0, atol=1e-3)
