@@ -348,7 +348,7 @@ def test_the_step_error_is_that_of_the_parameters(swing, thor):
 
 IDENTIFIABILITY = [
     ("stand", ("F1", "F2"), ("eta", "K_tau", "J"), "K_tau and eta enter only together, as their product"),
-    ("stand", ("F1",), ("k", "J", "b_r"), "J, b_r and k enter only together"),
+    ("stand", ("F1",), ("k", "J", "b_r"), "J, b_r and k are known only in their ratios"),
     ("stand", ("F1",), ("m_l", "J"), "J and m_l enter only together"),
     ("stand", ("F1", "F2"), ("l", "N_p", "J"), "N_p and l enter only together, as their ratio"),
     pytest.param(
