@@ -177,10 +177,23 @@ def test_a_simulated_flexible_link_gives_its_frequency_and_damping(simulated):
         assert fit.parameters["c"].value == pytest.approx(LINK["c"], rel=0.1)
 
 
-def test_a_simulated_servo_gives_its_friction(simulated, tmp_path):
+def test_logs_of_a_simulated_servo_are_read(simulated, tmp_path):
+    """Each with the gain that its header states; the scale of the duty stands in the logs, too."""
     xl330 = script("xl330")
     folder = simulated("xl330")
     assert xl330.duty_scale(folder) == pytest.approx(4096 / (2 * np.pi) / 256, rel=0.01)
+    experiments = xl330.gather(folder, tmp_path).experiments()
+    assert {one.name: one.parameters["k_p"] for one in experiments} == {
+        f"{name}_{gain}": gain
+        for gain in (100, 400)
+        for name in ("sin_sin", "lift_and_drop", "up_and_down", "sin_time_square")
+    }
+
+
+@pytest.mark.slow
+def test_a_simulated_servo_gives_its_friction(simulated, tmp_path):
+    xl330 = script("xl330")
+    folder = simulated("xl330")
     problem = xl330.gather(folder, tmp_path)
     fit = xl330.fit(problem)
     assert fit.parameters["J"].value == pytest.approx(SERVO["J"], rel=0.05)
@@ -234,6 +247,7 @@ def elastic_joint():
     return joint, joint.record(goal, angles), joint.record(steps, others, 1), angles
 
 
+@pytest.mark.slow  # notebooks/elastic_joint.ipynb asserts the same
 def test_the_elastic_joint_of_the_docs_has_its_resonances_where_they_are(elastic_joint):
     """Eigenvalues of the joint's own equations give the resonances; the link's motion was not measured."""
     joint, log, steps, _ = elastic_joint
@@ -248,6 +262,7 @@ def test_the_elastic_joint_of_the_docs_has_its_resonances_where_they_are(elastic
     assert min(joint.predict(fit, steps).fit_percent.values()) > 95
 
 
+@pytest.mark.slow  # notebooks/elastic_joint.ipynb asserts the same
 def test_the_rigid_joint_of_the_docs_swings_less_than_half_as_far(elastic_joint):
     joint, log, steps, angles = elastic_joint
     fit = joint.fit_rigid(log, diagnostics=False)
