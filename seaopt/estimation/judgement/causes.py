@@ -138,7 +138,7 @@ def find_causes(
     candidates = _list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor)
     for number, candidate in enumerate(candidates, 1):
         if progress is not None:
-            progress("causes", f"fitted; looking for causes of what it does not explain, the {number}. is tried")
+            progress("causes", f"fitted; looking for causes of what it does not explain: trying number {number}")
         try:
             solved = _refit(minimum, candidate)
         except SeaoptError:  # what does not make a problem explains nothing

@@ -17,6 +17,7 @@ from seaopt.logs.formats.source import MAX_DEPTH, MAX_PARTS, Field, Source, Wind
 from seaopt.logs.formats.text_layout import MAX_LINE, line_length_error
 from seaopt.units import header_unit
 
+LARGEST = 1e308  # number that is taken; JSON has whole ones of any length
 MAX_WHOLE = 512 << 20  # JSON that is not in lines has to be held whole
 JsonEntry = Mapping[str, Any]
 
@@ -27,7 +28,11 @@ def open_json(path: Path) -> Source:
     columns, length = _list_columns(path, header)
     fields = tuple(Field(name=name, kind=kind, length=length, unit=header_unit(name)) for name, kind in columns.items())
     listed = ", ".join(f"{key} = {value}" for key, value in header.items())
-    constants = {key: (float(one), header_unit(key)) for key, one in header.items() if name_kind(one) == "float64"}
+    constants = {
+        key: (float(one), header_unit(key))
+        for key, one in header.items()
+        if name_kind(one) == "float64" and abs(one) <= LARGEST
+    }
     return Source(
         path=path, format="JSON", fields=fields, load=partial(_load, path), constants=constants,
         notes=(f"header: {listed}"[:400],) if header else (),
@@ -71,7 +76,7 @@ def _to_number(path: Path, place: str, name: str, value: Any) -> float:
         return float("nan")
     if not isinstance(value, int | float):
         raise LogError(f'{path}: {place}: {json.dumps(value)[:60]} in "{name}" is not a number; correct it')
-    if value in (float("inf"), float("-inf")) or abs(value) > 1e308:
+    if abs(value) > LARGEST:
         raise LogError(f'{path}: {place}: "{name}" is not finite; write null')
     return float(value)
 
