@@ -81,7 +81,7 @@ from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant
 from seaopt.plants.roles import PlantMaker, put_behind
 from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
-from seaopt.plants.sensors.deflection import read_deflection
+from seaopt.plants.sensors.deflection import keep_weights, read_deflection
 from seaopt.records import record
 
 Part = Literal[
@@ -419,4 +419,5 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         h=h,
         ports=tuple(port.change_makers(partial(_make_filtered, part=part, signals=signals)) for port in plant.ports),
         friction=put_behind(plant.friction, find_inputs) if where == "input" else plant.friction,
+        sensing=keep_weights(plant) if where == "output" else plant.sensing,
     )

@@ -70,6 +70,8 @@ class Sensing:
         What encoders on either side of the spring read.
     from_encoders : tuple of str
         Outputs that a device computes from these two positions: with their errors.
+    weights : mapping of output to callable ``p -> {encoder: expression}``
+        How much such an output moves with each encoder, where that is no longer its slope: behind a filter.
 
     """
 
@@ -78,6 +80,9 @@ class Sensing:
     motor_speed: str | None = None
     link_position: str | None = None
     from_encoders: tuple[str, ...] = ()
+    weights: Mapping[str, Callable[[Any], Mapping[str, Any]]] = field(
+        default_factory=dict[str, Callable[[Any], Mapping[str, Any]]], repr=False
+    )
 
 
 @record(eq=False)

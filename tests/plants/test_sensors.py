@@ -125,3 +125,19 @@ def test_noise_of_encoders_reaches_the_loop():
         )  # fmt: skip
         runs.append(run_loop(loop, [params], np.ones(300)).outputs["tau_d"])
     np.testing.assert_allclose(*runs, atol=1e-12)
+
+
+@pytest.mark.parametrize("part", ["measurement_delay", "load_cell"])
+def test_an_encoders_error_passes_a_delay_and_a_load_cell(part):
+    """Both have a gain of 1 at rest, so that an offset e of theta_m is k_n e/N of tau_d, one of theta_l is -k_n e."""
+    plant, params = make_knee("free")
+    behind = so.plants.wrapped(plant, [part])
+    assert evaluate_weights(behind, behind.complete(params), "tau_d") == pytest.approx(
+        {"theta_m": 320.0 / 50.0, "theta_l": -320.0}
+    )
+    sensors, noise = so.Sensors(offset={"theta_m": 0.01, "theta_l": 1e-4}), (so.bench.Noise(std=0.1, band_hz=20.0),)
+    erring, ideal = (
+        so.virtual_log(behind, params, noise, duration_s=0.2, rate_hz=500, seed=3, sensors=one)["tau_d"]
+        for one in (sensors, so.Sensors())
+    )
+    np.testing.assert_allclose(erring - ideal, 320.0 / 50.0 * 0.01 - 320.0 * 1e-4, atol=1e-9)

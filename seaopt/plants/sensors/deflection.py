@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,7 +27,7 @@ import casadi as ca
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants.plant import CompletedParameters, Plant
-from seaopt.plants.roles import PlantMaker
+from seaopt.plants.roles import PlantMaker, Sensing
 from seaopt.units import ROTARY
 
 NOMINAL = "k_n"
@@ -77,19 +78,41 @@ def _read_deflection_of(make: PlantMaker) -> Plant:
 def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:
     """Return how much an output moves with what each encoder reads: {output or state that is read: expression of p}.
 
-    Empty where the output is not computed from encoders.
+    Empty where the output is not computed from encoders. Behind a delay or a load cell these are the weights inside.
     """
     sensing, port = plant.sensing, plant.port
-    position = sensing.motor_position if sensing is not None and output in sensing.from_encoders else None
+    if sensing is None or output not in sensing.from_encoders:
+        return {}
+    p = SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
+    if output in sensing.weights:
+        return dict(sensing.weights[output](p))
+    position = sensing.motor_position
     if position is None or position not in plant.states:
         return {}
     motor = list(plant.states).index(position)
     slope = ca.simplify(ca.jacobian(plant.output[list(plant.outputs).index(output)], plant.x[motor]))
     weights: dict[str, Any] = {position: slope}
     if port is not None and port.motion is not None and port.drive == position:
-        p = SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
         weights[port.motion] = ca.simplify(slope * port.ratio(p))
     return weights
+
+
+def keep_weights(plant: Plant) -> Sensing | None:
+    """Return the sensing of a plant whose outputs pass a filter, behind which their slopes are not the encoders'."""
+    sensing = plant.sensing
+    if sensing is None or not sensing.from_encoders:
+        return sensing
+    found = {output: partial(_weigh_inside, plant, output) for output in sensing.from_encoders}
+    return replace(sensing, weights={**found, **sensing.weights})
+
+
+def _weigh_inside(plant: Plant, output: str, p: Any) -> dict[str, Any]:
+    weights = weigh_encoders(plant, output)
+    if not weights:
+        return {}
+    stack = ca.Function("weights", [plant.p], [ca.densify(ca.vertcat(*weights.values()))])
+    values = stack(ca.vertcat(*(getattr(p, name) for name in plant.parameters)))
+    return dict(zip(weights, ca.vertsplit(values), strict=True))
 
 
 def evaluate_weights(plant: Plant, params: CompletedParameters, output: str) -> dict[str, float]:
