@@ -1,6 +1,7 @@
 """A winding that warms up, against equations written here, closed forms and an integrator of its own."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import seaopt as so
 from seaopt.control.loops.sampled_plant import differentiate_linearisation, linearise
 from seaopt.errors import PlantError
 from seaopt.plants import rate_motor
-from seaopt.plants.motor.thermal import find_resistance_range, freeze_heat
+from seaopt.plants.motor.thermal import find_warm_range, freeze_heat
 
 HOT = {"R": 0.7, "alpha_cu": 0.0039, "R_wc": 1.3, "R_ca": 3.1, "C_w": 15.0, "C_c": 160.0, "T_ambient": 21.0}
 T_MAX = 120.0
@@ -183,21 +184,42 @@ def test_a_plant_with_heat_pickles_and_its_held_partner_has_heat():
 
 def test_a_certificate_of_a_voltage_looks_at_the_winding_cold_and_hot():
     plant, values = make(parts=["voltage_input"])
-    assert find_resistance_range(PLANT, VALUES) == {}  # a current is commanded
-    ((cold, hot),) = find_resistance_range(plant, values).values()
-    assert cold == HOT["R"]
-    resistance = HOT["R"] * (1.0 + HOT["alpha_cu"] * (T_MAX - 25.0))
-    assert hot * (1.0 + HOT["alpha_cu"] * (HOT["T_ambient"] - 25.0)) == pytest.approx(resistance, rel=1e-12)
+    assert find_warm_range(PLANT, VALUES) is None  # a current is commanded
+    assert find_warm_range(plant, values) == (HOT["T_ambient"], T_MAX)
+    cold, hot = (HOT["R"] * (1.0 + HOT["alpha_cu"] * (T - 25.0)) for T in (HOT["T_ambient"], T_MAX))
     spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, command_limit=24.0, max_sensitivity=1.6)
     controller = so.tune(plant, values, spec)
     gain = controller.close(plant, values).plant.static_gain
-    assert controller.close(plant, values.update(R=hot)).plant.static_gain == pytest.approx(gain * cold / hot)
-    certificate = so.certify(controller, {"elbow": plant}, values, samples=60)
-    (row,) = [row for row in certificate.varied if row.name == "R"]
-    assert (row.low, row.high) == (cold, hot)
-    cool = so.certify(controller, {"elbow": plant}, values, samples=60, ranges={"R": (0.69, 0.71)})
-    (row,) = [row for row in cool.varied if row.name == "R"]
-    assert (row.low, row.high) == (0.69, 0.71)
+    warm = controller.close(plant, values.update(T_ambient=T_MAX)).plant.static_gain
+    assert warm == pytest.approx(gain * cold / hot, rel=1e-9)
+    # What is uncertain of R itself stays so, a range or a standard deviation; and the plant need not be the design's.
+    uncertain = values.with_parameters(replace(values["R"], prior_std=0.1))
+    certificate = so.certify(controller, {"elbow": plant}, uncertain, samples=20)
+    assert {row.name: (row.low, row.high) for row in certificate.varied if row.std is None} == {
+        "T_ambient": (HOT["T_ambient"], T_MAX)
+    }
+    assert [row.std for row in certificate.varied if row.name == "R"] == [0.1]
+    without = so.plants.rotary(link="locked", parts=["voltage_input"])
+    on_cold = so.tune(without, values, spec)
+    given = {"R": (0.69, 0.71), "T_ambient": (-20.0, 40.0)}
+    other = so.certify(on_cold, {"stand": without, "elbow": plant}, values, samples=20, ranges=given)
+    assert {row.name: (row.low, row.high) for row in other.varied} == {"R": (0.69, 0.71), "T_ambient": (-20.0, T_MAX)}
+
+
+def test_the_probe_of_a_port_warms_up_too():
+    """At 85 degC the probe is that of a winding of so much more resistance."""
+    ambient, parts = 85.0, ["voltage_input"]
+    plant = so.plants.rotary(link="free", parts=[*parts, "thermal"])
+    without = so.plants.rotary(link="free", parts=parts)
+    values = plant.defaults.update(T_ambient=ambient)
+    by_hand = without.defaults.update(R=values["R"].value * (1.0 + values["alpha_cu"].value * (ambient - 25.0)))
+    models = []
+    for one, its in ((freeze_heat(plant), values), (without, by_hand)):
+        probe = one.port.probe()
+        models.append(probe.linearize(probe.complete(its)))
+    for name in ("A", "B", "C", "D"):
+        assert getattr(models[0], name) == pytest.approx(getattr(models[1], name), rel=1e-12, abs=1e-12)
+    assert "rise_winding" in plant.port.probe().states
 
 
 def test_loops_of_a_commanded_current_are_those_without_heat():

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -41,6 +40,7 @@ from seaopt.records import record
 
 COPPER = 0.00393  # 1/K, at 20 to 25 degC
 REFERENCE_DEGC = 25.0
+AMBIENT = "T_ambient"
 PEAK_S = 10.0
 RISES = ("rise_winding", "rise_case")
 TEMPERATURES = ("T_winding", "T_case")
@@ -54,7 +54,7 @@ PARAMETERS = (
     Parameter(name="R_ca", value=4.0, unit="K/W", min=1e-9, description="from case to air", plausible=(1e-3, 1e3)),
     Parameter(name="C_w", value=20.0, unit="J/K", min=1e-9, description="heat of the winding", plausible=(1e-2, 1e5)),
     Parameter(name="C_c", value=400.0, unit="J/K", min=1e-9, description="heat of the case", plausible=(1e-1, 1e6)),
-    Parameter(name="T_ambient", value=25.0, unit="degC", min=-273.15, description="of the air", plausible=(-60, 80)),
+    Parameter(name=AMBIENT, value=25.0, unit="degC", min=-273.15, description="of the air", plausible=(-60, 80)),
     Parameter(name="T_max", value=125.0, unit="degC", min=-273.15, description="largest of the winding"),
 )
 
@@ -136,9 +136,7 @@ def add_heat(plant: Plant) -> Plant:
         states={**plant.states, **dict.fromkeys(RISES, "K")},
         outputs={**plant.outputs, **dict.fromkeys(TEMPERATURES, "degC")},
         parameters={**plant.parameters, **{item.name: item for item in PARAMETERS}},
-        ports=tuple(
-            port if port.held is None else replace(port, held=partial(_add_again, port.held)) for port in plant.ports
-        ),
+        ports=tuple(port.change_makers(_add_again) for port in plant.ports),
     )  # fmt: skip
 
 
@@ -175,9 +173,7 @@ def freeze_heat(plant: Plant) -> Plant:
         states={name: unit for name, unit in plant.states.items() if name not in still},
         outputs={name: unit for name, unit in plant.outputs.items() if name not in winding.temperatures},
         friction={name: freeze(one) for name, one in plant.friction.items()},
-        ports=tuple(
-            port if port.held is None else replace(port, held=partial(_freeze_again, port.held)) for port in plant.ports
-        ),
+        ports=tuple(port.change_makers(_freeze_again) for port in plant.ports),
     )  # fmt: skip
 
 
@@ -374,13 +370,14 @@ def rate_motor(plant: Plant, params: ParameterSet) -> MotorRating:
     )  # fmt: skip
 
 
-def find_resistance_range(plant: Plant, params: ParameterSet) -> dict[str, tuple[float, float]]:
-    """Return the range of the resistance's parameter that a loop meets between the ambient temperature and T_max.
+def find_warm_range(plant: Plant, params: ParameterSet) -> tuple[float, float] | None:
+    """Return the winding's temperatures that a loop meets, from the ambient's to T_max, degC.
 
-    It is empty where the winding does not warm up, or a current is commanded, which it does not change.
+    None where the winding does not warm up, or a current is commanded, which its resistance does not change. A plant
+    that is linearised has its winding at T_ambient: drawn from this range, that makes R warm, with whatever else is
+    uncertain of R.
     """
     if plant.winding is None or plant.actuation is None or plant.inputs[plant.actuation.input] == "A":
-        return {}
-    rating, p = rate_motor(plant, params), plant.complete(params).by_attribute
-    hot = rating.resistance + rating.slope * rating.allowed_rise
-    return {RESISTANCE.name: (float(p.R), float(p.R * hot / rating.resistance))}
+        return None
+    rating = rate_motor(plant, params)
+    return rating.ambient, rating.hottest

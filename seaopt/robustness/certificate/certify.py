@@ -25,7 +25,7 @@ from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
-from seaopt.plants.motor.thermal import find_resistance_range
+from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.plants.plant import require_plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
@@ -45,7 +45,7 @@ from seaopt.robustness.certificate.requirements import (
     plant_requirements,
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
-from seaopt.robustness.uncertainty.draws import Uncertainty, combine_uncertainty
+from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty
 from seaopt.robustness.uncertainty.severity import LARGEST_MS, LARGEST_MT, limits, severities
 from seaopt.robustness.uncertainty.worst import combine_worst, find_worst, measure_worst
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
@@ -126,7 +126,8 @@ def certify(
         A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one.
     ranges : mapping of name to (low, high), optional
         Drawn uniformly instead: parameters; conditions, which are an angle to linearise at (phi, rad) and delay_s,
-        seconds besides the controller's; and screw_mode_hz, where the screw's mode is, of plants with that part.
+        seconds besides the controller's; and screw_mode_hz, where the screw's mode is, of plants with that part. Where
+        a winding warms up and a voltage or a duty is commanded, T_ambient, which makes R warm, also runs up to T_max.
     others : ParameterSet, optional
         Values of parameters that the fit's plants do not have; the plants' defaults where left out.
     samples : int
@@ -178,7 +179,7 @@ def certify(
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     models, others = _with_design(controller, plants, others or ParameterSet())
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
-    ranges = {**_find_warm_ranges(controller, others), **(ranges or {})}
+    ranges = _add_warm_winding(ranges or {}, models, parameters, others)
     unknown = combine_uncertainty(parameters, others, ranges, models)
     _check_delay(controller, unknown.ranges)
     nominal, varied = unknown.nominal, unknown.varied()
@@ -220,11 +221,19 @@ def certify(
     return certificate.with_steps()
 
 
-def _find_warm_ranges(controller: Controller, others: ParameterSet) -> dict[str, tuple[float, float]]:
-    """Return the range of the winding's resistance, cold to hot, where a voltage or a duty is commanded."""
-    assert controller.design is not None
-    plant, values = controller.design
-    return find_resistance_range(plant, others.with_parameters(*values.values()))
+def _add_warm_winding(
+    ranges: Mapping[str, tuple[float, float]], models: Mapping[str, Plant], parameters: Fit | ParameterSet,
+    others: ParameterSet,
+) -> dict[str, tuple[float, float]]:  # fmt: skip
+    """Return the ranges with the temperatures of every winding that changes its loop, and those given for the air."""
+    known = parameters.parameters if isinstance(parameters, Fit) else parameters
+    values = others.with_parameters(*known.values())
+    warm = [found for plant in models.values() if (found := find_warm_range(plant, values)) is not None]
+    if not warm:
+        return dict(ranges)
+    check_ranges(ranges, models)
+    ends = [*warm, *([ranges[AMBIENT]] if AMBIENT in ranges else [])]
+    return {**ranges, AMBIENT: (min(low for low, _ in ends), max(high for _, high in ends))}
 
 
 def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tuple[str, ...]:
