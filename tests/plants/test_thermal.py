@@ -87,6 +87,42 @@ def test_ratings_end_at_the_largest_temperature():
     assert RATING.peak_effort(2.0) == pytest.approx(per_ampere * RATING.peak_A(2.0))
 
 
+@pytest.mark.parametrize(("part", "values", "command", "volts"), [
+    ("duty_input", {"V_s": 2.0}, None, 2.0), ("duty_input", {"V_s": 2.0}, 0.5, 1.0), ("voltage_input", {}, 1.5, 1.5)
+])  # fmt: skip
+def test_a_rating_keeps_to_what_the_voltage_drives(part, values, command, volts):
+    """At rest I = V/R(T): of T_max for ever, of the end of a peak for that."""
+    plant, params = make(parts=[part])
+    rating = rate_motor(plant, params.update(**values), command)
+    hot = HOT["R"] * (1.0 + HOT["alpha_cu"] * (T_MAX - 25.0))
+    assert rating.continuous_A == pytest.approx(volts / hot, rel=1e-12)
+    assert rating.continuous_A < RATING.continuous_A  # which the voltage does not reach
+    peak = rating.peak_A(10.0)
+    end = HOT["T_ambient"] + warm_up(np.full(40, peak), 0.25)[0, -1]
+    assert peak * HOT["R"] * (1.0 + HOT["alpha_cu"] * (end - 25.0)) == pytest.approx(volts, rel=1e-8)
+    assert rate_motor(plant, params.update(V_s=1e3) if values else params).peak_A() == pytest.approx(RATING.peak_A())
+
+
+def test_a_controller_of_a_voltage_states_what_its_limit_allows():
+    plant, values = make(parts=["voltage_input"])
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, command_limit=1.5)
+    rating = so.tune(plant, values, spec).rating
+    assert rating.continuous_A == pytest.approx(1.5 / (HOT["R"] * (1.0 + HOT["alpha_cu"] * (T_MAX - 25.0))))
+
+
+def test_a_winding_that_runs_away_is_infinitely_hot():
+    """No number holds what exp(rate t) gives here; the current of a peak so long is the continuous one."""
+    assert np.max(np.linalg.eigvals(RATING.matrix(50.0)).real) * 1e4 > 710.0
+    np.testing.assert_array_equal(RATING.rises(50.0, 1e4), [np.inf, np.inf])
+    assert RATING.peak_A(1e7) == pytest.approx(RATING.continuous_A, rel=1e-9)
+
+
+def test_a_largest_temperature_below_the_air_is_refused_before_it_is_tuned():
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15)
+    with pytest.raises(PlantError, match="T_max"):
+        so.tune(PLANT, VALUES.update(T_max=20.0), spec)
+
+
 def test_a_short_peak_is_heat_in_the_winding_alone():
     """Over a hundredth of the short time constant nothing leaves: C_w d(rise)/dt = R (1 + a rise) I^2."""
     duration = 0.01 * RATING.time_constants_s()[0]

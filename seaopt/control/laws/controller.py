@@ -208,8 +208,7 @@ class Controller:
         """What the motor of the design plant can do without overheating; None without the part "thermal"."""
         if self.design is None or self.design[0].winding is None:
             return None
-        rating = rate_motor(*self.design)
-        return replace(rating, largest_A=self.command_limit) if self.command.unit == "A" else rating
+        return rate_motor(*self.design, self.command_limit)
 
     @property
     def heat_guard(self) -> HeatGuard | None:

@@ -63,6 +63,7 @@ from seaopt.plants.friction import (
     list_fall_parameters,
     split_friction,
 )
+from seaopt.plants.motor.thermal import rate_motor
 from seaopt.plants.plant import require_plant
 
 
@@ -117,6 +118,8 @@ def tune(
     spec = settle_delay(spec, plant, params)
     params = params.parameters if isinstance(params, Fit) else params
     values = plant.complete(params)
+    if plant.winding is not None:
+        rate_motor(plant, values)  # the controller states it: refused here, not when it is printed
     task = make_task(plant, values, spec, robust_to or {}, draws)
     check_delay(spec, task.plants[0])
     command = command_of(plant, values, spec.measured)

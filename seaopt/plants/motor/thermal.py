@@ -203,6 +203,8 @@ class MotorRating:
         Of the effort.
     largest_A : float or None
         The largest current that can be commanded, where that is known.
+    largest_V : float or None
+        The same of the voltage; of a duty, of what it makes. The motor stands still.
 
     """
 
@@ -217,6 +219,7 @@ class MotorRating:
     per_ampere: float
     unit: str
     largest_A: float | None = None
+    largest_V: float | None = None
 
     @property
     def allowed_rise(self) -> float:
@@ -227,10 +230,12 @@ class MotorRating:
     def continuous_A(self) -> float:
         """The current that holds the winding at its largest temperature for ever.
 
-        All of the loss flows through both resistances: R(T_max) I^2 (R_wc + R_ca) = T_max - T_ambient.
+        All of the loss flows through both resistances: R(T_max) I^2 (R_wc + R_ca) = T_max - T_ambient. No more than
+        the largest command makes in the winding that is so warm.
         """
-        loss = self.allowed_rise / (self.to_case + self.to_air)
-        return self._limit(math.sqrt(loss / (self.resistance + self.slope * self.allowed_rise)))
+        loss, hot = self.allowed_rise / (self.to_case + self.to_air), self.resistance + self.slope * self.allowed_rise
+        current_A = math.sqrt(loss / hot)
+        return self._limit(current_A if self.largest_V is None else min(current_A, self.largest_V / hot))
 
     @property
     def continuous_effort(self) -> float:
@@ -239,6 +244,8 @@ class MotorRating:
 
     def peak_A(self, duration_s: float = PEAK_S, start: tuple[float, float] = (0.0, 0.0)) -> float:
         """Return the constant current after which, from temperatures above the ambient, the winding is at its largest.
+
+        No more than the largest command makes, of a voltage in the winding that is as warm as it then ends.
 
         Parameters
         ----------
@@ -257,7 +264,7 @@ class MotorRating:
             raise PlantError(f"duration_s = {duration_s:g} is not positive; give how long the peak lasts")
 
         def excess(current_A: float) -> float:
-            return float(self.rises(current_A, duration_s, start)[0]) - self.allowed_rise
+            return min(float(self.rises(current_A, duration_s, start)[0]), 2.0 * self.allowed_rise) - self.allowed_rise
 
         if not (start[0] < self.allowed_rise and excess(0.0) < 0.0):
             raise PlantError(
@@ -270,7 +277,18 @@ class MotorRating:
         while excess(high) < 0.0:
             high *= 2.0
         root: Any = brentq(excess, 0.0, high, xtol=1e-12 * high)
-        return self._limit(float(root))
+        most = float(root)
+        if self.largest_V is not None:
+            volts = self.largest_V
+
+            def dropped(current_A: float) -> float:
+                warm = self.resistance + self.slope * float(self.rises(current_A, duration_s, start)[0])
+                return current_A * warm - volts
+
+            if dropped(most) > 0.0:  # the winding, as warm as it is at the end, does not take so much
+                root = brentq(dropped, 0.0, most, xtol=1e-12 * most)
+                most = float(root)
+        return self._limit(most)
 
     def peak_effort(self, duration_s: float = PEAK_S, start: tuple[float, float] = (0.0, 0.0)) -> float:
         """Return the effort of that current at the spring."""
@@ -279,12 +297,16 @@ class MotorRating:
     def rises(
         self, current_A: float, duration_s: float, start: tuple[float, float] = (0.0, 0.0)
     ) -> Float[np.ndarray, " 2"]:
-        """Return how far winding and case are above the ambient (K) after a constant current."""
+        """Return how far winding and case are above the ambient (K) after a constant current.
+
+        Infinite where the winding runs away beyond what a number holds.
+        """
         heating = np.array([self.resistance * current_A**2 / self.winding, 0.0])
         rates, modes = np.linalg.eig(self.matrix(current_A))  # two different ones: the module's docstring
         with np.errstate(over="ignore", invalid="ignore"):  # a winding that runs away
             grown, collected = np.exp(rates * duration_s), np.expm1(rates * duration_s) / rates
-            return modes @ (grown * np.linalg.solve(modes, start) + collected * np.linalg.solve(modes, heating))
+            after = modes @ (grown * np.linalg.solve(modes, start) + collected * np.linalg.solve(modes, heating))
+        return after if np.all(np.isfinite(after)) else np.full(2, math.inf)
 
     def matrix(self, current_A: float = 0.0) -> Float[np.ndarray, "2 2"]:
         """Return what heat does by itself, 1/s, with what the growing resistance adds at a constant current."""
@@ -328,7 +350,7 @@ class MotorRating:
     _repr_html_ = html_text
 
 
-def rate_motor(plant: Plant, params: ParameterSet) -> MotorRating:
+def rate_motor(plant: Plant, params: ParameterSet, largest: float | None = None) -> MotorRating:
     """Return the continuous and peak currents and efforts of a motor, by the part "thermal".
 
     Parameters
@@ -337,6 +359,8 @@ def rate_motor(plant: Plant, params: ParameterSet) -> MotorRating:
         With that part.
     params : ParameterSet
         Its parameters, or those of a fit.
+    largest : float, optional
+        The largest command, in its unit; that of the plant's actuation if left out.
 
     Raises
     ------
@@ -362,11 +386,18 @@ def rate_motor(plant: Plant, params: ParameterSet) -> MotorRating:
     resistance = float(find_resistance(winding, None, p))
     if not resistance > 0.0:
         raise PlantError(f"R = {p.R:g} ohm at 25 degC is {resistance:g} ohm at T_ambient = {p.T_ambient:g} degC; check")
-    commands_current = plant.actuation is not None and plant.inputs[plant.actuation.input] == "A"
+    largest = find_range(plant, values) if largest is None else largest
+    largest_A, largest_V = None, None
+    if plant.actuation is not None and largest is not None:
+        source = plant.actuation.input
+        if plant.inputs[source] == "A":
+            largest_A = largest
+        elif plant.inputs[source] == "V" or source == "duty":  # `seaopt.plants.drives`
+            largest_V = largest * (p.V_s if source == "duty" else 1.0)
     return MotorRating(
         resistance=resistance, slope=p.R * p.alpha_cu, to_case=p.R_wc, to_air=p.R_ca, winding=p.C_w, case=p.C_c,
         ambient=p.T_ambient, hottest=p.T_max, per_ampere=float(winding.effort(p)), unit=winding.unit,
-        largest_A=find_range(plant, values) if commands_current else None,
+        largest_A=largest_A, largest_V=largest_V,
     )  # fmt: skip
 
 
