@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -194,11 +195,21 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "law": law,
         "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
-        "delay_samples": table.delay_samples, "command": Command(**table.command.model_dump()), "spec": spec,
+        "delay_samples": table.delay_samples, "command": _build_command(table.command), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
         "observer": observer, "blocked_by": tuple(table.blocked_by),
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
+
+
+def _build_command(stored: StoredCommand) -> Command:
+    """Return the command; a duty ends at 1 also where the file is older than ranges, and has none."""
+    command = Command(**stored.model_dump())
+    if (command.input, command.unit) != ("duty", "-"):
+        return command
+    if command.largest is not None and command.largest > 1.0:
+        raise _contradict("command.largest", f"is {command.largest:g}, and a duty ends at 1")
+    return command if "largest" in stored.model_fields_set else replace(command, largest=1.0)
 
 
 def _build_spec(stored: StoredSpec) -> tuple[ControllerSpec, tuple[str, ...]]:

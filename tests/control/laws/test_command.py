@@ -11,7 +11,7 @@ import seaopt as so
 from seaopt.control import Controller, MPCSpec, export_mpc, force_mpc
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
-from seaopt.errors import ControlError, PlantError, SeaoptError
+from seaopt.errors import ControlError, FileError, PlantError, SeaoptError
 from seaopt.estimation import Limits, design_experiment
 from seaopt.plants.equations.stored_equations import store_plant
 from seaopt.plants.plant import find_range
@@ -107,12 +107,17 @@ def test_two_limits_are_one_too_many():
             MPCSpec(bandwidth_hz=15, **limits)
 
 
-def test_the_range_comes_back_from_the_file_and_from_the_plant(asked_for_nine):
+def test_the_range_comes_back_from_the_file_and_from_the_plant(asked_for_nine, tmp_path):
     content = json.loads(json.dumps(so.files.plain(asked_for_nine.to_dict())))
     assert content["command"]["largest"] == 1.0
     assert Controller.from_dict(content, PLANT, VALUES).command_limit == 1.0
     del content["command"]["largest"]  # as written before there were ranges
     assert Controller.from_dict(content, PLANT, VALUES).command_limit == 1.0
+    export(content, tmp_path, name="elbow")  # for which 9 was asked
+    assert "#define ELBOW_DUTY_LIMIT 1.0\n" in (tmp_path / "elbow.h").read_text()
+    content["command"]["largest"] = 5.0
+    with pytest.raises(FileError, match=r"command\.largest"):
+        export(content, tmp_path)
 
 
 def test_a_plant_of_ones_own_states_its_range():
