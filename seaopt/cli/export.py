@@ -8,13 +8,15 @@ from typing import Any
 
 from seaopt.cli.provenance import FILES, check_unedited, digest
 from seaopt.cli.session import SCHEMAS, UNMET
-from seaopt.control.deploy.export import export
+from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
 
 
-def export_controller(results: Path, target: Path, json: bool, **options: Any) -> bool:
+def export_controller(
+    results: Path, target: Path, json: bool, derate_margin_K: float | None = None, **options: Any
+) -> bool:
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
 
     It may where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail.
@@ -34,6 +36,8 @@ def export_controller(results: Path, target: Path, json: bool, **options: Any) -
     expected = None if made_from is None else made_from.get(fitted.name)
     if expected is not None and fitted.exists() and digest(fitted) != expected:
         raise ProblemError(f"{path}: was tuned with another fit than {fitted.name} beside it; run seaopt tune again")
+    if derate_margin_K is not None:  # without a guard `export` says what is missing
+        options["derate"] = read_guard(content, derate_margin_K) or True
     written = [str(file) for file in export(content, target, **options)]
     met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, results / FILES["certify"])
     if json:

@@ -244,6 +244,7 @@ def export(
     derate: Annotated[
         bool, typer.Option("--derate", help='Lower the limit as the winding warms up, by the part "thermal".')
     ] = False,
+    derate_margin: Annotated[float | None, typer.Option(metavar="KELVIN", help="The same, so far below T_max.")] = None,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
     ] = False,
@@ -256,7 +257,7 @@ def export(
         "current_limit_A": current_limit, "command_limit": command_limit, "tracking_time_s": tracking_time,
         "derate": derate, "allow_infeasible": allow_infeasible,
     }  # fmt: skip
-    if not export_controller(results, c, json, precision=precision, name=name, **options):
+    if not export_controller(results, c, json, derate_margin, precision=precision, name=name, **options):
         raise typer.Exit(1)
 
 

@@ -22,10 +22,12 @@ from seaopt.control.laws.controller import Controller, name_gain_units
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
 from seaopt.control.laws.spec import check_command_limits
+from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
-from seaopt.errors import ControlError, FileError
+from seaopt.errors import ControlError, FileError, require_type
 from seaopt.files import write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
+from seaopt.plants.motor.thermal import MotorRating
 
 Precision = Literal["double", "float"]
 LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
@@ -56,7 +58,7 @@ def export(
     command_limit: float | None = None,
     tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None,
-    derate: bool = False,
+    derate: bool | HeatGuard = False,
     allow_infeasible: bool = False,
 ) -> tuple[Path, ...]:
     """Write a controller as C99, with its gains as a C header and as a MATLAB script.
@@ -77,9 +79,9 @@ def export(
         As in `seaopt.control.laws.realisation.runnable`.
     gate : PlausibilityGate, optional
         Which readings the law believes, and what it does about the others.
-    derate : bool
+    derate : bool or HeatGuard
         Lower the limit as the winding warms up, by `seaopt.plants.motor.heat_guard`: of a design plant with the part
-        "thermal" that is commanded a current.
+        "thermal" that is commanded a current; or by a guard of your own, with a margin say, at the law's sample time.
     allow_infeasible : bool
         Also write a controller that misses its limits; the files state it.
 
@@ -116,11 +118,13 @@ def export(
     else:
         from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
-        stored, figures, heat = read_controller(controller), _stated(controller), _read_guard(controller)
+        stored, figures, heat = read_controller(controller), _stated(controller), read_guard(controller)
     if not stored["feasible"] and not allow_infeasible:
         missed = join_labels(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
     check_command_limits(current_limit_A, command_limit)
+    require_type(derate, (bool, HeatGuard), "derate", "give True, False or a HeatGuard", ControlError)
+    heat = derate if isinstance(derate, HeatGuard) else heat
     if derate and heat is None:
         raise ControlError(
             "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that is "
@@ -142,11 +146,31 @@ def export(
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
 
 
-def _read_guard(content: Mapping[str, Any]) -> HeatGuard | None:
-    """Return the heat guard of a controller.json, where it has one."""
+def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard | None:
+    """Return the heat guard of a controller.json, where it has one, made again from its network with a margin.
+
+    Raises
+    ------
+    FileError
+        The file's own guard is not that of its network.
+    ControlError
+        A number is missing or out of range.
+
+    """
     heat = content.get("heat")
     guard = heat.get("guard") if isinstance(heat, Mapping) else None
-    return HeatGuard.from_dict(guard) if isinstance(guard, Mapping) else None
+    if not isinstance(heat, Mapping) or not isinstance(guard, Mapping):
+        return None
+    stated, rating, period = HeatGuard.from_dict(guard), MotorRating.from_dict(heat), content["sample_time_s"]
+    made = HeatGuard.of_rating(rating, period)
+    for field in fields(HeatGuard):
+        one, other = getattr(stated, field.name), getattr(made, field.name)
+        if not math.isclose(one, other, rel_tol=AGREES, abs_tol=0.0):
+            raise FileError(
+                f"controller.json: heat.guard.{field.name} is {one:.6g}, and the network of heat makes {other:.6g}; "
+                "tune again"
+            )
+    return HeatGuard.of_rating(rating, period, margin_K=margin_K)
 
 
 def _identifier(name: str) -> str:

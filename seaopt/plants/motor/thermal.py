@@ -23,7 +23,8 @@ two time constants. Where the feedback of the resistance makes one positive the 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -42,6 +43,8 @@ COPPER = 0.00393  # 1/K, at 20 to 25 degC
 REFERENCE_DEGC = 25.0
 AMBIENT = "T_ambient"
 PEAK_S = 10.0
+OPTIONAL = ("largest_A", "largest_V")  # of a MotorRating
+SIGNED = ("slope", "ambient", "hottest", "per_ampere")
 RISES = ("rise_winding", "rise_case")
 TEMPERATURES = ("T_winding", "T_case")
 RESISTANCE = Parameter(
@@ -220,6 +223,28 @@ class MotorRating:
     unit: str
     largest_A: float | None = None
     largest_V: float | None = None
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> MotorRating:
+        """Return the rating of what `to_dict` gives.
+
+        Raises
+        ------
+        PlantError
+            A number is missing, not finite or not positive.
+
+        """
+        values: dict[str, Any] = {"unit": str(content.get("unit", ""))}
+        for field in fields(cls):
+            value = content.get(field.name)
+            if field.name == "unit" or (value is None and field.name in OPTIONAL):
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise PlantError(f"heat.{field.name} = {value!r} is not a finite number; tune again")
+            if value <= 0.0 and field.name not in SIGNED:
+                raise PlantError(f"heat.{field.name} = {value:g} is not positive; tune again")
+            values[field.name] = float(value)
+        return cls(**values)
 
     @property
     def allowed_rise(self) -> float:

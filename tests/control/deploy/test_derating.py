@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.deploy.export import export
+from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import runnable
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, FileError, PlantError
 from seaopt.files import plain
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
@@ -62,9 +62,9 @@ def run_law(law, samples, reference, measurement=0.0):
     return np.array(commands), np.array(rises)
 
 
-def compile_law(compiler, controller, folder, precision="double", gated=False, **options):
+def compile_law(compiler, controller, folder, precision="double", gated=False, derate=True, **options):
     """Return the step of an exported law as a function, and its struct."""
-    export(controller, folder, name="law", precision=precision, derate=True, **options)
+    export(controller, folder, name="law", precision=precision, derate=derate, **options)
     library = folder / "law.so"
     command = [*compiler, *STRICT, "-O2", "-shared", "-fPIC", str(folder / "law.c"), "-o", str(library)]
     subprocess.run(command, check=True)
@@ -159,6 +159,12 @@ def test_the_file_has_what_the_code_needs(controller, tmp_path):
     assert code[0] == code[1]
     assert HeatGuard.from_dict(content["heat"]["guard"]) == controller.heat_guard
     assert f"({continuous_current():.4g} A)" in repr(controller)
+    for change in ({"ambient": 80.0}, {"winding": 0.4}, {"to_air": 1.0}):  # of the network, which the guard then is not
+        with pytest.raises(FileError, match=r"heat\.guard"):
+            export(content | {"heat": content["heat"] | change}, tmp_path / "c", derate=True)
+    for change in ({"winding": 0.0}, {"case": "?"}):
+        with pytest.raises(PlantError, match=next(iter(change))):
+            export(content | {"heat": content["heat"] | change}, tmp_path / "c", derate=True)
     content["heat"]["guard"]["b_1"] = None
     with pytest.raises(ControlError, match="b_1"):
         export(content, tmp_path / "c", derate=True)
@@ -184,3 +190,24 @@ def test_a_margin_keeps_the_winding_cooler(controller):
     guard = HeatGuard.of_rating(controller.rating, PERIOD, margin_K=20.0)
     commands, _ = run_law(runnable(controller, heat=guard), 8_000, 1e6)
     assert np.max(warm(commands)) <= HEAT["T_max"] - 20.0
+
+
+def test_the_code_takes_a_guard_with_a_margin(controller, compiler, tmp_path):
+    guard = read_guard(json.loads(json.dumps(plain(controller.to_dict()))), margin_K=20.0)
+    assert guard == HeatGuard.of_rating(controller.rating, PERIOD, margin_K=20.0)
+    step, _, _ = compile_law(compiler, controller, tmp_path, derate=guard)
+    temperature = warm(np.array([step(1e6, 0.0) for _ in range(8_000)]))
+    assert HEAT["T_max"] - 25.0 < np.max(temperature) <= HEAT["T_max"] - 20.0
+    assert "100 degC" in (tmp_path / "law.h").read_text()
+
+
+def test_without_a_fixed_limit_the_header_names_none(compiler, tmp_path):
+    plant = so.plants.rotary(link="locked", parts=["thermal"])
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15)
+    tuned = so.tune(plant, plant.defaults.update(**HEAT), spec)
+    _, struct, _ = compile_law(compiler, tuned, tmp_path)
+    header = (tmp_path / "law.h").read_text()
+    assert "LIMIT_A" not in header
+    assert "does not saturate" not in header
+    assert struct.derated == 1
+    assert struct.limit == pytest.approx(tuned.heat_guard.limit((0.0, 0.0)), rel=1e-12)
