@@ -26,7 +26,7 @@ from jaxtyping import Float
 from seaopt.errors import PlantError
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import CompletedParameters, Plant, state_space
+from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_space
 from seaopt.plants.roles import Friction, PlantMaker
 from seaopt.records import record
 
@@ -218,14 +218,6 @@ def list_smoothing(plant: Plant) -> tuple[str, ...]:
     return tuple(dict.fromkeys(friction.smoothing for friction in frictions if friction.smoothing is not None))
 
 
-def take_at_rest(plant: Plant) -> Plant:
-    """Return the plant to linearise at rest: the stuck one of bristles, which follow their coordinate there.
-
-    Linearised as they are they would be a mode that nothing moves and nothing damps.
-    """
-    return friction_states(plant)[STUCK] if remembers(plant) else plant
-
-
 def let_stick(plant: Plant) -> Plant:
     """Return the plant with friction that sticks: simulated and fitted as it jumps at rest, not as its smoothed curve.
 
@@ -415,3 +407,33 @@ def friction_matrices(plant: Plant) -> Any:
     ]
     blocks = [ca.densify(block) for block in (*effects, ca.jacobian(equations.velocities, plant.x))]
     return ca.Function("friction", [plant.x, plant.u, plant.p], blocks)
+
+
+@memo
+def rest_jacobians(plant: Plant) -> Any:
+    """Return the CasADi function (x, u, p) -> (A, B, C, D) at rest, where bristles stick and are not bent.
+
+    A deflection follows its coordinate from the rest on. Linearised as it is it would be a mode that nothing moves and
+    nothing damps; the stuck plant's own rest is another, where bristles bend all the way from a coordinate of zero.
+    """
+    if not remembers(plant):
+        return jacobians(plant)
+    equations = separate_friction(plant)
+    x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
+    stuck, rates, forces = friction_states(plant)[STUCK], ca.SX(equations.f), list[Any]()
+    velocities = dict(zip(plant.friction, ca.vertsplit(equations.velocities), strict=True))
+    for name, friction in plant.friction.items():
+        force = stuck.friction[name].force(velocities[name], p)
+        bristles = friction.bristles
+        if bristles is not None:
+            force += bristles.stiffness(p) * bristles.coordinate(x, p)
+            rates[list(plant.states).index(bristles.state)] = velocities[name] - FORGETTING * getattr(x, bristles.state)
+        forces.append(force)
+    by_state = ca.jacobian(ca.vertcat(*forces), plant.x)
+    blocks: list[Any] = []
+    for block in (rates, equations.h):
+        blocks.append(ca.jacobian(block, plant.x) + ca.jacobian(block, equations.forces) @ by_state)
+        blocks.append(ca.jacobian(block, plant.u))
+    nothing = ca.SX.zeros(*equations.forces.shape)
+    still = ca.substitute(ca.substitute(blocks, [equations.forces], [nothing]), [plant.t], [ca.SX(0)])
+    return ca.Function("jacobians", [plant.x, plant.u, plant.p], [ca.densify(block) for block in still])

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import lambertw
 
 import seaopt as so
+from seaopt.control.loops.sampled_plant import find_rest, linearise_sets
 from seaopt.errors import ParameterError
 from seaopt.plants.friction import find_breakaway, find_dry_friction, friction_states, split_friction
 from tests.independent_springs import simulate_independently, spring_force
@@ -162,6 +163,44 @@ def test_stuck_it_is_a_spring_and_sliding_the_flattest_curve(thor):
         assert np.count_nonzero(np.abs(poles + 1.0) < 1e-9) == 2  # the deflections, which nothing depends on
     assert list(split_friction({"a": plant}, params)) == [f"a {name}" for name in expected]
     assert list(friction_states(so.plants.high_impedance(parts=["lugre"]))) == ["sliding", "stuck"]
+
+
+@pytest.mark.parametrize(
+    ("plant", "place", "current", "values"),
+    [
+        (so.plants.rotary(link="pendulum", parts=["lugre"]), "theta_l", None, {}),
+        (so.plants.rotary(link="pendulum", parts=["hysteresis", "backlash"]), "theta_l", None, {"k_h": 60.0}),
+        (so.plants.moving_output(parts=["lugre"]), "phi", -0.3691, {"f_c": 20.0}),
+        (so.plants.rotary(link="pendulum", parts=["lugre", "thermal", "voltage_input"]), "theta_l", None, {}),
+    ],
+)
+def test_a_raised_plant_rests_with_bristles_unbent_and_is_linearised_there(thor, plant, place, current, values):
+    """The plant's own f is zero; its finite differences with z' = v have the poles, and zero for each deflection."""
+    own = thor.values() if place == "phi" else ()
+    held = plant.defaults.with_parameters(*(one for one in own if one.name in plant.parameters))
+    params = held.update(**values).with_parameters(so.Parameter(name=place, value=0.5, unit="rad"))
+    complete = plant.complete(params)
+    x, u = find_rest(plant, complete)
+    f = ca.Function("f", [plant.x, plant.u, plant.p], [ca.substitute(plant.dynamics, plant.t, 0.0)])
+    names = list(plant.states)
+    warm = [i for i, name in enumerate(names) if name.startswith("rise")]
+    moving = [i for i in range(len(names)) if i not in warm]
+
+    def rates(x):
+        return np.array(f(x, u, complete.vector)).ravel()[moving]
+
+    assert np.max(np.abs(rates(x))) < 1e-8 and x[names.index(place)] == 0.5
+    if current is not None:
+        assert u[0] == pytest.approx(current, abs=1e-4)
+    steps = 1e-7 * np.eye(len(names))[moving]
+    slopes = np.column_stack([(rates(x + step) - rates(x - step)) / 2e-7 for step in steps])
+    expected = np.linalg.eigvals(slopes)
+    (a, *_), _ = linearise_sets(plant, [complete], next(iter(plant.outputs)), 1.0)
+    poles, size = np.linalg.eigvals(a[0]), np.max(np.abs(expected))
+    count = sum(one.bristles is not None for one in plant.friction.values())
+    assert np.count_nonzero(np.abs(poles + 1.0) < 1e-6) == np.count_nonzero(np.abs(expected) < 1e-5 * size) == count
+    for pole in expected[np.abs(expected) > 1e-5 * size]:
+        assert np.min(np.abs(poles - pole)) < 1e-5 * size
 
 
 @pytest.mark.parametrize("make", [lambda: so.plants.moving_output(parts=["lugre", "hysteresis", "load_friction"]),

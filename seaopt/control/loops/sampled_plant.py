@@ -24,7 +24,7 @@ from jaxtyping import Complex, Float, Inexact
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, jacobians
-from seaopt.plants.friction import SLIDING, friction_states, remembers, take_at_rest
+from seaopt.plants.friction import SLIDING, friction_states, remembers, rest_jacobians
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import dynamics_function
@@ -169,8 +169,7 @@ def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float
 
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items()}
-    plant = friction_states(plant)[SLIDING] if remembers(plant) else plant
-    a, b, c, d = linearise(plant, params.vector[:, None], at, output, 1.0)
+    a, b, c, d = linearise(_let_slide(plant), params.vector[:, None], at, output, 1.0)
     return _compute_static_gain(a[0], b[0], c[0], float(d[0]))
 
 
@@ -224,13 +223,13 @@ def linearise(
         The plant has no such output, or cannot rest where it is to be linearised.
 
     """
-    plant = freeze_heat(take_at_rest(plant))
+    plant = freeze_heat(plant)
     if measured not in plant.outputs:
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
     row = list(plant.outputs).index(measured)
-    a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(plant, p, at), p)
+    a, b, c, d = _evaluate_at_rest(plant, *_solve_rest(_let_slide(plant), p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
 
@@ -254,10 +253,15 @@ def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarr
 
     """
     at = {name: np.array([value]) for name, value in read_conditions(plant, params).items() if name != DELAY}
-    cool = freeze_heat(take_at_rest(plant))
-    x, u = _solve_rest(cool, params.vector[:, None], at)
+    cool = freeze_heat(plant)
+    x, u = _solve_rest(_let_slide(cool), params.vector[:, None], at)
     rest = dict(zip(cool.states, x[:, 0], strict=True))  # a winding is cold there, though a current flows
     return np.array([rest.get(name, 0.0) for name in plant.states]), u[:, 0]
+
+
+def _let_slide(plant: Plant) -> Plant:
+    """Return the plant whose rest is that of unbent bristles: at rest they then carry nothing."""
+    return friction_states(plant)[SLIDING] if remembers(plant) else plant
 
 
 def _solve_rest(
@@ -295,19 +299,21 @@ def differentiate_linearisation(
     dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
-    plant = freeze_heat(take_at_rest(plant))
+    plant = freeze_heat(plant)
+    sliding = _let_slide(plant)
     row, names = list(plant.outputs).index(measured), list(plant.states)
-    x, u = _solve_rest(plant, p, at)
-    a, b, c, d = _evaluate_jacobians(plant, x, u, p)
+    x, u = _solve_rest(sliding, p, at)
+    a, b, c, d = _evaluate_at_rest(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)
     fixed = [names.index(name) for name in at if name in names]
     if fixed:  # f(x, u, p) = 0 along the direction: linear in the loose states and the first input
         loose = [i for i in range(len(names)) if i not in fixed]
         for i in fixed:
             dx[i] = dat[names[i]]
-        (drift,) = _map_columns(plant, _drift_function, x, u, p, dp)
-        moved = drift.T[:, :, None] + a[:, :, fixed] @ dx[fixed].T[:, :, None]
-        step = np.linalg.solve(np.concatenate([a[:, :, loose], b[:, :, :1]], axis=2), -moved)[..., 0].T
+        (drift,) = _map_columns(sliding, _drift_function, x, u, p, dp)
+        by_x, by_u = _evaluate_jacobians(sliding, x, u, p)[:2] if sliding is not plant else (a, b)
+        moved = drift.T[:, :, None] + by_x[:, :, fixed] @ dx[fixed].T[:, :, None]
+        step = np.linalg.solve(np.concatenate([by_x[:, :, loose], by_u[:, :, :1]], axis=2), -moved)[..., 0].T
         dx[loose], du[0] = step[:-1], step[-1]
     da, db, dc, dd = _stack_blocks(plant, _map_columns(plant, _turn_function, x, u, p, dx, du, dp))
     return (
@@ -321,6 +327,13 @@ def _evaluate_jacobians(
 ) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return A, B, C and D of k plants."""
     return _stack_blocks(plant, _map_columns(plant, jacobians, x, u, p))
+
+
+def _evaluate_at_rest(
+    plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
+) -> tuple[Float[np.ndarray, "k _ _"], ...]:
+    """Return A, B, C and D of k plants at rest, where bristles stick."""
+    return _stack_blocks(plant, _map_columns(plant, rest_jacobians if remembers(plant) else jacobians, x, u, p))
 
 
 def _stack_blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:
@@ -367,7 +380,8 @@ def _turn_function(plant: Plant) -> Any:
     """Return the CasADi function (x, u, p, dx, du, dp) -> derivatives of A, B, C and D along (dx, du, dp)."""
     at = [plant.x, plant.u, plant.p]
     along = [ca.SX.sym("along", symbols.shape[0]) for symbols in at]
-    slopes = [ca.densify(ca.jtimes(block, ca.vertcat(*at), ca.vertcat(*along))) for block in jacobians(plant).call(at)]
+    blocks = rest_jacobians(plant).call(at)
+    slopes = [ca.densify(ca.jtimes(block, ca.vertcat(*at), ca.vertcat(*along))) for block in blocks]
     return ca.Function("turn", [*at, *along], slopes)
 
 
