@@ -28,7 +28,7 @@ from seaopt.control.laws.friction_margin import take_friction_out
 from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import friction_slopes
+from seaopt.plants.friction import friction_slopes, remembers
 from seaopt.records import record
 
 ANGLES = 512  # of the quadrature
@@ -96,9 +96,12 @@ def predict_limit_cycles(controller: Controller, plant: Plant, params: Parameter
     controller : Controller
         Its measurement path closes the loop; the reference stands still.
     plant, params
-        The plant with its friction. Where several of its frictions change with velocity nothing is predicted.
+        The plant with its friction. Where several of its frictions change with velocity nothing is predicted, nor
+        where one has bristles: before they slip they are a spring, which the curve of steady sliding knows nothing of.
 
     """
+    if remembers(plant):
+        return ()
     (loop,) = take_friction_out(controller, plant, [params])
     if loop is None or loop.only_port is None:
         return ()

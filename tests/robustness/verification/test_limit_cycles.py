@@ -128,6 +128,16 @@ def test_an_unstable_cycle_bounds_what_friction_holds(blind, stand, rubbing):
     assert found.runs_away
 
 
+def test_of_bristles_no_cycle_is_predicted_that_does_not_bend_them(blind, rubbing):
+    """Where they slide at the largest velocity, sigma_0 z = f_c; from the curve of steady sliding it was 2 N of 25."""
+    plant = so.plants.high_impedance(parts=["lugre"])
+    params = rubbing.with_parameters(*(one for one in plant.parameters.values() if one.name not in rubbing))
+    cycles = predict_limit_cycles(scaled(blind, 1.5), plant, params)
+    place, sigma_0 = list(plant.states).index("z_f"), params["sigma_0"].value
+    assert all(sigma_0 * cycle.state[place] == pytest.approx(25.0, rel=0.1) for cycle in cycles)
+    assert not cycles
+
+
 def test_a_cycle_that_the_current_holds_fails_the_certificate(blind, stand, rubbing):
     wild = scaled(blind, 1.5, current_limit_A=10.0)
     certificate = so.certify(wild, {"stand": stand}, rubbing)
