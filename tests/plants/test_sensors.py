@@ -11,6 +11,7 @@ from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ParameterError, PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants.sensors.deflection import evaluate_weights
+from seaopt.robustness.verification.playback import Stage
 
 KNEE = {"J_m": 1e-4, "b_r": 1e-3, "K_tau": 0.05, "N": 50.0, "k_s": 300.0, "c_s": 1.5, "J_l": 0.1, "d_l": 0.05}
 
@@ -141,3 +142,23 @@ def test_an_encoders_error_passes_a_delay_and_a_load_cell(part):
         for one in (sensors, so.Sensors())
     )
     np.testing.assert_allclose(erring - ideal, 320.0 / 50.0 * 0.01 - 320.0 * 1e-4, atol=1e-9)
+
+
+def test_offset_and_range_of_an_encoder_reach_the_loop():
+    """An integrating law brings the reading to 2: tau_d rests at 2 - k_n e/N, and moves on where theta_m is clipped."""
+    plant, params = make_knee()
+    controller = so.tune(plant, params, so.ControllerSpec(measured="tau_d", current_limit_A=10.0, **SPEC))
+
+    def rest(n=1500, **errors):
+        loop = SampledLoop(
+            plant=plant, law=runnable(controller), measured="tau_d", delay_samples=controller.delay_samples,
+            sensors=so.Sensors(**errors),
+        )  # fmt: skip
+        return run_loop(loop, [params], np.full(n, 2.0)).outputs["tau_d"][0, -1]
+
+    assert rest() == pytest.approx(2.0, abs=1e-6)
+    assert rest(offset={"theta_m": 0.2}) == pytest.approx(2.0 - 320.0 / 50.0 * 0.2, abs=1e-6)
+    assert rest(saturation={"theta_m": 0.1}) > 10.0  # the reading ends at 0.64, and the law pushes on
+    stage = Stage(controller=controller, plant=plant, sensors=so.Sensors(offset={"theta_m": 0.2}))
+    assert not stage.is_ideal  # a scenario is judged beside its ideal twin
+    assert stage.ideal.is_ideal

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.bench import Sensors
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
@@ -65,6 +66,29 @@ class LoopArrays:
 
 
 @record
+class _Device:
+    """What a sensor does to a reading besides adding an offset and noise."""
+
+    saturates: bool
+    quantises: bool
+
+    def read(self, value: Any, numbers: Any) -> Any:
+        """Return the reading of a value; the numbers are those of `_describe_device`."""
+        offset, highest, quantum = ca.vertsplit(numbers)
+        reading = value + offset
+        if self.saturates:
+            reading = ca.fmin(ca.fmax(reading, -highest), highest)
+        return quantum * ca.floor(reading / quantum + 0.5) if self.quantises else reading
+
+
+def _describe_device(sensors: Sensors, name: str) -> tuple[_Device, list[float]]:
+    """Return a sensor, and the numbers that are data: offset, range and step."""
+    highest, quantum = sensors.saturation.get(name), sensors.quantisation.get(name, 0.0)
+    device = _Device(saturates=highest is not None, quantises=bool(quantum))
+    return device, [sensors.offset.get(name, 0.0), highest or 0.0, quantum]
+
+
+@record
 class _Structure:
     """What the functions of a loop depend on besides its plant; all else is data."""
 
@@ -72,9 +96,8 @@ class _Structure:
     law_states: int
     waiting: int
     rounds_current: bool
-    saturates: bool
-    quantises: bool
-    encoders: tuple[str, ...]  # that round, of those that the reading is computed from
+    device: _Device
+    encoders: tuple[tuple[str, _Device], ...]  # with errors, of those that the reading is computed from
     limits_current: bool
     sticks: bool
 
@@ -83,8 +106,9 @@ def _structure_of(loop: SampledLoop) -> _Structure:
     sensors, name = loop.sensors, loop.measured
     return _Structure(
         measured=name, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
-        saturates=sensors.saturation.get(name) is not None, quantises=bool(sensors.quantisation.get(name)),
-        encoders=tuple(loop.encoder_steps), limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
+        device=_describe_device(sensors, name)[0],
+        encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
+        limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
     )  # fmt: skip
 
 
@@ -95,8 +119,8 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     """
     n, queue = structure.law_states, structure.waiting
     z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
-    e, steps = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("steps", len(structure.encoders))
-    c = ca.vertcat(ca.SX.sym("c", n * n + 4 * n + 9), steps)
+    e, devices = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("devices", 3, 1 + len(structure.encoders))
+    c = ca.vertcat(ca.SX.sym("c", n * n + 4 * n + 6), ca.vec(devices))
     observe = _observe(plant, structure.sticks)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
@@ -106,17 +130,13 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     )
     reading = outputs[structure.measured] + w
     weights = weigh_encoders(plant, structure.measured)
-    for name, width in zip(structure.encoders, ca.vertsplit(steps) if structure.encoders else (), strict=True):
-        reading += weights[name] * (width * ca.floor(outputs[name] / width + 0.5) - outputs[name])
+    for number, (name, encoder) in enumerate(structure.encoders, 1):
+        reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
     size = n * n
     a = ca.reshape(c[:size], n, n)
     b_r, b_y, out, windup = (ca.reshape(c[size + i * n : size + (i + 1) * n], n, 1) for i in range(4))
-    d_r, d_y, limit, gain, offset, highest, quantum, step, most = ca.vertsplit(c[size + 4 * n : size + 4 * n + 9])
-    reading = reading + offset
-    if structure.saturates:
-        reading = ca.fmin(ca.fmax(reading, -highest), highest)
-    if structure.quantises:
-        reading = quantum * ca.floor(reading / quantum + 0.5)
+    d_r, d_y, limit, gain, step, most = ca.vertsplit(c[size + 4 * n : size + 4 * n + 6])
+    reading = structure.device.read(reading, devices[:, 0])
     x = ca.reshape(z[:n], n, 1)
     force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - d_y * reading
     limited = ca.fmin(ca.fmax(force, -limit), limit) if structure.limits_current else force
@@ -134,14 +154,11 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 
 
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
-    law, sensors, name = loop.law, loop.sensors, loop.measured
+    law = loop.law
     limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.current_limit_A) else (0.0, 0.0)
-    numbers = [
-        law.d_reference, law.d_measurement, limit, law.per_effort, sensors.offset.get(name, 0.0),
-        sensors.saturation.get(name, 0.0), sensors.quantisation.get(name, 0.0), loop.current_step_A,
-        most,
-    ]  # fmt: skip
-    numbers += loop.encoder_steps.values()
+    numbers = [law.d_reference, law.d_measurement, limit, law.per_effort, loop.current_step_A, most]
+    for name in (loop.measured, *loop.encoders):
+        numbers += _describe_device(loop.sensors, name)[1]
     return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
 
 

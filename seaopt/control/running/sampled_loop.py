@@ -35,8 +35,8 @@ class SampledLoop:
     delay_samples : int
         Whole samples from measurement to output, besides the hold.
     sensors : Sensors
-        Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from:
-        these round, and their noise is the output's.
+        Noise, offset, range and quantisation of the measured output, and of the encoders that it is computed from,
+        whose noise is the output's.
     current_step_A : float
         What the command is rounded to, in its unit; 0 for not at all. The largest is the last whole step within the
         law's limit.
@@ -81,8 +81,9 @@ class SampledLoop:
             if not getattr(self, what) >= 0.0:
                 raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")
         for what in ("noise_std", "quantisation", "saturation"):
-            if not getattr(self.sensors, what).get(self.measured, 0.0) >= 0.0:
-                raise SimulationError(f"{what} of {self.measured} is negative; give zero or more")
+            for name in (self.measured, *self.encoders):
+                if not getattr(self.sensors, what).get(name, 0.0) >= 0.0:
+                    raise SimulationError(f"{what} of {name} is negative; give zero or more")
         if self.current_step_A and not self.most_A:
             limit = show_command(self.law.current_limit_A, *self.law.command)
             raise SimulationError(
@@ -97,14 +98,11 @@ class SampledLoop:
             )
 
     @property
-    def encoder_steps(self) -> dict[str, float]:
-        """The steps of those encoders that round and that the measured output is computed from."""
-        weights = weigh_encoders(self.plant, self.measured)
-        return {
-            name: step
-            for name in weights
-            if name in self.plant.outputs and (step := self.sensors.quantisation.get(name))
-        }
+    def encoders(self) -> tuple[str, ...]:
+        """The encoders that the measured output is computed from and that have an offset, a range or a step."""
+        sensors = self.sensors
+        erring = {*sensors.offset, *sensors.saturation, *sensors.quantisation} & self.plant.outputs.keys()
+        return tuple(name for name in weigh_encoders(self.plant, self.measured) if name in erring)
 
     @property
     def waiting(self) -> int:

@@ -21,6 +21,7 @@ from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.friction import can_stick
 from seaopt.plants.impacts import catch, offset, release, strike
 from seaopt.plants.plant import fill_vector
+from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 
@@ -83,7 +84,8 @@ class Stage:
     @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
-        offset = self.sensors.offset.get(self.controller.spec.measured, 0.0)
+        measured = self.controller.spec.measured
+        offset = any(self.sensors.offset.get(name) for name in (measured, *weigh_encoders(self.plant, measured)))
         return not (self.current_step_A or offset or any(self.reading_errors))
 
     @property
