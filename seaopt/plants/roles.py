@@ -317,11 +317,14 @@ class Sampling:
         Between samples; such a plant is simulated with this period alone.
     sets : mapping of state to mapping of state to float
         What each becomes after a sample: a combination of states as they were at the sample.
+    differences : mapping of output to Difference
+        The speeds that these memories are for.
 
     """
 
     period_s: float
     sets: Mapping[str, Mapping[str, float]]
+    differences: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def matrix(self, states: Sequence[str]) -> tuple[list[int], Float[np.ndarray, "m nx"]]:
         """Return which states are set, and their combinations of all."""

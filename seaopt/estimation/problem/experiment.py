@@ -166,9 +166,15 @@ class Experiment:
         where = f"experiment {self.name}: differences"
         require_type(self.differences, Mapping, where, "give a mapping", EstimationError)
         plant, initial = self.plant, self.initial_state
+        made = plant.sampling.differences if plant.sampling is not None else {}
         for name, difference in self.differences.items():
             require_type(difference, Difference, f"{where}: {name}", "give a Difference", EstimationError)
-            if plant.sampling is None or name not in plant.outputs:
+            if made.get(name, difference) != difference:
+                raise EstimationError(
+                    f"{where}: {name} = {difference}, but {plant.name} has it made already, as {made[name]}; "
+                    "give the plant without differences"
+                )
+            if name not in made:
                 plant = add_difference(plant, name, difference, self.log.period)
             if isinstance(initial, Mapping) and difference.of in initial:  # known to be there, and taken to rest there
                 held = {f"{name}_held_{i}": initial[difference.of] for i in range(1, difference.samples + 1)}

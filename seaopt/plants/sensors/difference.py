@@ -122,10 +122,10 @@ def _add(plant: Plant, name: str, difference: Difference, period_s: float) -> Pl
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return {**plant.h(t, x, u, p), name: sum(weight * getattr(x, state) for state, weight in reading.items())}
 
-    before = plant.sampling.sets if plant.sampling is not None else {}
+    before, made = (plant.sampling.sets, plant.sampling.differences) if plant.sampling is not None else ({}, {})
     return replace(
         plant, f=f, h=h, states={**plant.states, **states}, outputs={**plant.outputs, name: unit},
-        sampling=Sampling(period_s=period_s, sets={**before, **sets}),
+        sampling=Sampling(period_s=period_s, sets={**before, **sets}, differences={**made, name: difference}),
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ The logs are of matrices written here, discretised by scipy, and differenced by 
 """
 
 import pickle
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -272,3 +273,15 @@ def test_a_plant_of_one_s_own_in_symbols_has_one():
     observed = add_difference(plant, "w", Difference(of="place"), 0.01)
     assert observed.outputs["w"] == "m/s"
     assert observed.sampling.sets == {"w_held_1": {"x": 1.0}}
+
+
+def test_another_difference_than_the_plant_has_is_refused(motion):
+    """It was ignored: the plant of an experiment has its differences already, and replace() gives that plant."""
+    one = record(motion, motion[2], plant=so.plants.rotary(), differences={"speed": CASES["one sample"]})
+    assert replace(one, name="again").plant is one.plant
+    with pytest.raises(EstimationError, match="without differences"):
+        replace(one, differences={"speed": CASES["three samples"]})
+    other = replace(one, plant=so.plants.rotary(), differences={"speed": CASES["three samples"]})
+    assert other.plant.sampling.sets["speed_held_3"] == {"speed_held_2": 1.0}
+    with pytest.raises(PlantError, match="of its own"):
+        replace(one, outputs=("theta_m",), differences={"theta_m": CASES["one sample"]})
