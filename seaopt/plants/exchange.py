@@ -18,7 +18,7 @@ from seaopt.errors import PlantError
 from seaopt.files import write_bytes
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import can_stick, list_smoothing
-from seaopt.plants.plant import CompletedParameters, Plant
+from seaopt.plants.plant import CompletedParameters, Plant, refuse_samples
 
 DESCRIPTION = "modelDescription.xml"
 
@@ -27,6 +27,7 @@ def to_control(plant: Plant, params: ParameterSet) -> Any:
     """Return the plant as a continuous-time `control.NonlinearIOSystem` with named signals, at fixed parameters."""
     import control  # deferred: it imports matplotlib
 
+    refuse_samples(plant)
     p = plant.complete(params).vector
     f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
     h = ca.Function("h", [plant.t, plant.x, plant.u, plant.p], [plant.output])
@@ -64,7 +65,8 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     Raises
     ------
     PlantError
-        The installed CasADi has no exporter, the plant depends on time explicitly, or the sources do not compile.
+        The installed CasADi has no exporter, the plant holds samples or depends on time explicitly, or the sources do
+        not compile.
 
     Notes
     -----
@@ -72,6 +74,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
     plant that sticks the model's description says so, for there the FMU creeps.
 
     """
+    refuse_samples(plant)
     if ca.depends_on(ca.vertcat(plant.dynamics, plant.output), plant.t):
         raise PlantError(f"plant {plant.name} depends on time explicitly, which the export leaves out")
     target = Path(path)

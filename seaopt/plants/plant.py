@@ -407,6 +407,12 @@ def deflection_row(plant: Plant, params: CompletedParameters) -> Float[np.ndarra
     return np.array(_deflection_slope(plant)(zero, params.vector)).ravel()
 
 
+def refuse_samples(plant: Plant) -> None:
+    """Refuse a plant that holds samples where one in continuous time is meant: between samples these stand still."""
+    if plant.sampling is not None:
+        raise PlantError(f"plant {plant.name} holds samples, which no system in continuous time does; give it without")
+
+
 def state_space(
     plant: Plant,
     params: ParameterSet,
@@ -421,8 +427,7 @@ def state_space(
         The plant holds samples.
 
     """
-    if plant.sampling is not None:
-        raise PlantError(f"plant {plant.name} holds samples, which no linear system in time does; give it without")
+    refuse_samples(plant)
     at = (fill_vector("state", plant.states, x), fill_vector("input", plant.inputs, u), plant.complete(params).vector)
     a, b, c, d = (np.array(block) for block in jacobians(plant)(*at))
     return a, b, c, d

@@ -27,7 +27,7 @@ from seaopt.plants import CompletedParameters, Plant, jacobians
 from seaopt.plants.friction import SLIDING, friction_states, remembers, rest_jacobians
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
-from seaopt.plants.plant import dynamics_function
+from seaopt.plants.plant import dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.units import factor
 
@@ -221,8 +221,11 @@ def linearise(
     ------
     ControlError
         The plant has no such output, or cannot rest where it is to be linearised.
+    PlantError
+        The plant holds samples.
 
     """
+    refuse_samples(plant)
     plant = freeze_heat(plant)
     if measured not in plant.outputs:
         raise ControlError(

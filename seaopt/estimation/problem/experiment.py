@@ -17,7 +17,7 @@ from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.sensors.difference import Difference, add_difference
+from seaopt.plants.sensors.difference import Difference, add_difference, find_state
 from seaopt.records import record
 from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
@@ -176,8 +176,9 @@ class Experiment:
                 )
             if name not in made:
                 plant = add_difference(plant, name, difference, self.log.period)
-            if isinstance(initial, Mapping) and difference.of in initial:  # known to be there, and taken to rest there
-                held = {f"{name}_held_{i}": initial[difference.of] for i in range(1, difference.samples + 1)}
+            position = find_state(plant, difference.of)
+            if isinstance(initial, Mapping) and position in initial:  # known to be there, and taken to rest there
+                held = {f"{name}_held_{i}": initial[position] for i in range(1, difference.samples + 1)}
                 initial = {**held, **initial}
         object.__setattr__(self, "plant", plant)
         object.__setattr__(self, "initial_state", initial)

@@ -103,7 +103,7 @@ def add_difference(plant: Plant, name: str, difference: Difference, period_s: fl
 
 @memo
 def _add(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
-    position = _find_state(plant, difference.of)
+    position = find_state(plant, difference.of)
     unit = f"{plant.states[position]}/s"
     held = [f"{name}_held_{i}" for i in range(1, difference.samples + 1)]
     rate = {position: 1.0 / (difference.samples * period_s), held[-1]: -1.0 / (difference.samples * period_s)}
@@ -131,7 +131,7 @@ def _add(plant: Plant, name: str, difference: Difference, period_s: float) -> Pl
 
 def read_positions(plant: Plant, differences: Mapping[str, Difference]) -> Plant:
     """Return a plant with differences in which these outputs are the positions themselves."""
-    states = {name: _find_state(plant, difference.of) for name, difference in differences.items()}
+    states = {name: find_state(plant, difference.of) for name, difference in differences.items()}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return {**plant.h(t, x, u, p), **{name: getattr(x, state) for name, state in states.items()}}
@@ -139,7 +139,7 @@ def read_positions(plant: Plant, differences: Mapping[str, Difference]) -> Plant
     return replace(plant, h=h)
 
 
-def _find_state(plant: Plant, position: str) -> str:
+def find_state(plant: Plant, position: str) -> str:
     """Return the state that a position is."""
     if position in plant.outputs and position not in plant.states:
         row = plant.output[list(plant.outputs).index(position)]

@@ -194,6 +194,23 @@ def test_a_known_start_was_there_before(motion):
     assert one.initial_state == {"theta_m": 5.0, "theta_l": 0.1, "speed_held_1": 5.0, "speed_held_2": 5.0}
 
 
+def test_a_known_start_is_that_of_an_output_which_is_the_state():
+    """At rest at 0.3 rad the speed is zero from the first sample, not 0.3 rad over a period."""
+    cart = so.Plant(
+        name="cart", states={"x": "m", "v": "m/s"}, inputs={"F": "N"}, outputs={"place": "m"},
+        parameters={"m": so.Parameter(name="m", value=2.0, unit="kg")},
+        f=lambda t, x, u, p: {"x": x.v, "v": u.F / p.m}, h=lambda t, x, u, p: {"place": x.x},
+    )  # fmt: skip
+    log = so.Log.from_arrays(time=np.arange(50) * PERIOD, F=np.zeros(50), speed=np.zeros(50))
+    one = so.Experiment(
+        plant=cart, log=log, outputs=("speed",), initial_state={"x": 0.3},
+        differences={"speed": Difference(of="place", samples=2)},
+    )  # fmt: skip
+    assert one.initial_state == {"x": 0.3, "speed_held_1": 0.3, "speed_held_2": 0.3}
+    run = so.simulate(one.plant, one.plant.defaults, log, initial_state=dict(one.initial_state))
+    np.testing.assert_allclose(run["speed"], 0.0, atol=1e-12)
+
+
 def test_the_response_is_that_of_the_recursion():
     case, s = CASES["with a lag"], 2j * np.pi * np.array([1.0, 20.0, 90.0])
     t = np.arange(4000) * PERIOD
@@ -203,7 +220,7 @@ def test_the_response_is_that_of_the_recursion():
         np.testing.assert_allclose(read, expected, atol=1e-6 * np.max(np.abs(expected)))
 
 
-def test_what_cannot_be_differenced_is_refused(motion):
+def test_what_cannot_be_differenced_is_refused(motion, tmp_path):
     plant, params = start()
     speed = motion[2]
     one = record(motion, speed, plant=plant, differences={"speed": Difference(of="theta_m")})
@@ -215,8 +232,18 @@ def test_what_cannot_be_differenced_is_refused(motion):
         record(motion, speed, plant=plant, differences={"speed": Difference(of="tau_s")})
     with pytest.raises(PlantError, match="samples = 0"):
         Difference(of="theta_m", samples=0)
-    with pytest.raises(PlantError, match="holds samples"):
-        one.plant.linearize(params)
+    for use in (
+        one.plant.linearize,
+        lambda params: so.plants.to_control(one.plant, params),
+        lambda params: so.plants.export_fmu(one.plant, params, tmp_path / "x.fmu"),
+        lambda params: so.tune(one.plant, params, so.ControllerSpec(measured="tau_s", bandwidth_hz=15.0)),
+        lambda params: so.tune(
+            replace(one.plant, actuation=None), params, so.ControllerSpec(measured="tau_s", bandwidth_hz=15.0)
+        ),
+    ):
+        with pytest.raises(PlantError, match="holds samples"):
+            use(params)
+    assert not list(tmp_path.iterdir())
     with pytest.raises(SimulationError, match="samples every"):
         so.simulate(one.plant, params, so.Log.from_arrays(time=np.arange(10) * 1e-3, I=np.zeros(10)))
 
