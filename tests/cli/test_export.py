@@ -40,6 +40,7 @@ def one_line(out):
         (("results", "--c", "out", "--precision", "half"), 'use "double" or "float"'),
         (("results", "--c", "out", "--name", "7"), "cannot begin a name in C"),
         (("results", "--c", "out", "--current-limit", "0"), "is not positive"),
+        (("results", "--c", "out", "--derate-margin", "15"), "part thermal"),
     ],
 )
 def test_bad_input_is_one_line_and_exits_2(folder, done, seaopt, arguments, words):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import differentiate_linearisation, linearise
 from seaopt.errors import PlantError
 from seaopt.plants import rate_motor
@@ -249,12 +250,9 @@ def test_the_probe_of_a_port_warms_up_too():
     without = so.plants.rotary(link="free", parts=parts)
     values = plant.defaults.update(T_ambient=ambient)
     by_hand = without.defaults.update(R=values["R"].value * (1.0 + values["alpha_cu"].value * (ambient - 25.0)))
-    models = []
-    for one, its in ((freeze_heat(plant), values), (without, by_hand)):
-        probe = one.port.probe()
-        models.append(probe.linearize(probe.complete(its)))
-    for name in ("A", "B", "C", "D"):
-        assert getattr(models[0], name) == pytest.approx(getattr(models[1], name), rel=1e-12, abs=1e-12)
+    one, other = (port_of(plant, values, "tau_s", 1.0), port_of(without, by_hand, "tau_s", 1.0))
+    for name in ("a", "motor", "force", "feedback"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-12, abs=1e-12)
     assert "rise_winding" in plant.port.probe().states
 
 

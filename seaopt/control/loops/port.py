@@ -9,6 +9,7 @@ from seaopt.control.loops.sampled_plant import DELAY, read_conditions
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
+from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
 from seaopt.units import LINEAR
 
@@ -151,7 +152,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
         The plant has no such port or output.
 
     """
-    probe = probe_of(plant)
+    probe = freeze_heat(probe_of(plant))
     values = probe.complete(params)
     if measured not in probe.outputs:
         raise ControlError(
