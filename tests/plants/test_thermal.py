@@ -12,6 +12,7 @@ from seaopt.control.loops.sampled_plant import differentiate_linearisation, line
 from seaopt.errors import PlantError
 from seaopt.plants import rate_motor
 from seaopt.plants.motor.thermal import find_warm_range, freeze_heat
+from seaopt.robustness.verification.environments import attach_environment
 
 HOT = {"R": 0.7, "alpha_cu": 0.0039, "R_wc": 1.3, "R_ca": 3.1, "C_w": 15.0, "C_c": 160.0, "T_ambient": 21.0}
 T_MAX = 120.0
@@ -254,6 +255,7 @@ def test_the_probe_of_a_port_warms_up_too():
     for name in ("a", "motor", "force", "feedback"):
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-12, abs=1e-12)
     assert "rise_winding" in plant.port.probe().states
+    assert list(attach_environment(plant).states) == list(attach_environment(without).states)
 
 
 def test_loops_of_a_commanded_current_are_those_without_heat():

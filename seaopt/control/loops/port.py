@@ -124,6 +124,8 @@ class PortModel:
 def probe_of(plant: Plant) -> Plant:
     """Return the plant that shows what the port is to the world: a bare inertia on it, the other links held.
 
+    It is without heat, as all that looks at linear loops.
+
     Raises
     ------
     ControlError
@@ -140,7 +142,7 @@ def probe_of(plant: Plant) -> Plant:
             f"the port of plant {plant.name} states no probe, by which its impedance is known; give Port(probe=...), "
             "or use high_impedance, moving_output, two_link or rotary"
         )
-    return plant.port.probe()
+    return freeze_heat(plant.port.probe())
 
 
 def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float) -> PortModel:
@@ -152,7 +154,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
         The plant has no such port or output.
 
     """
-    probe = freeze_heat(probe_of(plant))
+    probe = probe_of(plant)
     values = probe.complete(params)
     if measured not in probe.outputs:
         raise ControlError(
