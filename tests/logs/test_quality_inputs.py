@@ -5,6 +5,7 @@ import pytest
 
 import seaopt as so
 from seaopt.logs import assess_quality
+from seaopt.signals import Signal
 
 
 @pytest.mark.parametrize(
@@ -20,3 +21,19 @@ def test_steps_of_a_goal_are_no_sensor_that_stopped(name, inputs, warned):
     assert [finding.channel for finding in stuck] == ([name] if warned else [])
     if warned:
         assert f"--input {name}" in stuck[0].sentence
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "inputs"),
+    [
+        ("v", "m/s", ("current",)), ("v", "", ("current",)), ("v", "V", ("v",)), ("V", "", ("V",)),
+        ("V", "m/s", ("current",)),
+    ],
+)  # fmt: skip
+def test_a_v_is_an_input_where_it_is_a_voltage(name, unit, inputs):
+    """A speed v beside a current was taken for the only input."""
+    rng = np.random.default_rng(0)
+    current = np.convolve(rng.normal(size=2000), np.ones(20) / 20, "same")
+    channels = {"current": (current, "A"), name: (np.cumsum(current) * 1e-3, unit)}
+    signals = {key: Signal(name=key, values=values, unit=own) for key, (values, own) in channels.items()}
+    assert so.Log(time=np.arange(2000) * 1e-3, signals=signals).quality.inputs == inputs

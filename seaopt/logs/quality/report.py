@@ -147,8 +147,8 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
     data : Log or Table
         `log.quality` is this with its defaults.
     inputs : sequence of str, optional
-        Channels that drive the others, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u, or
-        else those in A or V.
+        Channels that drive the others, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u (a v
+        only in V), or else those in A or V.
 
     Raises
     ------
@@ -228,8 +228,13 @@ def _stretches(clock: ClockQuality, n: int) -> list[slice]:
 
 def _likely_inputs(channels: Mapping[str, ChannelQuality]) -> tuple[str, ...]:
     active = [name for name, channel in channels.items() if _varies(channel)]
-    named = tuple(name for name in active if name.casefold() in INPUT_NAMES)
+    named = tuple(name for name in active if name.casefold() in INPUT_NAMES and not _is_speed(channels[name]))
     return named or tuple(name for name in active if channels[name].unit in INPUT_UNITS)
+
+
+def _is_speed(channel: ChannelQuality) -> bool:
+    """Tell whether a v is not a voltage: by its unit, and without one as a small letter."""
+    return channel.name.casefold() == "v" and channel.unit != "V" and (channel.name == "v" or bool(channel.unit))
 
 
 def _correlate_pairs(
