@@ -142,6 +142,7 @@ class Plant:
         put(self, "output", _stack(self, "h", _evaluate_equations(self, "h", self.h, time, *spaces), self.outputs))
         _check_structure(self)
         _check_roles(self)
+        _check_bristles(self, spaces)
 
     @property
     def port(self) -> Port | None:
@@ -588,6 +589,32 @@ def _check_roles(plant: Plant) -> None:
         raise PlantError(
             f'plant {plant.name}: actuation.input = "{plant.actuation.input}" is not the first input; put it first'
         )
+
+
+def _check_bristles(plant: Plant, spaces: list[SimpleNamespace]) -> None:
+    """Refuse bristles that `f` contradicts, at one point: in their rate, or in that of their coordinate."""
+    x, u, p = spaces
+    for name, friction in plant.friction.items():
+        bristles = friction.bristles
+        if bristles is None:
+            continue
+        slip, speed = ca.SX(friction.find_rate(x, u, p)), ca.SX(friction.velocity(x, p))
+        moves = ca.jtimes(ca.SX(bristles.coordinate(x, p)), plant.x, plant.dynamics)
+        stated = plant.dynamics[list(plant.states).index(bristles.state)]
+        symbols = [plant.t, plant.x, plant.u, plant.p]
+        rng = np.random.default_rng(0)
+        values = [rng.uniform(0.5, 1.5, one.shape[0]) for one in symbols]
+        found = [float(one) for one in ca.Function("bristles", symbols, [slip, stated, moves, speed]).call(values)]
+        for given, expected, message in (
+            (found[1], found[0], f'f gives "{bristles.state}" another rate than bristles.rate; use the same in both'),
+            (
+                found[2],
+                found[3],
+                "the rate of bristles.coordinate is not the velocity; give the coordinate it belongs to",
+            ),
+        ):
+            if abs(given - expected) > 1e-6 * max(abs(given), abs(expected)):  # what is not finite there is not judged
+                raise PlantError(f"plant {plant.name}: friction {name}: {message} ({given:.6g} against {expected:.6g})")
 
 
 # Units that need no look-up: asking pint costs 0.2 s the first time.

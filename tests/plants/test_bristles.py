@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.special import lambertw
 
 import seaopt as so
 from seaopt.control.loops.sampled_plant import find_rest, linearise_sets
-from seaopt.errors import ParameterError
+from seaopt.errors import ParameterError, PlantError
 from seaopt.plants.friction import find_breakaway, find_dry_friction, friction_states, split_friction
 from tests.independent_springs import simulate_independently, spring_force
 
@@ -214,6 +215,23 @@ def test_bristles_survive_pickling(make):
     for name in friction_states(plant):
         one, other = (friction_states(each)[name].linearize(params) for each in (plant, again))
         assert np.array_equal(one.A, other.A), name
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"state": "theta_m"}, "rate"),
+        ({"rate": lambda z, v, p: 0.5 * v}, "rate"),
+        ({"coordinate": lambda x, p: -x.theta_m}, "coordinate"),
+    ],
+)
+def test_bristles_that_contradict_f_are_refused(change, word):
+    """The role changed, f is not: dz/dt is another there, or the coordinate's rate is not the velocity."""
+    plant = so.plants.rotary(link="locked", parts=["lugre"])
+    role = plant.friction["tau_f"]
+    changed = replace(role, bristles=replace(role.bristles, **change))
+    with pytest.raises(PlantError, match=word):
+        replace(plant, friction={"tau_f": changed})
 
 
 def test_bristles_need_friction(thor):
