@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -460,6 +461,9 @@ def _make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Parame
             if name in tables
         }
     _check_units(plants)
+    _check_defaults(
+        plants, {key: set(tables).union(set[str].intersection(*given) if given else ()) for key, given in own.items()}
+    )
     # A plant of the file may use a built-in plant's name for something else.
     known = built_in | declared
     parameters = {name: known[name] for name in known if name in declared or name in tables}
@@ -506,6 +510,22 @@ def _check_units(plants: Mapping[str, Plant]) -> None:
                     f"parameters.{name} is in {known} for plant.{other} and in {unit} for plant.{key}; "
                     "give each a problem file of its own"
                 ) from error
+
+
+def _check_defaults(plants: Mapping[str, Plant], stated: Mapping[str, Collection[str]]) -> None:
+    """Refuse plants whose defaults of a parameter differ, where neither the file nor their experiments state it."""
+    first: dict[str, tuple[str, Parameter]] = {}
+    for key, plant in plants.items():
+        for name, default in plant.defaults.items():
+            if name in stated[key]:
+                continue
+            other, known = first.setdefault(name, (key, default))
+            value = default.value * factor(default.unit, known.unit)
+            if not math.isclose(value, known.value, rel_tol=1e-12):
+                raise ProblemError(
+                    f"parameters.{name} is missing: its default is {known.value:g} {known.unit} for plant.{other} and "
+                    f"{value:g} {known.unit} for plant.{key}; give {name} = ... in [parameters]"
+                )
 
 
 def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:

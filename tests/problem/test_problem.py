@@ -47,6 +47,19 @@ virtual = {{ seed = 1, duration_s = 2, rate_hz = 400, excitation = {{ {lines} }}
     assert current[100] == pytest.approx(0.0, abs=1e-9)  # a quarter of a second is two periods
 
 
+@pytest.mark.parametrize("order", [("plain", "bristled"), ("bristled", "plain")])
+def test_a_default_that_differs_among_plants_is_asked_for(write, order):
+    """In whatever order they stand; a value in the file is that of both."""
+    text = {"plain": '[plant.plain]\nkind = "rotary"\n',
+            "bristled": '[plant.bristled]\nkind = "rotary"\nparts = ["lugre"]\n'}  # fmt: skip
+    both = "schema = 1\n" + "".join(text[name] for name in order)
+    with pytest.raises(so.errors.ProblemError, match=r"parameters\.f_c is missing"):
+        so.read_problem(write(both))
+    assert so.read_problem(write(both + "[parameters]\nf_c = 0.03\n")).parameters["f_c"].value == 0.03
+    for name, default in (("plain", 0.0), ("bristled", 0.02)):
+        assert so.read_problem(write("schema = 1\n" + text[name])).parameters["f_c"].value == default
+
+
 def test_values_units_bounds_and_priors(write):
     path = write(
         """
