@@ -32,12 +32,14 @@ from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
+WORSE = -1.0  # fit percent below which a constant explains more, beyond rounding and an offset that is fixed
 RUNS_AWAY = -1e3  # fit percent below which a free run is ten times as large as what was measured
 LITTLE = 0.02  # of an output's energy: where no model explains more, explaining less is no fault
 CHANCE = 1e-6  # probability below which a test is not chance
 DOUBTFUL = 1e-3  # probability of a score below which a refit decides: far from the truth a score falls short of that
 SYSTEMATIC = 0.5  # of a residual's power: more than its noise
 LARGE = 3e-3  # of an output's energy: a systematic residual of 5 % of its size
+VISIBLE = 1e-4  # of one of 1 %
 SMALL = 1e-5  # below which a systematic residual is worth no word
 FAR_ABOVE = 5.0  # times the noise between neighbouring samples, from third differences (variance 20 times the noise's)
 HELD_OUT = 0.9  # of the share explained over the samples used
@@ -70,13 +72,14 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress | Non
     }
     outputs = _score_held_out_shots(fit, _state_shares(fit, shares))
     fit = replace(fit, outputs=outputs)
-    findings = [*_find_unexplained(fit, shares), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
+    excess = _measure_excess(minimum.problem, residuals)
+    findings = [*_find_unexplained(fit, shares, excess), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
     findings += [*_find_implausible(fit), *_find_contradicting_delays(fit), *_find_few_samples(fit, minimum)]
     tests = _run_tests(fit, minimum)
     suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     wrong = (
         bool(suspects)
-        or _exceeds_noise(minimum.problem, residuals)
+        or any(one > FAR_ABOVE for row in excess.values() for one in row.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
         or fit.status != "converged"
     )
@@ -87,17 +90,16 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress | Non
     return _conclude(fit, findings)
 
 
-def _exceeds_noise(problem: FitProblem, residuals: ResidualsByExperiment) -> bool:
-    """Tell whether some residual is far above its noise between neighbouring samples, so that causes are looked for.
-
-    Noise of a colour is so, too: only a cause that explains it is a finding.
-    """
+def _measure_excess(problem: FitProblem, residuals: ResidualsByExperiment) -> dict[str, dict[str, float]]:
+    """Return how many times its noise between neighbouring samples each output's residual is."""
+    excess: dict[str, dict[str, float]] = {}
     for output in problem.outputs:
         raw = [part[np.isfinite(part)] for part in residuals[output.experiment.name].raw_of(output.name)]
         thirds = np.concatenate([np.diff(part, 3) for part in raw])
-        if thirds.size and np.std(np.concatenate(raw)) > FAR_ABOVE * np.sqrt(np.mean(thirds**2) / 20.0):
-            return True
-    return False
+        noise = float(np.sqrt(np.mean(thirds**2) / 20.0)) if thirds.size else 0.0
+        size = float(np.std(np.concatenate(raw))) if thirds.size else 0.0
+        excess.setdefault(output.experiment.name, {})[output.name] = size / max(noise, 1e-300)
+    return excess
 
 
 def _conclude(fit: Fit, findings: Sequence[FitFinding]) -> Fit:
@@ -146,12 +148,26 @@ def _explained(one: OutputFit) -> float | None:
     return max(1.0 - (1.0 - percent / 100.0) ** 2, 0.0)
 
 
-def _find_unexplained(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -> Iterator[FitFinding]:
-    """Yield outputs that are explained less than they could be, and residuals that follow an input."""
+def _find_unexplained(
+    fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]], excess: Mapping[str, Mapping[str, float]]
+) -> Iterator[FitFinding]:
+    """Yield outputs that are explained less than they could be, and residuals that follow an input.
+
+    What follows the inputs is an error where it is more than noise: more than the rest of the residual, or far above
+    what neighbouring samples differ by; the rest may be what a nonlinearity leaves.
+    """
     for name, row in fit.outputs.items():
         for output, one in row.items():
             where = f"{name}.{output}"
             share = shares[name].get(output)
+            percents = [
+                one.fit_percent,
+                *(p for p in (one.band_fit_percent, one.one_step_fit_percent) if p is not None),
+            ]
+            if one.explained is not None and max(percents) < WORSE:
+                text = "the model explains it worse than a constant: look for jumps, such as a counter that wraps"
+                yield FitFinding(severity="error", kind="explained", where=where, text=text)
+                continue
             if one.explained is None or one.explainable is None or share is None:
                 continue
             ratio = one.explained / max(one.explainable, 1e-300)
@@ -165,7 +181,10 @@ def _find_unexplained(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]
                 )
             elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
                 low, high = share.band_hz
-                bad = share.residual > SYSTEMATIC and share.power > LARGE
+                follows = np.sqrt(share.residual) * excess[name][output]
+                bad = (share.residual > SYSTEMATIC and share.power > LARGE) or (
+                    follows > FAR_ABOVE and share.power > VISIBLE
+                )
                 text = (
                     f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at "
                     f"{low:.3g} to {high:.3g} Hz: the model lacks something, and the stds allow for noise alone"

@@ -13,6 +13,7 @@ from scipy import signal
 import seaopt as so
 from seaopt.estimation.judgement.causes import find_causes, find_clipping
 from seaopt.estimation.judgement.coherence import measure_coherence
+from seaopt.estimation.judgement.judge import _find_unexplained
 
 RATE_HZ = 400.0
 K, M_L, J, B_R, K_TAU, RADIUS = 655e3, 0.646, 3.31e-6, 1.31e-4, 0.0255, 0.002 / (2 * math.pi * 3.0)
@@ -196,3 +197,23 @@ def test_a_parameter_does_not_run_away(gain):
     else:
         (far,) = (finding for finding in result.findings if finding.where == "p" and finding.kind == "bound")
         assert far.severity == "error" and "searches" in far.text
+
+
+def test_an_output_that_a_constant_explains_better_is_an_error():
+    """A counter that wraps, say, which the other outputs outweigh: its coherence with the inputs is gone as well."""
+    result = fit(bench())
+    worse = replace(result.outputs["log"]["F2"], fit_percent=-3.4, explained=0.0, explainable=0.0)
+    told = replace(result, outputs={"log": result.outputs["log"] | {"F2": worse}})
+    shares = {"log": dict.fromkeys(("F1", "F2"))}
+    findings = list(_find_unexplained(told, shares, {"log": {"F1": 1.0, "F2": 1.0}}))
+    assert [(one.severity, one.kind, one.where) for one in findings] == [("error", "explained", "log.F2")]
+
+
+def test_a_small_misfit_that_follows_the_input_far_above_the_noise_is_an_error():
+    """An echo of 2 % of the forces, 40 ms late: estimates are off by many of the stds, which allow for noise alone."""
+    columns = bench(noise_n=1.0)
+    late = {name: columns[name] + 0.02 * np.roll(columns[name], 16) for name in ("F1", "F2")}
+    result = fit(columns | late)
+    assert result.outputs["log"]["F1"].fit_percent > 95.0
+    assert abs(result.parameters["b_r"].value - B_R) > 5.0 * result.parameters["b_r"].std
+    assert not result.met and "residual" in kinds(result)
