@@ -210,7 +210,7 @@ def test_an_output_that_a_constant_explains_better_is_an_error():
 
 def test_a_small_misfit_that_follows_the_input_far_above_the_noise_is_an_error():
     """An echo of 2 % of the forces, 40 ms late: estimates are off by many of the stds, which allow for noise alone."""
-    columns = bench(noise_n=1.0)
+    columns = bench(noise_n=0.1)
     late = {name: columns[name] + 0.02 * np.roll(columns[name], 16) for name in ("F1", "F2")}
     result = fit(columns | late)
     assert result.outputs["log"]["F1"].fit_percent > 95.0
