@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test slow check lint types contract notebooks floors bench bench-peers fuzz nocompiler clean setup
+.PHONY: demo test slow check lint types contract notebooks docs floors bench bench-peers fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -61,6 +61,17 @@ contract: $(READY)
 notebooks: $(READY)
 	$(PYTEST) --nbmake --nbmake-timeout=300 -q notebooks
 
+# The site, in an environment of its own: warnings are errors, notebooks run, search and pages are tried in a browser.
+DOCS := $(VENV)-docs
+SITE := docs/_build/html
+docs: $(DOCS)/.ready
+	$(DOCS)/bin/sphinx-build -W --keep-going -q -b html docs $(SITE)
+	SEAOPT_SITE=$(SITE) $(DOCS)/bin/python -m pytest -q tests/test_site.py
+
+$(DOCS)/.ready: pyproject.toml constraints.txt tools/setup.sh
+	@sh tools/setup.sh $(DOCS) constraints.txt docs
+	@touch $@
+
 check: test slow nocompiler lint types contract notebooks
 
 bench: $(READY)
@@ -82,4 +93,4 @@ fuzz: $(READY)
 	for target in csv json mat plant; do $(BIN)/python tools/fuzz.py $$target --seconds $(FUZZ_SECONDS) || exit 1; done
 
 clean:
-	rm -rf $(VENV) $(FLOORS) out
+	rm -rf $(VENV) $(FLOORS) $(DOCS) docs/_build docs/reference/api out

@@ -3,7 +3,7 @@ r"""The case that rigid tools miss: an elastic joint under a firmware's PD, by i
 A motor with a gear turns a link through a spring. Its firmware holds the motor's angle by current; a log has the goal,
 a chirp of 20 s from 0.1 to 10 Hz, and the motor's angle in encoder steps. The goal acts 1.4 samples late. The truth
 is simulated here, by NumPy and SciPy alone, with dry friction that sticks; `fit_rigid` and `fit_elastic` fit what rigid
-tools assume, and the joint as it is. docs/elastic_joint.md tells what comes out.
+tools assume, and the joint as it is. docs/evidence/elastic_joint.md tells what comes out.
 
     python problems/elastic_joint.py [SEED]
 """

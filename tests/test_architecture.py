@@ -8,9 +8,10 @@ import tomllib
 from pathlib import Path
 
 import seaopt
+from tests.pages import read_page
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+PAGE = read_page("reference/architecture.md")
 PACKAGE = Path(seaopt.__file__).parent
 
 

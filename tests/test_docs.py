@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import tomllib
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -18,22 +17,17 @@ from seaopt.cli import main
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.passivity import passivity
 from seaopt.simulation.native import find_compiler
-
-DOCS = Path(__file__).resolve().parents[1] / "docs"
-
-
-def blocks(name, language):
-    return re.findall(rf"```{language}\n(.*?)```", (DOCS / name).read_text(encoding="utf-8"), flags=re.DOTALL)
+from tests.pages import blocks, read_page, unbroken
 
 
 def test_the_speed_by_difference_of_the_docs_is_declared():
     space = {}
-    exec(blocks("plants.md", "python")[0], space)
+    exec(blocks("theory/plants.md", "python")[0], space)
     assert space["bench"].outputs == ("speed",)
 
 
 def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log):
-    (text,) = blocks("problem_file.md", "toml")
+    (text,) = blocks("reference/problem_file.md", "toml")
     path = tmp_path / "problem.toml"
     path.write_text(text, encoding="utf-8")
     late = so.simulate(stand, thor, short_log, delay_s=1.2e-3)
@@ -51,7 +45,7 @@ def test_the_problem_file_of_the_docs_is_valid(tmp_path, stand, thor, short_log)
 
 
 def test_the_plant_of_the_how_to_works():
-    code = blocks("howto_own_plant.md", "python")[0]
+    code = blocks("howto/own_plant.md", "python")[0]
     space: dict = {}
     exec(code, space)
     assert list(space["pendulum"].states) == ["theta", "omega"]
@@ -59,14 +53,14 @@ def test_the_plant_of_the_how_to_works():
 
 def test_the_plant_of_the_how_to_as_data_gives_the_same_fit(tmp_path, simulated):
     """The page's file, and its Python, on a log laid out as the measured one; then the roles that it shows."""
-    problem_file, roles = blocks("howto_own_plant.md", "toml")[:2]
+    problem_file, roles = blocks("howto/own_plant.md", "toml")[:2]
     (tmp_path / "pendulum.toml").write_text(problem_file, encoding="utf-8")
     shutil.copy(simulated("ak80") / "data_measured.csv", tmp_path)
     problem = so.read_problem(tmp_path / "pendulum.toml")
     own = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
     space: dict = {}
     with contextlib.chdir(tmp_path):
-        for code in blocks("howto_own_plant.md", "python"):
+        for code in blocks("howto/own_plant.md", "python"):
             exec(code, space)
     for name in ("I_p", "mgL", "d", "tau_c"):
         one, other = own.parameters[name], space["fit"].parameters[name]
@@ -81,19 +75,19 @@ def test_the_plant_of_the_how_to_as_data_gives_the_same_fit(tmp_path, simulated)
 
 
 def test_the_mistake_of_the_how_to_is_shown_as_it_says(tmp_path, monkeypatch, capsys):
-    problem_file = blocks("howto_own_plant.md", "toml")[0].replace("mgL*sin", "mgl*sin")
+    problem_file = blocks("howto/own_plant.md", "toml")[0].replace("mgL*sin", "mgl*sin")
     (tmp_path / "pendulum.toml").write_text(problem_file, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["seaopt", "fit", "pendulum.toml"])
     with pytest.raises(SystemExit, match="2"):
         main()
-    assert capsys.readouterr().err == blocks("howto_own_plant.md", "text")[0]
+    assert capsys.readouterr().err == blocks("howto/own_plant.md", "text")[0]
 
 
 def test_the_export_of_the_docs_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     space: dict = {}
-    exec(blocks("export.md", "python")[0], space)
+    exec(blocks("howto/on_the_target.md", "python")[0], space)
     assert {path.name for path in (tmp_path / "firmware").iterdir()} >= {"knee.h", "knee.c"}
     assert 0.8 < space["current_A"] <= 9.0
     assert space["currents_A"].shape == (100,)
@@ -105,7 +99,7 @@ def test_the_c_of_the_docs_compiles(tmp_path):
         pytest.skip("no C compiler on this machine")
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
     export(so.tune(so.plants.high_impedance(), so.plants.thor(), spec), tmp_path, name="knee")
-    (tmp_path / "main.c").write_text(blocks("export.md", "c")[0], encoding="utf-8")
+    (tmp_path / "main.c").write_text(blocks("howto/on_the_target.md", "c")[0], encoding="utf-8")
     subprocess.run(
         [*compiler, "-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic", "-c", "main.c"], cwd=tmp_path, check=True
     )
@@ -113,14 +107,14 @@ def test_the_c_of_the_docs_compiles(tmp_path):
 
 def test_the_passivity_of_the_docs_works():
     space: dict = {}
-    for block in blocks("passivity.md", "python"):
+    for block in blocks("theory/passivity.md", "python"):
         exec(re.sub(r"print\(.*", "", block), space)
     assert space["port"].holds((0.1, 60.0))
     assert space["passive"]
 
 
 def test_the_design_of_the_how_to_works():
-    code = blocks("howto_experiment_design.md", "python")[0]
+    code = blocks("howto/experiment_design.md", "python")[0]
     space: dict = {}
     exec(re.sub(r"print\(.*", "", code), space)
     ratio = space["design"].against(space["PAPER_STAND"]).ratio
@@ -130,9 +124,9 @@ def test_the_design_of_the_how_to_works():
 @pytest.mark.slow
 def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = (DOCS / "diagnostics.md").read_text(encoding="utf-8")
+    page = read_page("theory/diagnostics.md")
     space: dict = {}
-    exec(re.sub(r"(?m)^(print|so.write_report)\(.*", "", blocks("diagnostics.md", "python")[0]), space)
+    exec(re.sub(r"(?m)^(print|so.write_report)\(.*", "", blocks("theory/diagnostics.md", "python")[0]), space)
     assert space["ranking"].preferred == "unlumped" and space["ranking"].decisive
     assert space["diagnose"](space["fits"]["unlumped"]).ok
     said = [space["ranking"].sentences[0], *space["diagnose"](space["fits"]["lumped"]).sentences[:2]]
@@ -144,7 +138,7 @@ def test_the_comparison_of_the_diagnostics_page_works(tmp_path, monkeypatch):
 def test_the_estimator_and_the_controller_of_the_mpc_page_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     space: dict = {}
-    exec(re.sub(r"(?m)^print\(.*", "", blocks("mpc.md", "python")[0]), space)
+    exec(re.sub(r"(?m)^print\(.*", "", blocks("theory/mpc.md", "python")[0]), space)
     assert space["run"].whiteness_p["F1"] > 0.01
     assert space["loop"].overshoot < 0.03 and space["loop"].settling_time_s(0.05) < 0.04
     assert (tmp_path / "force_mpc" / "force_mpc.h").exists()
@@ -152,7 +146,7 @@ def test_the_estimator_and_the_controller_of_the_mpc_page_work(tmp_path, monkeyp
 
 def test_the_log_of_the_quality_page_is_clipped_and_masked():
     space: dict = {}
-    for code in blocks("log_quality.md", "python"):
+    for code in blocks("howto/log_quality.md", "python"):
         exec(re.sub(r"(?m)^print\(.*", "", code), space)
     eta = {name: space[name].parameters["eta"] for name in ("masked", "declared", "biased")}
     assert len(space["clipped"]) == 2
@@ -165,24 +159,18 @@ def test_the_log_of_the_quality_page_is_clipped_and_masked():
 def test_the_certificate_of_the_docs_works():
     """The pages on margins and on the certificate run, and the table of ranges is a problem file's."""
     space: dict = {}
-    for page in ("margins.md", "certificate.md"):
+    for page in ("theory/margins.md", "theory/certificate.md"):
         exec(re.sub(r"print\(.*", "", blocks(page, "python")[0]), space)
     assert space["disk"].alpha > 0.8
     assert space["worst"].verify(space["controller"])
-    (table,) = blocks("certificate.md", "toml")
+    (table,) = blocks("theory/certificate.md", "toml")
     assert set(tomllib.loads(table)["robustness"]["parameters"]) == set(space["ranges"])
 
 
-def test_every_figure_of_the_docs_is_there():
-    for page in DOCS.glob("*.md"):
-        for name in re.findall(r"\]\((figures/[^)]+)\)", page.read_text(encoding="utf-8")):
-            assert (DOCS / name).exists(), name
-
-
 def test_the_verification_of_the_docs_works():
-    page = " ".join((DOCS / "verification.md").read_text(encoding="utf-8").split())
+    page = unbroken("theory/verification.md")
     space: dict = {}
-    for code in blocks("verification.md", "python"):
+    for code in blocks("theory/verification.md", "python"):
         exec(re.sub(r"(?m)^print\(", "found = (", code), space)
         found = space.get("found")
         if "verify(" in code:
@@ -205,14 +193,14 @@ def test_the_verification_of_the_docs_works():
 
 def test_the_tuner_of_the_docs_works():
     space: dict = {}
-    exec(re.sub(r"(?m)^print\(.*", "", blocks("tuning.md", "python")[0]), space)
+    exec(re.sub(r"(?m)^print\(.*", "", blocks("theory/tuning.md", "python")[0]), space)
     assert space["controller"].feasible
     assert [round(row.bandwidth_hz) for row in space["frontier"].rows] == [20, 30, 40]
 
 
 def test_the_integrals_that_the_tuning_page_states_are_those_of_its_code(capsys):
-    first, second = blocks("tuning.md", "python")
-    text = (DOCS / "tuning.md").read_text(encoding="utf-8")
+    first, second = blocks("theory/tuning.md", "python")
+    text = read_page("theory/tuning.md")
     lines = [line for line in first.splitlines() if line.startswith(("import", "from", "stand"))]
     exec("\n".join(lines) + "\n" + second, {})
     assert capsys.readouterr().out.split() == ["pid_dob", "1.0", "pid", "1.53"]
@@ -221,7 +209,7 @@ def test_the_integrals_that_the_tuning_page_states_are_those_of_its_code(capsys)
 
 def test_the_design_of_the_elastic_joint_tells_the_damping_better():
     space: dict = {}
-    for code in blocks("elastic_joint.md", "python"):
+    for code in blocks("evidence/elastic_joint.md", "python"):
         exec(re.sub(r"(?m)^print\(.*", "", code), space)
     ratio = space["design"].against((space["Chirp"](amplitude=0.5, f0_hz=0.1, f1_hz=10),)).ratio
     assert ratio["b_r"] > 2.2 and ratio["c_s"] > 1.2 and ratio["k_s"] < 0.5

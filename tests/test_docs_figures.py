@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,19 +15,10 @@ from seaopt.control.laws.passivity import passivity
 from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.loops.loop import Loop
 from seaopt.control.tuning.tuner import disturbance
+from tests.pages import DOCS, read_page, unbroken
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
 UNITS = {"s": 1.0, "ms": 1e-3}
 PERIOD = 1e-3
-
-
-def page(name):
-    return (DOCS / name).read_text(encoding="utf-8")
-
-
-def unbroken(name):
-    """Return a page without its line breaks."""
-    return " ".join(page(name).split())
 
 
 def printed_gains(text):
@@ -91,7 +81,7 @@ PASSIVE_EDGES = ([160.26, 160.33], [85.2, 160, 351], [60.0, 160, 223, 406], [29.
 
 
 def test_the_table_of_passive_bands_follows_from_the_gains(stand_matrices):
-    text = page("passivity.md")
+    text = read_page("theory/passivity.md")
     gains = printed_gains(text)
     f = np.unique(np.concatenate([np.geomspace(0.05, 499.9, 200_000), np.linspace(160.0, 160.6, 20_001)]))
     rows = cells(text, "delay")
@@ -126,7 +116,7 @@ def simulate(matrices, gains, per_effort, tracking):
 
 
 def test_the_table_of_tracking_times_follows_from_the_gains(stand_matrices, thor):
-    text = page("export.md")
+    text = read_page("howto/on_the_target.md")
     gains = printed_gains(text)
     per_effort = thor["l"].value / (2 * np.pi * thor["N_p"].value * thor["K_tau"].value)
     integral, derivative = gains["k_p"] / gains["k_i"], gains["k_d"] / gains["k_p"]
@@ -143,7 +133,7 @@ def test_the_table_of_tracking_times_follows_from_the_gains(stand_matrices, thor
 
 
 def test_what_a_passive_band_costs_the_quiet_law(stand, thor):
-    text = unbroken("passivity.md")
+    text = unbroken("theory/passivity.md")
     quiet = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, objective="noise")
     ends, noise = [], []
     for band in (None, (1.0, 60.0)):
@@ -162,11 +152,12 @@ def test_what_late_samples_cost(stand, thor):
         Loop(plant=sample(stand, thor, "F1", law.command.per_effort, 1e-3, late), law=law.law).figures().ms
         for late in (1, 2, 3)
     ]
-    assert "has Ms {:.2f} as stated, {:.2f} with 2 samples and {:.2f} with 3.".format(*ms) in unbroken("tuning.md")
+    text = "has Ms {:.2f} as stated, {:.2f} with 2 samples and {:.2f} with 3.".format(*ms)
+    assert text in unbroken("theory/tuning.md")
 
 
 def test_the_pid_beside_mixed_sensitivity_synthesis(stand, thor):
-    text = unbroken("tuning.md")
+    text = unbroken("theory/tuning.md")
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=60)
     for name, weights in (("pid", "tuned"), ('pid, `"error"`', "error")):
         law = so.tune(stand, thor, replace(spec, reference_weights=weights))
@@ -194,4 +185,4 @@ def test_the_steps_of_the_pid_beside_predictive_control(stand, swing, thor):
     for force in (500.0, 1000.0, 2000.0):
         run = close_loop(law.step, law.reset(), stand, thor, np.where(np.arange(500) < 10, 0.0, force))
         times = " | ".join(f"{1e3 * run.settling_time_s(band):.0f} ms" for band in (0.05, 0.02))
-        assert f"| {force:g} N | pid | {100 * run.overshoot:.1f} % | {times} |" in unbroken("mpc.md")
+        assert f"| {force:g} N | pid | {100 * run.overshoot:.1f} % | {times} |" in unbroken("theory/mpc.md")

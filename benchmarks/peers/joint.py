@@ -1,4 +1,4 @@
-"""The elastic joint of docs/elastic_joint.md by seaopt, by CMA-ES and by MuJoCo's minimize: time, error, interval.
+"""The elastic joint of docs/evidence/elastic_joint.md by seaopt, CMA-ES and MuJoCo's minimize: time, error, interval.
 
     python benchmarks/peers/joint.py [--seed 0] [--limit 600] [--without-4096]
 

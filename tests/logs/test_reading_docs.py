@@ -1,4 +1,4 @@
-"""What docs/reading_logs.md shows is what works."""
+"""What docs/howto/reading_logs.md shows is what works."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "reading_logs.md"
+from tests.pages import read_page
 
 
 def test_the_page_runs(tmp_path, monkeypatch, capsys):
@@ -17,7 +17,7 @@ def test_the_page_runs(tmp_path, monkeypatch, capsys):
     Path("chirp.csv").write_text("time [s],cur,F1 [N],note\n" + rows)
     Path("motor.csv").write_text("time [s],I [A]\n" + "".join(f"{x},{np.sin(x)}\n" for x in t))
     Path("cell.csv").write_text("time [s],F1 [N]\n" + "".join(f"{x},{x}\n" for x in t + 0.0035))
-    page = PAGE.read_text(encoding="utf-8")
+    page = read_page("howto/reading_logs.md")
     space: dict = {}
     for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
         exec(block, space)

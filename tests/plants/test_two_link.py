@@ -87,7 +87,7 @@ def test_spring_at_link_2_sees_the_rotary_inertia_alone():
 
 
 def test_the_lumped_mirror(thor):
-    """Lumped, spring at link 2: link 1 feels what link 2 feels with the spring at link 1 (docs/plants.md)."""
+    """Lumped, spring at link 2: link 1 feels what link 2 feels with the spring at link 1 (docs/theory/plants.md)."""
     s = 1j * FREQUENCIES
     mirror, paper = so.plants.high_impedance("lumped", "link2"), so.plants.high_impedance("lumped", "link1")
     f1, f2 = (response(mirror, thor, output, s) for output in ("F1", "F2"))

@@ -123,7 +123,7 @@ class PlantMargins:
         The end of the search: three times the classical margin and two samples, up to 20,000 samples. A delay
         that long is beyond what the loop's model means.
     nu_gap, nu_gap_hz : float and float or None
-        Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: see docs/margins.md.
+        Vinnicombe's gap of this plant's loop gain to the design plant's. It says little here: docs/theory/margins.md.
 
     """
 

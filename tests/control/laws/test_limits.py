@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, replace
-from pathlib import Path
 
 import control
 import numpy as np
@@ -22,8 +21,8 @@ from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
 from seaopt.errors import ControlError
 from seaopt.problem.schema import ControllerTable
 from tests import laws
+from tests.pages import read_page
 
-TUNING = Path(__file__).resolve().parents[3] / "docs" / "tuning.md"
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, min_disk_margin=0.5, max_reference_peak=1.2,
     max_noise_gain=25, passive_band_hz=(1, 60),
@@ -56,7 +55,7 @@ def loops(design, other=None, cosine=0.5, *, held_stable=True):
 
 def table_of_the_docs():
     """Return the rows of the table below "Limits" as lists of cells."""
-    section = TUNING.read_text(encoding="utf-8").split("## Limits\n")[1].split("\n## ")[0]
+    section = read_page("theory/tuning.md").split("## Limits\n")[1].split("\n## ")[0]
     lines = [line for line in section.splitlines() if line.startswith("|")]
     return [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,12 +13,12 @@ import seaopt as so
 from seaopt.errors import ControlError
 from seaopt.robustness import tune_certified
 from seaopt.robustness.certificate.joint import _list_new_witnesses
+from tests.pages import unbroken
 
 SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25,
     min_sensitivity_bandwidth_hz=6,
 )  # fmt: skip
-DOCS = Path(__file__).resolve().parents[3] / "docs"
 RANGES = {"I_p": (0.2, 0.6), "eta": (0.9, 1.0), "delay_s": (0.0, 2e-4)}
 
 
@@ -53,7 +52,7 @@ def test_every_round_has_draws_of_its_own_and_keeps_the_earlier_witnesses(done):
 
 def test_the_documentation_shows_these_rounds(done):
     """But for the number of failures: the page has more draws."""
-    page = " ".join((DOCS / "certificate.md").read_text(encoding="utf-8").split())
+    page = unbroken("theory/certificate.md")
     head, _, *rounds = repr(done).splitlines()
     assert head in page
     for line in rounds:

@@ -88,7 +88,7 @@ def test_robustness_json_reads_back(certificate, controller, stand, swing, thor)
 
 
 def test_a_run_that_fails_is_a_requirement_with_its_witness(controller, stand, thor):
-    """At 11 times the gain the limit of 9 A holds the loop in a limit cycle near 84 Hz (docs/verification.md)."""
+    """At 11 times the gain the limit of 9 A holds the loop in a limit cycle near 84 Hz (verification.md)."""
     wild = replace(controller, law=scaled(controller.law, 12.0))
     found = so.certify(wild, {"stand": stand}, thor).with_simulation(seed=3)
     (failed,) = [item for item in found.requirements if item.name == "simulation_failures"]
