@@ -72,7 +72,9 @@ def tune(path, params, **asked):
 
 def certify(path, controller, params, **options):
     plants = {"stand": path.stand, "swing": path.swing}
-    return so.certify(controller, plants, params, samples=20, ranges={path.link: (0.15, 0.5)}, **options)
+    return so.certify(
+        controller, plants, params, samples=20, ranges={path.link: (0.15, 0.5)}, **options, simulations=False
+    )
 
 
 def test_the_controller_is_the_same(controllers):

@@ -21,17 +21,18 @@ from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
 from seaopt.cli.terminal import Terminal
-from seaopt.control import Controller, ControllerSpec, sweep, tune
+from seaopt.control import Controller, ControllerSpec, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit, warn_unidentified
+from seaopt.estimation import Experiment, Fit, warn_unidentified
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, read_problem
+from seaopt.problem.stages import can_design, certify_problem, fit_problem, score_problem, tune_problem
 from seaopt.reporting import verdict, write_frontier_figure, write_report
-from seaopt.robustness import Budget, Certificate, certify, tune_certified
+from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
 
@@ -106,13 +107,7 @@ class Session:
 
     def can_design(self) -> bool:
         """Tell whether the fit of this run can be designed with: it converged, or there was none."""
-        fitted: Fit | None = self.results.get("fit")
-        return fitted is None or (fitted.status in ("converged", "not_identifiable") and self._covers(fitted))
-
-    def _covers(self, fitted: Fit) -> bool:
-        """Tell whether what the fit leaves open has a range in the problem."""
-        names = fitted.covariance.names
-        return all(np.isfinite(fitted.covariance.std(name)) or name in self.problem.ranges for name in names)
+        return "fit" not in self.results or can_design(self.problem, self.results["fit"])
 
     def run(self, stage: str) -> None:
         """Run one stage and write its result."""
@@ -183,10 +178,7 @@ class Session:
 
     def values(self) -> ParameterSet:
         """Return the parameter values to design with, the file's for what the fit does not have."""
-        source = self.parameters()
-        if isinstance(source, ParameterSet):
-            return source
-        return self.problem.parameters.with_parameters(*source.parameters.values())
+        return self.problem.values(self.parameters())
 
     def _design_values(self, *plants: Plant) -> ParameterSet:
         """Return the values to design with; those that the fit cannot tell, of these plants, are named on stderr."""
@@ -300,30 +292,17 @@ class Session:
         return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
 
     def _fit(self, tell: Callable[[str], None]) -> None:
-        if not self.problem.table.experiment:
-            raise ProblemError(f"{self.problem.source}: has no [[experiment]] to fit; add one")
         tell("reading logs")
-        experiments = self.problem.choose_fitted(self.experiments())
-        if not experiments:
-            raise ProblemError(f'{self.problem.source}: every [[experiment]] has use = "validate"; fit one of them')
-        result = fit(
-            experiments,
-            self.problem.parameters,
+        result = fit_problem(
+            self.problem,
+            self.experiments(),
             callback=lambda iteration, cost: tell(f"iteration {iteration}, cost {cost:.6g}"),
             progress=lambda kind, text: self._note(text) if kind == "advice" else tell(text),
-            alternatives=tuple(self.problem.plants.values()),
-            **self.problem.fit_options,
         )
         tell(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}")
         self.results["fit"] = result
-        scores = self._score(result)
-        self.results["scores"] = scores
+        self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {one.name: one.to_dict() for one in scores}})
-
-    def _score(self, result: Fit) -> list[ModelledOutputs]:
-        """Return the predictions of the experiments that are not fitted."""
-        names = {experiment.name for experiment in self.problem.choose_fitted(self.experiments())}
-        return [result.predict(experiment) for experiment in self.experiments() if experiment.name not in names]
 
     def validate(self, log: Path, like: str | None, as_json: bool) -> None:
         """Score the folder's fit on another log, and print that."""
@@ -367,21 +346,13 @@ class Session:
 
     def _tune(self, tell: Callable[[str], None]) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
-        values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
+        self._design_values(design, *(plant for plant, _ in robust_to.values()))
         spec = self._spec()
-        tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz")
-        draws = self.problem.draws(self.parameters())
-        table = self.problem.robustness
-        if table.retune:
-            joint = tune_certified(
-                design, self.parameters(), spec, self.problem.certified_plants(), ranges=self.problem.ranges,
-                robust_to=robust_to, draws=draws, others=self.problem.parameters, samples=table.samples,
-                seed=table.seed + 1, rounds=table.retune,
-                progress=lambda done: tell(f"{spec.structure}, {spec.bandwidth_hz:g} Hz, round {done.number}"),
-            )  # fmt: skip
-            self.results["joint"], result = joint, joint.controller
-        else:
-            result = tune(design, values, spec, robust_to, draws=draws)
+        asked = f"{spec.structure}, {spec.bandwidth_hz:g} Hz"
+        tell(asked)
+        result = tune_problem(self.problem, self.parameters(), lambda done: tell(f"{asked}, round {done.number}"))
+        if isinstance(result, JointTuning):
+            self.results["joint"], result = result, result.controller
         self.results["tune"] = result
         self._write("tune", result.to_dict())
 
@@ -404,14 +375,11 @@ class Session:
         table = self.problem.robustness
         tell(f"{table.samples} draws")
         self._design_values(*plants.values())
-        result = certify(
-            controller, plants, source, ranges=self.problem.ranges, samples=table.samples, seed=table.seed,
-            others=self.problem.parameters, bounds=Budget() if table.bounds else None,
-            max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
-            progress=lambda done, of: tell(f"{table.samples} draws, {100 * done // of} %"),
-        )  # fmt: skip
-        tell("simulating scenarios")
-        result = result.with_simulation(sensors=self.problem.sensors, current_step_A=table.step, seed=table.seed)
+
+        def count(done: int, of: int) -> None:
+            tell(f"{table.samples} draws, {100 * done // of} %" if done < of else "simulating scenarios")
+
+        result = certify_problem(self.problem, controller, source, count)
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
         for remark in (*result.notes, *self.problem.remarks(self.values())):
             self._note(remark)

@@ -158,6 +158,10 @@ class Problem:
         """Return remarks on ranges that are valid but may not be meant, at nominal parameters."""
         return range_remarks(self.ranges, self.certified_plants(), parameters)
 
+    def values(self, source: Fit | ParameterSet) -> ParameterSet:
+        """Return the values to design with: a fit's, the file's for what it does not have."""
+        return self.parameters.with_parameters(*source.parameters.values()) if isinstance(source, Fit) else source
+
     def robust_to(self, parameters: ParameterSet) -> dict[str, tuple[Plant, ParameterSet]]:
         """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges."""
         out: dict[str, tuple[Plant, ParameterSet]] = {}

@@ -190,7 +190,7 @@ class Certificate:
     models : mapping of name to Plant
         What it was certified on, at `parameters`: the plants as they are, friction and all.
     simulated : Simulated or None
-        The results of `with_simulation`.
+        The results of `with_simulation`; None where `certify` was told to leave them out.
     steps : Verification, str or None
         The simulated steps that every plant is judged by; the reason where they cannot be simulated.
     cycles : mapping of name to tuple of FoundCycle
@@ -236,8 +236,9 @@ class Certificate:
     ) -> Certificate:
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
-        Each scenario that fails is a requirement that is not met. Large signals (on every plant), passivity and
-        coupled stability (on the design plant) are not requirements.
+        `certify` does this unless it is told not to; here it is done again, with other sensors, say. Each scenario
+        that fails is a requirement that is not met. Large signals (on every plant), passivity and coupled stability
+        (on the design plant) are not requirements.
 
         Parameters
         ----------
@@ -253,8 +254,9 @@ class Certificate:
         >>> import seaopt as so
         >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
         >>> controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
-        >>> certificate = so.certify(controller, {"stand": stand}, thor).with_simulation()
-        >>> certificate.passed, len(certificate.simulated.verification.rows)
+        >>> certificate = so.certify(controller, {"stand": stand}, thor, simulations=False)
+        >>> coarse = certificate.with_simulation(sensors=so.Sensors(quantisation={"F1": 0.5}))
+        >>> coarse.passed, len(coarse.simulated.verification.rows)
         (True, 7)
 
         """
@@ -269,7 +271,7 @@ class Certificate:
         """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
 
         Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
-        reference; nothing may oscillate. `certify` does this; `with_simulation` plays all other scenarios too.
+        reference; nothing may oscillate. `certify` always does this; `with_simulation` plays all other scenarios too.
         """
         played = self.play_steps()
         requirements = (*self.requirements, *played._require_cycles(), *_require_runs(played.steps or ""))
@@ -441,14 +443,15 @@ class Certificate:
         )  # fmt: skip
 
     def _ideal_notes(self) -> tuple[str, ...]:
-        """Say that friction that sticks was simulated with an ideal sensor, where nothing else was."""
-        if self.simulated is not None or self.runs is None:
+        """Say that friction that sticks was simulated with a sensor without noise, where nothing else was."""
+        noisy = self.simulated is not None and any(self.simulated.sensors.noise_std.values())
+        if noisy or self.runs is None:
             return ()
         if not any(each.friction == "sticking" for chosen in self.runs.scenarios.values() for each in chosen):
             return ()
         return (
-            "steps were simulated with an ideal sensor: noise can free a joint that sticks, so that what is regulated "
-            "wanders; call with_simulation(sensors=...), or give the problem file sensors",
+            "the simulations' sensor has no noise, which can free a joint that sticks, so that what is regulated "
+            "wanders; give certify(sensors=...), or sensors = { noise_std = ... } in [robustness]",
         )
 
     def _worst_dict(self, name: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from types import NoneType
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
@@ -108,9 +109,12 @@ def certify(
     max_failure_probability: float | None = None,
     min_friction_margin: float | None = None,
     bounds: Budget | None = None,
+    simulations: bool = True,
+    sensors: Sensors | None = None,
+    current_step_A: float = 0.0,
     progress: DrawProgress | None = None,
 ) -> Certificate:
-    """Check a controller against plants, at the nominal parameters and over draws.
+    """Check a controller against plants: at the nominal parameters, over draws, and simulated on the nonlinear plants.
 
     Everything is computed from the controller's two transfer functions; every loop is closed with the current that
     the controller commands, so that its own eta, K_tau and lead change the loop gain.
@@ -146,6 +150,11 @@ def certify(
     bounds : Budget, optional
         Also bound the worst case from above, with this much work on each plant; not at all if left out. The bounds
         are not a requirement; a plant that this meets and that is worse than the worst case found replaces it.
+    simulations : bool
+        Play every scenario on the nonlinear plants, with large signals, passivity and environments, as
+        `Certificate.with_simulation` does. False plays steps of several sizes alone, which takes a few seconds less.
+    sensors, current_step_A
+        Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     progress : callable, optional
         Called with the number of draws done and their total, now and then.
 
@@ -169,12 +178,19 @@ def certify(
     >>> certificate = so.certify(controller, {"swing": swing}, params, ranges={"I_p": (0.3, 0.5)}, samples=100)
     >>> certificate.passed, certificate.monte_carlo.failures, list(certificate.plants)
     (True, 0, ['design', 'swing'])
+    >>> certificate.simulated.passed
+    True
 
     """
     _check_arguments(controller, plants, samples, seed, confidence, max_failure_probability, min_friction_margin)
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
+    require_type(simulations, bool, "simulations", "give True or False", ControlError)
+    if not simulations and (sensors is not None or current_step_A):
+        raise ControlError(
+            "sensors and current_step_A are of the simulations, which are left out; give simulations=True"
+        )
     asked = (min_friction_margin, controller.spec.level(MIN_FRICTION_MARGIN))
     min_friction_margin = max((slope for slope in asked if slope is not None), default=None)
     models, others = _with_design(controller, plants, others or ParameterSet())
@@ -218,7 +234,10 @@ def certify(
         brackets=brackets, friction=friction, friction_draws=friction_draws,
         remarks=(*_remark_delay(controller, parameters), *_remark_amplitude(controller, models, nominal)),
     )  # fmt: skip
-    return certificate.with_steps()
+    certificate = certificate.with_steps()
+    if not simulations:
+        return certificate
+    return certificate.with_simulation(sensors=sensors, current_step_A=current_step_A, seed=seed)
 
 
 def _add_warm_winding(

@@ -193,7 +193,7 @@ def tune_certified(
         if controller.feasible:
             certificate = certify(
                 controller, plants, parameters, ranges=ranges, others=others, samples=samples, seed=seed + number - 1,
-                confidence=share,
+                confidence=share, simulations=False,
             )  # fmt: skip
         added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
         done.append(

@@ -203,7 +203,9 @@ def test_physical_bounds_cut_the_set(stand, thor):
 
 def test_the_certificate_states_and_keeps_the_bounds(controller, swing, thor, tmp_path):
     ranges = {"I_p": (0.3, 0.5)}
-    certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50, bounds=Budget())
+    certificate = so.certify(
+        controller, {"swing": swing}, thor, ranges=ranges, samples=50, bounds=Budget(), simulations=False
+    )
     bounds = certificate.brackets["swing"]
     assert certificate.worst["swing"].ms <= bounds.ms_upper < 1.011 * certificate.worst["swing"].ms
     assert "bounded, rounding estimated: all stable, Ms below 1.5" in repr(certificate)

@@ -37,7 +37,13 @@ def controller(stand, swing, thor):
 def certificate(controller, stand, swing, thor):
     params, plants = thor.prior(J=2e-9, b_r=2e-7, eta=1e-4), {"stand": stand, "swing": swing}
     return so.certify(
-        controller, plants, params, ranges={"I_p": (0.2, 0.6)}, samples=1375, max_failure_probability=0.01
+        controller,
+        plants,
+        params,
+        ranges={"I_p": (0.2, 0.6)},
+        samples=1375,
+        max_failure_probability=0.01,
+        simulations=False,
     )
 
 
@@ -92,7 +98,9 @@ def test_the_worst_draw_is_a_witness(certificate, controller, swing, thor):
 
 
 def test_a_controller_that_fails_is_named_with_its_witness(controller, stand, thor):
-    certificate = so.certify(controller, {"stand": stand}, thor, ranges={"eta": (0.5, 4.0)}, samples=200)
+    certificate = so.certify(
+        controller, {"stand": stand}, thor, ranges={"eta": (0.5, 4.0)}, samples=200, simulations=False
+    )
     assert not certificate.passed
     assert certificate.monte_carlo.failures > 0
     broken = [item for item in certificate.requirements if not item.met]
@@ -102,7 +110,9 @@ def test_a_controller_that_fails_is_named_with_its_witness(controller, stand, th
 
 
 def test_an_unstable_draw_is_a_failure(controller, stand, thor):
-    certificate = so.certify(controller, {"stand": stand}, thor, ranges={"eta": (20.0, 21.0)}, samples=20)
+    certificate = so.certify(
+        controller, {"stand": stand}, thor, ranges={"eta": (20.0, 21.0)}, samples=20, simulations=False
+    )
     assert certificate.monte_carlo.failures == 20
     assert np.isinf(certificate.worst["stand"].ms)
     assert certificate.to_dict()["monte_carlo"]["failure_probability_bound"] == 1.0
@@ -117,7 +127,7 @@ def test_the_bound_is_clopper_pearson(n, k):
 
 def test_fit_covariance_drives_the_draws(controller, stand, swing, short_log, thor):
     fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], thor.free("J", "b_r", "eta"))
-    certificate = so.certify(controller, {"stand": stand, "swing": swing}, fit, samples=100)
+    certificate = so.certify(controller, {"stand": stand, "swing": swing}, fit, samples=100, simulations=False)
     assert certificate.passed
     assert set(certificate.worst["stand"].parameters) == {"J", "b_r", "eta"}
 
@@ -164,14 +174,16 @@ def test_the_law_alone_is_certified(controller, stand, thor):
     """Halve the law: the design figures are of the halved law, not of what was tuned."""
     from dataclasses import replace
 
-    certificate = so.certify(replace(controller, law=scaled(controller.law, 0.5)), {"stand": stand}, thor)
+    certificate = so.certify(
+        replace(controller, law=scaled(controller.law, 0.5)), {"stand": stand}, thor, simulations=False
+    )
     (row,) = [item for item in certificate.requirements if item.name == "bandwidth_hz"]
     assert not row.met
     assert row.value < 20
 
 
 def test_nothing_uncertain_is_no_statement(controller, stand, thor):
-    certificate = so.certify(controller, {"stand": stand}, thor)
+    certificate = so.certify(controller, {"stand": stand}, thor, simulations=False)
     assert certificate.monte_carlo.samples == 0
     assert certificate.monte_carlo.failure_probability_bound == 1.0
     assert "nothing is uncertain" in repr(certificate)
@@ -192,7 +204,7 @@ def test_fits_that_cannot_be_trusted(controller, stand, short_log, thor):
 def test_a_parameter_on_its_bound_is_drawn_from_one_side(controller, stand, short_log, thor):
     start = thor.update(J=5e-6).free("J", "b_r").bound(J=(3.3101e-6, 1e-5))
     fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], start)
-    certificate = so.certify(controller, {"stand": stand}, fit, samples=200)
+    certificate = so.certify(controller, {"stand": stand}, fit, samples=200, simulations=False)
     assert certificate.worst["stand"].parameters["J"] >= 3.3101e-6
 
 
@@ -201,7 +213,7 @@ def test_a_known_parameters_prior_is_drawn_too(controller, stand, short_log, tho
 
     known = thor.free("J").with_parameters(replace(thor["k"], prior_std=5e3))
     fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], known)
-    certificate = so.certify(controller, {"stand": stand}, fit, samples=50)
+    certificate = so.certify(controller, {"stand": stand}, fit, samples=50, simulations=False)
     assert set(certificate.worst["stand"].parameters) == {"J", "k"}
 
 
@@ -226,8 +238,10 @@ def test_draws_have_the_fits_covariance_whatever_the_units_and_the_order():
 def test_the_design_plant_is_certified_though_nobody_lists_it(controller, stand, swing, thor):
     """A law whose own plant breaks the limit on a draw must not pass on another plant alone."""
     heavy = {"J": (3.31e-6, 6e-6)}
-    alone = so.certify(controller, {"swing": swing}, thor, ranges=heavy, samples=50)
-    listed = so.certify(controller, {"design": stand, "swing": swing}, thor, ranges=heavy, samples=50)
+    alone = so.certify(controller, {"swing": swing}, thor, ranges=heavy, samples=50, simulations=False)
+    listed = so.certify(
+        controller, {"design": stand, "swing": swing}, thor, ranges=heavy, samples=50, simulations=False
+    )
     assert list(alone.plants) == ["design", "swing"]
     assert alone.worst["design"].ms == pytest.approx(listed.worst["design"].ms, rel=1e-9)
     assert alone.monte_carlo == listed.monte_carlo
@@ -239,7 +253,7 @@ def test_another_law_meets_other_draws(controller, stand, thor):
     """A law tuned with the worst draws of a certificate must not be certified on the same draws."""
     softer = replace(controller, law=scaled(controller.law, 1.0, 0.9))
     points = [
-        so.certify(law, {"stand": stand}, thor, ranges={"eta": (0.9, 1.0)}, samples=1, seed=seed)
+        so.certify(law, {"stand": stand}, thor, ranges={"eta": (0.9, 1.0)}, samples=1, seed=seed, simulations=False)
         for law, seed in ((controller, 1), (controller, 1), (controller, 2), (softer, 1))
     ]
     assert len({_digest(controller), _digest(softer)}) == 2
@@ -250,7 +264,9 @@ def test_another_law_meets_other_draws(controller, stand, thor):
 def test_failures_are_told_apart(controller, stand, swing, thor):
     """Eigenvalues and peaks of each draw, one by one, against the counts."""
     ranges = {"I_p": (0.002, 0.6), "delay_s": (0.0, 2e-3)}
-    found = so.certify(controller, {"stand": stand, "swing": swing}, thor, ranges=ranges, samples=300).monte_carlo
+    found = so.certify(
+        controller, {"stand": stand, "swing": swing}, thor, ranges=ranges, samples=300, simulations=False
+    ).monte_carlo
     assert found.unstable + found.over_ms + found.over_mt == found.failures
     assert min(found.unstable, found.over_ms) > 0
     assert f"{found.unstable} unstable" in str(found)
@@ -274,7 +290,7 @@ def test_an_edited_verdict_is_not_believed(certificate, controller, stand, swing
 
 
 def test_a_nominal_value_outside_its_range_is_noted(controller, swing, thor):
-    found = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.5, 0.6)}, samples=5)
+    found = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.5, 0.6)}, samples=5, simulations=False)
     assert "I_p = 0.36 lies outside its range of 0.5 to 0.6" in found.notes[0]
 
 
@@ -302,13 +318,15 @@ def test_the_bound_is_required_where_it_is_asked_for(certificate, controller, st
     """1375 draws without a failure bound it by 1 % (ln(1e6)/ln(1/0.99) = 1374.6); 50 by 24 %, which is noted."""
     assert certificate.passed and any(row.name == "max_failure_probability" for row in certificate.requirements)
     options = {"ranges": {"eta": (0.9, 1.0)}, "max_failure_probability": 0.01}
-    few = so.certify(controller, {"stand": stand}, thor, samples=50, **options)
+    few = so.certify(controller, {"stand": stand}, thor, samples=50, **options, simulations=False)
     (row,) = [item for item in few.requirements if not item.met]
     assert (row.name, row.limit) == ("max_failure_probability", 0.01)
     assert row.value == pytest.approx(1.0 - 1e-6 ** (1 / 50), rel=1e-9)
     assert "1375 draws without a failure would do" in row.where
     assert "below 0.24" in few.notes[-1]
-    assert not so.certify(controller, {"stand": stand}, thor, max_failure_probability=0.01).passed  # nothing is drawn
+    assert not so.certify(
+        controller, {"stand": stand}, thor, max_failure_probability=0.01, simulations=False
+    ).passed  # nothing is drawn
 
 
 def test_values_in_other_units_are_the_same_values(controller, stand, thor):
@@ -317,7 +335,7 @@ def test_values_in_other_units_are_the_same_values(controller, stand, thor):
     kilograms = thor.with_parameters(replace(thor["m_l"], prior_std=1e-3), late[0])
     grams = Parameter(name="m_l", value=646.0, unit="g", prior_std=1.0, min=0.0)
     found = [
-        so.certify(controller, {"stand": stand}, params, ranges={"eta": (0.9, 1.0)}, samples=50)
+        so.certify(controller, {"stand": stand}, params, ranges={"eta": (0.9, 1.0)}, samples=50, simulations=False)
         for params in (kilograms, thor.with_parameters(grams, late[1]))
     ]
     assert found[1].worst["stand"].ms == pytest.approx(found[0].worst["stand"].ms, rel=1e-9)
@@ -329,7 +347,7 @@ def test_values_in_other_units_are_the_same_values(controller, stand, thor):
 def test_a_ranged_parameter_that_nobody_gave_has_its_default(controller, stand, swing):
     """A set with the stand's names alone: the swing's inertia is the plant's, inside its range."""
     stands = stand.complete(so.plants.thor())
-    found = so.certify(controller, {"swing": swing}, stands, ranges={"I_p": (0.3, 0.4)}, samples=5)
+    found = so.certify(controller, {"swing": swing}, stands, ranges={"I_p": (0.3, 0.4)}, samples=5, simulations=False)
     (told,) = found.varied
     assert told.value == 0.36
     assert not told.outside
@@ -347,7 +365,7 @@ def test_a_plant_with_friction_is_certified_sliding_and_stuck(stand, rubbing):
     """Its figures are those of the loops with viscous friction of no slope, and of f_c/v_s, computed by hand."""
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25, delay_samples=2)
     controller = so.tune(stand, rubbing.update(f_c=0.0), spec)
-    certificate = so.certify(controller, {"stand": stand}, rubbing, samples=10)
+    certificate = so.certify(controller, {"stand": stand}, rubbing, samples=10, simulations=False)
     assert list(certificate.plants) == ["stand sliding", "stand stuck"]
     radius = rubbing["l"].value / (2 * np.pi * rubbing["N_p"].value)
     for state, slope in (("sliding", 0.0), ("stuck", 25 / 0.004)):
@@ -374,7 +392,9 @@ def test_stability_with_friction_is_shown_over_draws_and_may_be_required(stand, 
     rubbing = thor.update(f_c=50.0)
     controller = so.tune(stand, rubbing, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25))
     ranges = {"eta": (0.8, 1.1), "f_c": (20.0, 80.0)}
-    certificate = so.certify(controller, {"stand": stand}, rubbing, ranges=ranges, samples=20, min_friction_margin=1e4)
+    certificate = so.certify(
+        controller, {"stand": stand}, rubbing, ranges=ranges, samples=20, min_friction_margin=1e4, simulations=False
+    )
     drawn = certificate.friction_draws["stand"]
     assert (drawn.samples, drawn.shown) == (20, 20)
     assert drawn.least_slope == pytest.approx(drawn.factor * drawn.parameters["f_c"] / rubbing["v_s"].value)
@@ -403,7 +423,9 @@ def test_friction_at_draws_alone_is_looked_at_too(stand, smooth):
     """The draws' proof is that of the same law at the worst draw's parameters, with friction nominal there."""
     controller, values = smooth
     ranges = {"f_c": (0.0, 50.0)}
-    certificate = so.certify(controller, {"stand": stand}, values, ranges=ranges, samples=10, min_friction_margin=1e6)
+    certificate = so.certify(
+        controller, {"stand": stand}, values, ranges=ranges, samples=10, min_friction_margin=1e6, simulations=False
+    )
     (row,) = margin_rows(certificate)
     drawn = certificate.friction_draws["stand"]
     assert not row.met and not certificate.passed
@@ -418,7 +440,7 @@ def test_friction_at_draws_alone_is_looked_at_too(stand, smooth):
 
 def test_without_friction_a_margin_that_is_asked_says_so(stand, smooth):
     controller, values = smooth
-    certificate = so.certify(controller, {"stand": stand}, values, min_friction_margin=1e6)
+    certificate = so.certify(controller, {"stand": stand}, values, min_friction_margin=1e6, simulations=False)
     (row,) = margin_rows(certificate)
     assert row.met and np.isinf(row.value) and "no friction" in row.where
 
@@ -427,7 +449,7 @@ def test_the_larger_of_two_friction_margins_is_required(stand, smooth):
     controller, values = smooth
     rubbing = values.update(f_c=50.0)
     asking = replace(controller, spec=replace(controller.spec, min_friction_margin=1e9))
-    certificate = so.certify(asking, {"stand": stand}, rubbing, min_friction_margin=10.0)
+    certificate = so.certify(asking, {"stand": stand}, rubbing, min_friction_margin=10.0, simulations=False)
     (row,) = margin_rows(certificate)
     assert row.limit == 1e9 and not row.met and not certificate.passed
 
@@ -451,9 +473,9 @@ def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, delay_samples=2)
     controller, sharp = so.tune(stand, rubbing, spec), rubbing.update(v_s=1e-6)
     asked = {"ranges": {"eta": (0.4, 3.0)}, "samples": 3}
-    certificate = so.certify(controller, {"stand": stand}, sharp, min_friction_margin=1e3, **asked)
+    certificate = so.certify(controller, {"stand": stand}, sharp, min_friction_margin=1e3, **asked, simulations=False)
     margin, drawn = certificate.friction["stand"], certificate.friction_draws["stand"]
     assert not margin.shown and (drawn.samples, drawn.shown) == (3, 0)
     (row,) = [row for row in certificate.requirements if row.name == "min_friction_margin"]
     assert row.value == min(*margin.slopes, drawn.least_slope) < margin.slopes[0]
-    assert so.certify(controller, {"stand": stand}, sharp, **asked).friction_draws == {}
+    assert so.certify(controller, {"stand": stand}, sharp, **asked, simulations=False).friction_draws == {}

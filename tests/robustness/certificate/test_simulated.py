@@ -27,7 +27,7 @@ def controller(stand, swing, thor):
 @pytest.fixture(scope="module")
 def linear(controller, stand, swing, thor):
     plants = {"stand": stand, "swing": swing}
-    return so.certify(controller, plants, thor, ranges={"I_p": (0.3, 0.5)}, samples=50)
+    return so.certify(controller, plants, thor, ranges={"I_p": (0.3, 0.5)}, samples=50, simulations=False)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_robustness_json_reads_back(certificate, controller, stand, swing, thor)
 def test_a_run_that_fails_is_a_requirement_with_its_witness(controller, stand, thor):
     """At 11 times the gain the limit of 9 A holds the loop in a limit cycle near 84 Hz (verification.md)."""
     wild = replace(controller, law=scaled(controller.law, 12.0))
-    found = so.certify(wild, {"stand": stand}, thor).with_simulation(seed=3)
+    found = so.certify(wild, {"stand": stand}, thor, simulations=False).with_simulation(seed=3)
     (failed,) = [item for item in found.requirements if item.name == "simulation_failures"]
     assert (failed.met, failed.value, failed.limit) == (False, 7.0, 0.0)  # the same failure in every run, once
     assert failed.where.startswith("stand, ") and "draw nominal, seed 3: unstable" in failed.where

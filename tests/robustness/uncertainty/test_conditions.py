@@ -241,7 +241,9 @@ def test_what_the_motor_cannot_hold_is_named(controller, swing, thor):
 
 def test_the_certificates_worst_draw_is_played_there(controller, swing, thor):
     ranges = {"I_p": (0.2, 0.5), "phi": (0.3, 0.8), "delay_s": (0.0, 2e-4)}
-    _, drawn = certified = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=50).worst["swing"]
+    _, drawn = certified = so.certify(
+        controller, {"swing": swing}, thor, ranges=ranges, samples=50, simulations=False
+    ).worst["swing"]
     worst = certified.parameters
     verification = verify(controller, {"swing": swing}, thor, draws={"swing": [drawn]}, scenarios=[STEP])
     assert verification.rows[1].parameters == pytest.approx(worst)
@@ -280,7 +282,9 @@ def test_a_limit_cycle_at_the_angle_is_where_the_describing_function_says(contro
 
 def test_conditions_of_the_nominal_values_are_in_the_worst_case(controller, swing, thor):
     there = at(thor, phi=0.9)
-    certificate = so.certify(controller, {"swing": swing}, there, ranges={"I_p": (0.3, 0.4)}, samples=20)
+    certificate = so.certify(
+        controller, {"swing": swing}, there, ranges={"I_p": (0.3, 0.4)}, samples=20, simulations=False
+    )
     worst = certificate.worst["swing"]
     assert worst.ms >= certificate.plants["swing"].ms
     again = controller.close(swing, at(thor.update(**worst.parameters), phi=0.9)).figures()

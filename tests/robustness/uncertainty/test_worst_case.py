@@ -36,6 +36,7 @@ def certificate(controller, swing, thor, progress):
     return so.certify(
         controller, {"swing": swing}, thor, ranges={"I_p": (0.15, 0.6)}, samples=50, seed=1,
         progress=lambda done, total: progress.append((done, total)),
+        simulations=False,
     )  # fmt: skip
 
 
@@ -68,7 +69,7 @@ def test_draws_beyond_computing_are_failures(b_r, controller, stand, thor):
     assert figures.spectral_radius[1] >= 1.0 - 1e-9
     for options in ({"ranges": {"b_r": (0.0, b_r)}}, {}):
         values = thor if options else thor.with_parameters(replace(thor["b_r"], value=b_r, prior_std=min(b_r, 1e150)))
-        certificate = so.certify(controller, {"stand": stand}, values, samples=50, **options)
+        certificate = so.certify(controller, {"stand": stand}, values, samples=50, **options, simulations=False)
         assert not certificate.passed
         assert certificate.monte_carlo.failures >= 49
 
@@ -109,7 +110,7 @@ def test_the_worst_case_is_scipys_on_one_range(controller, swing, thor, certific
 
 def test_the_worst_case_of_several_is_no_less_than_any_corner_or_draw(controller, swing, thor):
     ranges = {"I_p": (0.2, 0.6), "L_a": (0.065, 0.08), "eta": (0.9, 1.1), "delay_s": (0.0, 3e-4)}
-    certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=200)
+    certificate = so.certify(controller, {"swing": swing}, thor, ranges=ranges, samples=200, simulations=False)
     corners = np.array(np.meshgrid(*ranges.values())).reshape(4, -1)
     figures = batch_figures(controller, swing, thor, dict(zip(ranges, corners, strict=True)))
     fresh = np.random.default_rng(7)
@@ -121,7 +122,7 @@ def test_the_worst_case_of_several_is_no_less_than_any_corner_or_draw(controller
 
 def test_the_gaussian_part_stays_inside_its_ellipsoid(controller, swing, thor):
     params = thor.prior(J=1e-7, b_r=1e-5)
-    certificate = so.certify(controller, {"swing": swing}, params, samples=100)
+    certificate = so.certify(controller, {"swing": swing}, params, samples=100, simulations=False)
     at = certificate.worst["swing"].parameters
     size = ((at["J"] - 3.31e-6) / 1e-7) ** 2 + ((at["b_r"] - 1.31e-4) / 1e-5) ** 2
     assert size == pytest.approx(chi2.ppf(0.999, 2), rel=1e-3)
@@ -133,7 +134,7 @@ def test_the_worst_case_on_a_physical_bound_is_a_dense_searchs(controller, swing
     tight = thor.prior(J=2e-7, b_r=4e-5).with_parameters(
         replace(thor["b_r"], prior_std=4e-5, min=1.25e-4), replace(thor["J"], prior_std=2e-7)
     )
-    certificate = so.certify(controller, {"swing": swing}, tight, samples=200)
+    certificate = so.certify(controller, {"swing": swing}, tight, samples=200, simulations=False)
     radius, angle = np.meshgrid(np.linspace(0.0, np.sqrt(chi2.ppf(0.999, 2)), 20), np.linspace(0.0, 2 * np.pi, 241))
     b_r = np.maximum(1.31e-4 + 4e-5 * (radius * np.sin(angle)).ravel(), 1.25e-4)
     figures = batch_figures(
@@ -159,7 +160,9 @@ def test_a_witness_verifies_itself_and_goes_back_to_the_tuner(controller, stand,
 
 def test_a_worst_case_that_no_draw_hit_fails_the_certificate(controller, swing, thor):
     """The edge lies at an end of the range that five draws miss; the search finds it, and the requirement names it."""
-    certificate = so.certify(controller, {"swing": swing}, thor, ranges={"I_p": (0.02, 1.0)}, samples=5)
+    certificate = so.certify(
+        controller, {"swing": swing}, thor, ranges={"I_p": (0.02, 1.0)}, samples=5, simulations=False
+    )
     assert certificate.monte_carlo.failures == 0
     assert controller.close(swing, thor.update(I_p=0.02)).figures().ms > 1.6
     (row,) = [row for row in certificate.requirements if not row.met]

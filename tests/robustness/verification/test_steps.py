@@ -44,7 +44,7 @@ def blind(stand, rubbing):
 
 @pytest.fixture(scope="module")
 def certificate(blind, stand, rubbing):
-    return so.certify(blind, {"stand": stand}, rubbing)
+    return so.certify(blind, {"stand": stand}, rubbing, simulations=False)
 
 
 def play_independently(controller, params, steps, jump=False):
@@ -78,7 +78,7 @@ def test_what_overshoots_only_once_friction_lets_go_is_not_passed(stand, thor):
     )  # fmt: skip
     spec = so.ControllerSpec(bandwidth_hz=32.4, delay_samples=3, max_noise_gain=25, current_limit_A=13.5)
     controller = so.tune(stand, params, spec)
-    certificate = so.certify(controller, {"stand": stand}, params)
+    certificate = so.certify(controller, {"stand": stand}, params, simulations=False)
     rows = {row.scenario: row.overshoot for row in certificate.steps.rows}
     smooth = max(rows[name] for name in rows if "sticking" not in name)
     (over,) = [row for row in certificate.requirements if row.name == "step_overshoot"]
@@ -118,7 +118,7 @@ def test_an_overshoot_that_the_limit_alone_makes_stands(cell, stand, thor):
 
 def test_where_no_peak_is_asked_for_the_certificate_says_that_none_is_judged(blind, stand, rubbing):
     lifted = replace(blind, spec=replace(SPEC, max_reference_peak=False))
-    certificate = so.certify(lifted, {"stand": stand}, rubbing)
+    certificate = so.certify(lifted, {"stand": stand}, rubbing, simulations=False)
     assert not any(row.name == "step_overshoot" for row in certificate.requirements)
     assert any("overshoot" in note for note in certificate.notes)
 
@@ -145,7 +145,7 @@ def test_a_step_that_ends_short_neither_settles_nor_passes(stand, rubbing):
 @pytest.mark.parametrize(("factor", "late"), [(40.0, 0), (1.0, 30)])
 def test_a_run_away_is_told_once_and_allows_nothing_absurd(blind, stand, rubbing, factor, late):
     wild = replace(blind, law=scaled(blind.law, factor), delay_samples=2 + late)
-    certificate = so.certify(wild, {"stand": stand}, rubbing)
+    certificate = so.certify(wild, {"stand": stand}, rubbing, simulations=False)
     (told,) = [row for row in certificate.requirements if row.name == "simulation_failures"]
     assert (told.value, "unstable" in told.where) == (11.0, True)
     sizes = [step.phases[-1].force_N for step in certificate.steps.scenarios["stand"]]
@@ -171,7 +171,7 @@ def test_bandwidth_against_amplitude_is_that_of_an_independent_simulator(blind, 
 
 def test_steps_are_played_once(limited_controller, stand, thor, monkeypatch):
     """On the same devices `with_simulation` takes over what `certify` played; the rows are those played anew."""
-    certificate = so.certify(limited_controller, {"stand": stand}, thor)
+    certificate = so.certify(limited_controller, {"stand": stand}, thor, simulations=False)
     played = []
     monkeypatch.setattr(
         verification, "play", lambda stage, scenario, *rest, **more: played.append(scenario.name) or play(

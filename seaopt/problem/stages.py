@@ -1,0 +1,176 @@
+"""The stages of a problem, one call each: fit, tune and certify with what the file says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from seaopt.control import Controller, tune
+from seaopt.control.laws.delay import settle_delay
+from seaopt.errors import ProblemError
+from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
+from seaopt.parameters import ParameterSet
+from seaopt.problem.problem import Problem
+from seaopt.robustness import Budget, Certificate, JointTuning, Round, certify, tune_certified
+
+
+def fit_problem(
+    problem: Problem,
+    experiments: Sequence[Experiment] | None = None,
+    *,
+    callback: Callable[[int, float], None] | None = None,
+    progress: Callable[[str, str], None] | None = None,
+) -> Fit:
+    """Fit the problem's logs, as `seaopt fit` does.
+
+    Parameters
+    ----------
+    problem : Problem
+        What `read_problem` returned.
+    experiments : sequence of Experiment, optional
+        All of the problem's, where they are read already; read here if left out.
+    callback, progress : callable, optional
+        As in `seaopt.fit`.
+
+    Raises
+    ------
+    ProblemError
+        There is nothing to fit.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> fit_problem(so.read_problem(so.demo_path())).met
+    True
+
+    """
+    if not problem.table.experiment:
+        raise ProblemError(f"{problem.source}: has no [[experiment]] to fit; add one")
+    fitted = problem.choose_fitted(problem.experiments() if experiments is None else experiments)
+    if not fitted:
+        raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them')
+    return fit(
+        fitted, problem.parameters, callback=callback, progress=progress, alternatives=tuple(problem.plants.values()),
+        **problem.fit_options,
+    )  # fmt: skip
+
+
+def score_problem(problem: Problem, result: Fit, experiments: Sequence[Experiment]) -> list[ModelledOutputs]:
+    """Return a fit's predictions of the problem's experiments that are not fitted (`use = "validate"`)."""
+    fitted = {experiment.name for experiment in problem.choose_fitted(experiments)}
+    return [result.predict(experiment) for experiment in experiments if experiment.name not in fitted]
+
+
+def can_design(problem: Problem, result: Fit) -> bool:
+    """Tell whether a controller can be designed with a fit: it ended well, and what it leaves open has a range."""
+    if result.status not in ("converged", "not_identifiable"):
+        return False
+    covariance = result.covariance
+    return all(np.isfinite(covariance.std(name)) or name in problem.ranges for name in covariance.names)
+
+
+def tune_problem(
+    problem: Problem, source: Fit | ParameterSet, progress: Callable[[Round], None] | None = None
+) -> Controller | JointTuning:
+    """Tune the problem's controller, as `seaopt tune` does; with `retune`, until it is certified.
+
+    Parameters
+    ----------
+    problem : Problem
+        What `read_problem` returned.
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+    progress : callable, optional
+        Called after each round, with `retune`.
+
+    """
+    design, robust_to = problem.design_plant, problem.robust_to(problem.values(source))
+    assert problem.spec is not None
+    spec, draws, table = settle_delay(problem.spec, design, source), problem.draws(source), problem.robustness
+    if not table.retune:
+        return tune(design, problem.values(source), spec, robust_to, draws=draws)
+    return tune_certified(
+        design, source, spec, problem.certified_plants(), ranges=problem.ranges, robust_to=robust_to, draws=draws,
+        others=problem.parameters, samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
+    )  # fmt: skip
+
+
+def certify_problem(
+    problem: Problem,
+    controller: Controller,
+    source: Fit | ParameterSet,
+    progress: Callable[[int, int], None] | None = None,
+) -> Certificate:
+    """Certify a controller on the problem's plants, simulations included, as `seaopt certify` does.
+
+    Parameters
+    ----------
+    problem : Problem
+        What `read_problem` returned.
+    controller : Controller
+        The law, which knows its design plant.
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+    progress : callable, optional
+        As in `seaopt.certify`.
+
+    """
+    table = problem.robustness
+    return certify(
+        controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
+        samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
+        max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
+        sensors=problem.sensors, current_step_A=table.step, progress=progress,
+    )  # fmt: skip
+
+
+class Stages:
+    """A problem's results, each made when it is first asked for.
+
+    Parameters
+    ----------
+    problem : Problem
+        What `read_problem` returned.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> stages = Stages(so.read_problem(so.demo_path()))
+    >>> stages.problem.title
+    'THOR linear SEA'
+
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    @cached_property
+    def _experiments(self) -> tuple[Experiment, ...]:
+        return self.problem.experiments()
+
+    @cached_property
+    def fit(self) -> Fit | None:
+        """The fit; None of a problem without experiments."""
+        return fit_problem(self.problem, self._experiments) if self.problem.table.experiment else None
+
+    @cached_property
+    def scores(self) -> list[ModelledOutputs]:
+        """The predictions of what was not fitted."""
+        return [] if self.fit is None else score_problem(self.problem, self.fit, self._experiments)
+
+    @cached_property
+    def controller(self) -> Controller | None:
+        """The controller; None where the problem asks for none, or the fit allows none."""
+        if self.problem.spec is None or (self.fit is not None and not can_design(self.problem, self.fit)):
+            return None
+        tuned = tune_problem(self.problem, self.fit or self.problem.parameters)
+        return tuned.controller if isinstance(tuned, JointTuning) else tuned
+
+    @cached_property
+    def certificate(self) -> Certificate | None:
+        """The certificate of the controller; None where there is none."""
+        if self.controller is None:
+            return None
+        return certify_problem(self.problem, self.controller, self.fit or self.problem.parameters)
