@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from seaopt.bench import virtual_log as virtual_log
     from seaopt.control import Controller as Controller
     from seaopt.control import ControllerSpec as ControllerSpec
+    from seaopt.control import corners as corners
     from seaopt.control import export as export
     from seaopt.control import tune as tune
     from seaopt.errors import SeaoptError as SeaoptError
@@ -26,8 +27,12 @@ if TYPE_CHECKING:
     from seaopt.estimation import OutputError as OutputError
     from seaopt.estimation import PredictionError as PredictionError
     from seaopt.estimation import SoftL1 as SoftL1
+    from seaopt.estimation import bootstrap as bootstrap
     from seaopt.estimation import compare as compare
+    from seaopt.estimation import design_experiment as design_experiment
+    from seaopt.estimation import diagnose as diagnose
     from seaopt.estimation import fit as fit
+    from seaopt.estimation import profile as profile
     from seaopt.frequency import h1 as h1
     from seaopt.logs import Column as Column
     from seaopt.logs import Log as Log
@@ -69,9 +74,14 @@ _HOME = {
     "PredictionError": "seaopt.estimation",
     "Fit": "seaopt.estimation",
     "fit": "seaopt.estimation",
+    "diagnose": "seaopt.estimation",
     "compare": "seaopt.estimation",
+    "profile": "seaopt.estimation",
+    "bootstrap": "seaopt.estimation",
+    "design_experiment": "seaopt.estimation",
     "ControllerSpec": "seaopt.control",
     "Controller": "seaopt.control",
+    "corners": "seaopt.control",
     "tune": "seaopt.control",
     "export": "seaopt.control",
     "Certificate": "seaopt.robustness",
@@ -86,8 +96,9 @@ _HOME = {
 __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "contents", "read_log", "write_log",
     "simulate", "Sensors", "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
-    "PredictionError", "Fit", "fit", "compare", "ControllerSpec", "Controller", "tune", "export", "Certificate",
-    "certify", "verify", "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
+    "PredictionError", "Fit", "fit", "diagnose", "compare", "profile", "bootstrap", "design_experiment",
+    "ControllerSpec", "Controller", "corners", "tune", "export", "Certificate", "certify", "verify", "demo_path",
+    "read_problem", "write_report", "testing", "SeaoptError",
 ]  # fmt: skip
 
 

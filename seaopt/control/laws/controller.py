@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,6 +45,9 @@ from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
 from seaopt.records import record
 from seaopt.units import divide_units, unit_after
+
+if TYPE_CHECKING:
+    import control
 
 FRICTION_MARGIN = "friction_margin"  # among what controller.json says is achieved
 CONTROLLER_SCHEMA = "seaopt/controller/2"
@@ -246,6 +249,10 @@ class Controller:
         """
         sliding = self.plant(take_sliding(plant, params), params)
         return Loop(plant=sliding, law=self.law)
+
+    def to_control(self) -> control.StateSpace:
+        """Return the law as python-control's `StateSpace`, from reference and measured to effort, in discrete time."""
+        return self.law.to_control()
 
     def force_limit(self, frequency_hz: float) -> float | None:
         """Return the largest amplitude of F_ref (N) at a frequency that `command_limit` allows on the design plant.

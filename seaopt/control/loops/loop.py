@@ -8,6 +8,8 @@ crossings come from the eigenvalues of level sets (`response`, `peaks`), so that
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -18,6 +20,9 @@ from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.formatting import format_number
 from seaopt.records import record
+
+if TYPE_CHECKING:
+    import control
 
 GRID_LOWEST_HZ = 1e-3
 DROOP_BAND = 1.0 / 3.0  # of the bandwidth
@@ -138,6 +143,19 @@ class Loop:
     def system(self) -> ClosedLoop:
         """Return plant, hold, delay and controller as one system."""
         return close(self.plant.delayed(), self.law)
+
+    def to_control(self) -> control.StateSpace:
+        """Return the closed loop as python-control's `StateSpace`: from noise and reference to measured and effort.
+
+        What is measured includes the noise; the delay between the two is inside.
+        """
+        import control  # deferred: slow to import
+
+        system = self.system()
+        return control.StateSpace(
+            system.a, system.b, system.c, system.d, self.plant.sample_time_s,
+            inputs=["noise", "reference"], outputs=["measured", "effort"], name="loop",
+        )  # fmt: skip
 
     def eigenvalues(self) -> Complex[np.ndarray, " n"]:
         """Return the closed loop's eigenvalues."""
