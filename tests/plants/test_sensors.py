@@ -86,14 +86,14 @@ def test_it_is_fed_back_as_what_it_is():
     controller = so.tune(plant, params, so.ControllerSpec(measured="tau_d", **SPEC))
     assert controller.feasible
     per_effort = controller.command.per_effort
-    held = control.sample_system(plant.linearize(params)["tau_d", "I"], 1e-3) * per_effort
+    model = plant.linearize(params)
+    held = control.sample_system(model[model.find_output("tau_d"), model.find_input("I")], 1e-3) * per_effort
     f = np.array([1.0, 10.0, 60.0])
     z = np.exp(2j * np.pi * f * 1e-3)
     np.testing.assert_allclose(
         controller.plant(plant, params).response(f), held(z) * z**-controller.delay_samples, rtol=1e-8
     )
 
-    model = plant.linearize(params)
     a, b, _, _, _ = cont2discrete((model.A, model.B[:, :1], model.C, model.D), 1e-3)
     law, step, x = runnable(controller), 2 * np.pi / 1024, np.zeros(2)
     inside, waiting, path = np.zeros(law.c.size), [0.0] * controller.delay_samples, []
