@@ -49,6 +49,7 @@ from seaopt.units import name_command, unit_after
 __all__ = ["DELAY", "ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop"]
 
 MAX_LOOP_SUBSTEPS = 512
+ALIKE = 0.5  # of its largest value, by which a state of a run that is lost may differ between two numbers of steps
 FASTEST_GUESSED = 1e6  # of a mode, radians a sample: beyond, the guess is the largest, and a power may overflow
 RTOL, STICKING_RTOL = 1e-6, 1e-4
 RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
@@ -202,10 +203,13 @@ def run_loop(
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
         error = float(np.max(_errors(arrays, motion)[kept], initial=0.0)) / (1.0 if loop.sticks else 15.0)
-        decided = bool(np.all(kept)) or (before is not None and bool(np.all(kept | _lose_alike(before, arrays))))
+        shortest = 2 * substeps > MAX_LOOP_SUBSTEPS
+        decided = bool(np.all(kept)) or (
+            before is not None and bool(np.all(kept | _lose_alike(before, arrays, shortest=shortest)))
+        )
         if error <= rtol and decided:
             return _result(loop, job, arrays, error, substeps, wall_s)
-        if 2 * substeps > MAX_LOOP_SUBSTEPS:
+        if shortest:
             if decided:
                 raise StepSizeError(
                     f"plant {loop.plant.name}: {2 * substeps} steps per sample leave an error of {error:.1e} of a "
@@ -238,13 +242,20 @@ def _first_lost_sample(arrays: LoopArrays) -> Int[np.ndarray, " runs"]:
     return np.where(np.all(finite, axis=1), finite.shape[1], np.argmin(finite, axis=1))
 
 
-def _lose_alike(before: LoopArrays, after: LoopArrays) -> Bool[np.ndarray, " runs"]:
-    """Tell which runs two numbers of steps lose in the same way: about the same sample, states as large before it."""
+def _lose_alike(before: LoopArrays, after: LoopArrays, *, shortest: bool) -> Bool[np.ndarray, " runs"]:
+    """Tell which runs two numbers of steps lose in the same way: about the same sample, and alike until there.
+
+    Steps that are too long for what is fast lose a loop at once, too, with about the same largest state; but not with
+    the same values of what is fast. Where a run is lost before a sample tells, steps as short as can be have to tell.
+    """
     lost = np.stack([_first_lost_sample(before), _first_lost_sample(after)])
-    last, rows = np.maximum(np.min(lost, axis=0) - 1, 0), np.arange(lost.shape[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        size = np.log([np.max(np.abs(arrays.states[rows, last]), axis=1) for arrays in (before, after)])
-        return (np.abs(lost[1] - lost[0]) <= 1) & (np.abs(size[1] - size[0]) <= 1.0)
+    alike = (np.abs(lost[1] - lost[0]) <= 1) & ((np.min(lost, axis=0) > 1) | shortest)
+    for run in np.flatnonzero(alike):
+        one, other = (arrays.states[run, : max(int(np.min(lost[:, run])), 1)] for arrays in (before, after))
+        size = np.max(np.maximum(np.abs(one), np.abs(other)), axis=0)
+        scale = np.maximum(size, RESTS * np.max(size))
+        alike[run] = bool(np.all(np.max(np.abs(other - one), axis=0) <= ALIKE * scale))
+    return alike
 
 
 def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, substeps: int, wall_s: float) -> LoopRun:

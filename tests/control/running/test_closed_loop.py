@@ -222,6 +222,35 @@ def test_stiff_friction_takes_smaller_steps_or_is_refused(stand, thor):
         run_loop(loop, [thor.update(f_c=500.0, v_s=1e-9)], np.full(100, 80.0))
 
 
+@pytest.mark.parametrize("speed", [400.0, 2000.0])
+def test_bristles_that_slip_fast_are_no_loop_that_runs_away(speed):
+    """They settle at a rate of sigma_0 |v|/f_c, here 20 and 100 in a sample: too long steps lose them at once."""
+    plant = so.plants.rotary(link="locked", parts=["lugre"])
+    params = plant.defaults.update(
+        N=50.0, K_tau=0.03, J_m=2e-5, b_r=6e-5, f_c=0.006, k_s=250.0, c_s=0.3, sigma_0=0.3, sigma_1=1e-4, eta=1.0
+    )
+    loop = SampledLoop(plant=plant, law=realise(LAW, per_effort=1 / 1.5, current_limit_A=9.0), measured="tau_s",
+                       delay_samples=1)  # fmt: skip
+    x = np.array([-60.0, speed, -0.02])
+    start = LoopState(x=x[None], z=np.zeros((1, loop.law.c.size + 1)))
+    run = run_loop(loop, [params], np.zeros(40), start=start)
+
+    def rate(t, x, current):
+        theta, v, z = x
+        slip = v - 0.3 * abs(v) * z / 0.006
+        spring = (250.0 * theta + 0.3 * v) / 50.0
+        push = 0.03 * current - 6e-5 * v - (0.3 * z + 1e-4 * slip) - spring / 50.0
+        return [v, push / 2e-5, slip]
+
+    paths = [x]
+    for current in run.current[0]:
+        paths.append(
+            solve_ivp(rate, (0, TS), paths[-1], args=(current,), method="LSODA", rtol=1e-10, atol=1e-13).y[:, -1]
+        )
+    scale = np.max(np.abs(paths), axis=0)
+    assert np.max(np.abs(run.states[0] - paths[:-1]) / scale) < 1e-4
+
+
 @pytest.mark.parametrize("damping", [0.1, 0.5])
 def test_a_stiff_draw_beside_a_soft_one_does_not_run_away(stand, thor, damping):
     """Steps that do for the first plant leave the numbers on the second: b/J = 3e4 and 1.5e5 per second."""
