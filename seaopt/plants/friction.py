@@ -26,7 +26,14 @@ from jaxtyping import Float
 from seaopt.errors import PlantError
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_space
+from seaopt.plants.plant import (
+    CompletedParameters,
+    Plant,
+    jacobians,
+    name_parameters,
+    name_symbols,
+    state_space,
+)
 from seaopt.plants.roles import Friction, PlantMaker
 from seaopt.records import record
 
@@ -306,17 +313,6 @@ def list_fall_parameters(plant: Plant, friction: Friction) -> tuple[str, ...]:
     """
     flattest, _ = bound_slopes(friction, name_parameters(plant, plant.p))
     return _list_parameters(plant, ca.SX(flattest))
-
-
-def name_parameters(plant: Plant, p: Any) -> SimpleNamespace:
-    """Return a vector of a plant's parameters as the namespace that its roles take."""
-    return SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(p), strict=True)))
-
-
-def name_symbols(plant: Plant, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, ...]:
-    """Return vectors of states, inputs and parameters as the namespaces that a plant's roles take."""
-    vectors = ((plant.states, x), (plant.inputs, u), (plant.parameters, p))
-    return tuple(SimpleNamespace(**dict(zip(names, ca.vertsplit(v), strict=True))) for names, v in vectors)
 
 
 def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:

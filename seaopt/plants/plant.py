@@ -204,7 +204,7 @@ class Plant:
         """Return the derived figures as {name: (expression of p, unit)}; empty where none are declared."""
         if self.derived is None:
             return {}
-        return dict(self.derived(SimpleNamespace(**dict(zip(self.parameters, ca.vertsplit(self.p), strict=True)))))
+        return dict(self.derived(name_parameters(self, self.p)))
 
     def stored_energy(self) -> Any:
         """Return the energy (J) as an expression of x and p.
@@ -217,11 +217,8 @@ class Plant:
         """
         if self.energy is None:
             raise PlantError(f"plant {self.name} declares no energy; give energy=lambda x, p: ... when it is made")
-        spaces = [
-            SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
-            for names, symbols in ((self.states, self.x), (self.parameters, self.p))
-        ]
-        return ca.SX(self.energy(*spaces))
+        x, _, p = name_symbols(self, self.x, self.u, self.p)
+        return ca.SX(self.energy(x, p))
 
     def linearize(
         self,
@@ -390,14 +387,22 @@ def jacobians(plant: Plant) -> Any:
     return ca.Function("jacobians", [plant.x, plant.u, plant.p], blocks)
 
 
+def name_parameters(plant: Plant, p: Any) -> SimpleNamespace:
+    """Return a vector of a plant's parameters as the namespace that its roles take."""
+    return SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(p), strict=True)))
+
+
+def name_symbols(plant: Plant, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, ...]:
+    """Return vectors of states, inputs and parameters as the namespaces that a plant's roles take."""
+    vectors = ((plant.states, x), (plant.inputs, u), (plant.parameters, p))
+    return tuple(SimpleNamespace(**dict(zip(names, ca.vertsplit(v), strict=True))) for names, v in vectors)
+
+
 @memo
 def _deflection_slope(plant: Plant) -> Any:
     """Return the CasADi function (x, p) -> derivative of the spring's deflection by the states."""
     assert plant.spring is not None
-    x, p = (
-        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
-        for names, symbols in ((plant.states, plant.x), (plant.parameters, plant.p))
-    )
+    x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
     slope = ca.jacobian(ca.SX(plant.spring.deflection(x, p)), plant.x)
     return ca.Function("deflection", [plant.x, plant.p], [ca.densify(slope)])
 

@@ -21,8 +21,9 @@ from typing import Any
 import casadi as ca
 
 from seaopt.plants import Plant
-from seaopt.plants.friction import name_symbols, separate_friction
+from seaopt.plants.friction import separate_friction
 from seaopt.plants.memo import memo
+from seaopt.plants.plant import name_symbols
 from seaopt.simulation.runge_kutta import runge_kutta_step
 
 LATEST_STOP = 0.999  # of a step: in what is left of it a force must have an effect that can be divided by

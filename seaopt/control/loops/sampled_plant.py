@@ -23,7 +23,7 @@ from jaxtyping import Complex, Float, Inexact
 
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import CompletedParameters, Plant, jacobians
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import SLIDING, friction_states, remembers, rest_jacobians
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
@@ -232,7 +232,7 @@ def linearise(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
         )
     row = list(plant.outputs).index(measured)
-    a, b, c, d = _evaluate_at_rest(plant, *_solve_rest(_let_slide(plant), p, at), p)
+    a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(_let_slide(plant), p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
 
 
@@ -306,7 +306,7 @@ def differentiate_linearisation(
     sliding = _let_slide(plant)
     row, names = list(plant.outputs).index(measured), list(plant.states)
     x, u = _solve_rest(sliding, p, at)
-    a, b, c, d = _evaluate_at_rest(plant, x, u, p)
+    a, b, c, d = _evaluate_jacobians(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)
     fixed = [names.index(name) for name in at if name in names]
     if fixed:  # f(x, u, p) = 0 along the direction: linear in the loose states and the first input
@@ -328,15 +328,8 @@ def differentiate_linearisation(
 def _evaluate_jacobians(
     plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
 ) -> tuple[Float[np.ndarray, "k _ _"], ...]:
-    """Return A, B, C and D of k plants."""
-    return _stack_blocks(plant, _map_columns(plant, jacobians, x, u, p))
-
-
-def _evaluate_at_rest(
-    plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
-) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return A, B, C and D of k plants at rest, where bristles stick."""
-    return _stack_blocks(plant, _map_columns(plant, rest_jacobians if remembers(plant) else jacobians, x, u, p))
+    return _stack_blocks(plant, _map_columns(plant, rest_jacobians, x, u, p))
 
 
 def _stack_blocks(plant: Plant, columns: Sequence[Float[np.ndarray, "_ _"]]) -> tuple[Float[np.ndarray, "k _ _"], ...]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from itertools import combinations, zip_longest
-from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -30,6 +29,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import list_smoothing
 from seaopt.plants.parts import wrapped
+from seaopt.plants.plant import name_symbols
 from seaopt.records import record
 from seaopt.units import ROTARY, mechanics_of, unit_after
 
@@ -348,10 +348,7 @@ def _read_deflections(experiments: tuple[Experiment, ...], params: ParameterSet)
 def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
     """Tell whether an output is the spring's stiffness times its deflection at rest, and more in motion."""
     assert plant.spring is not None
-    x, p = (
-        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
-        for names, symbols in ((plant.states, plant.x), (plant.parameters, plant.p))
-    )
+    x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
     row = plant.output[list(plant.outputs).index(output)] - getattr(p, stiffness) * plant.spring.deflection(x, p)
     more = ca.Function("more", [plant.t, plant.x, plant.u, plant.p], [row])
     still = np.array([0.0 if unit.endswith("/s") else 1.0 for unit in plant.states.values()])

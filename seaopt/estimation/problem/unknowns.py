@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -15,7 +14,7 @@ from seaopt.errors import EstimationError, SeaoptError, suggestion
 from seaopt.estimation.problem.band import design_filter, sees_level
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants.plant import fill_vector
+from seaopt.plants.plant import fill_vector, name_symbols
 from seaopt.records import record
 from seaopt.simulation import Clock, Model, depends_on_time, linearise, make_model, transition
 from seaopt.simulation.simulate import input_samples
@@ -276,11 +275,8 @@ def _scale_stopped_speeds(builder: _Builder, experiment: Experiment, model: Mode
     plant = experiment.plant
     if not model.sticks:
         return {}
-    space = [
-        SimpleNamespace(**dict(zip(names, ca.vertsplit(symbols), strict=True)))
-        for names, symbols in ((plant.states, plant.x), (plant.parameters, plant.p))
-    ]
-    velocities = ca.vertcat(*(one.velocity(*space) for one in plant.friction.values() if one.jump is not None))
+    x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
+    velocities = ca.vertcat(*(one.velocity(x, p) for one in plant.friction.values() if one.jump is not None))
     values = {entry.name: entry.value for entry in builder.entries}
     own = experiment.list_own()
     theta = np.array([values[own[name].name if name in own else name] for name in model.free])

@@ -19,14 +19,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
-from seaopt.plants.plant import CompletedParameters, Plant
+from seaopt.plants.plant import CompletedParameters, Plant, name_parameters
 from seaopt.plants.roles import PlantMaker, Sensing
 from seaopt.units import ROTARY
 
@@ -83,7 +82,7 @@ def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:
     sensing, port = plant.sensing, plant.port
     if sensing is None or output not in sensing.from_encoders:
         return {}
-    p = SimpleNamespace(**dict(zip(plant.parameters, ca.vertsplit(plant.p), strict=True)))
+    p = name_parameters(plant, plant.p)
     if output in sensing.weights:
         return dict(sensing.weights[output](p))
     position = sensing.motor_position
