@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -270,3 +271,25 @@ def test_the_rigid_joint_of_the_docs_swings_less_than_half_as_far(elastic_joint)
     true, rigid = joint.find_peak(goal, angles[1]), joint.find_peak(goal, joint.predict(fit, log).model["theta_l"])
     assert rigid[0] < 0.5 * true[0]
     assert max(joint.predict(fit, steps).fit_percent.values()) < 50
+
+
+@pytest.mark.slow
+def test_gains_from_a_log(tmp_path):
+    """The exported coefficients, around the true plant on NumPy's own grid: as far from -1, and as loud, as said."""
+    gain_design = script("gain_design")
+    log = gain_design.record().between(0, 20)
+    fit, controller, certificate = gain_design.design(log, tmp_path)
+    assert fit.met and controller.feasible and certificate.passed
+    header = (tmp_path / "knee_gains.h").read_text(encoding="utf-8")
+    value = {name: float(text) for name, text in re.findall(r"#define KNEE_GAIN_(K_P|K_I|K_D|T_F) ([-+.\de]+)", header)}
+    s = 2j * np.pi * np.geomspace(0.01, 499, 20_000)
+    thor, period = gain_design.GUESS.update(J=3.31e-6, b_r=1.31e-4, eta=0.95), 1e-3
+    r = thor["l"].value / (2 * np.pi * thor["N_p"].value)
+    mass, damping, k = thor["J"].value / r**2 + thor["m_l"].value, thor["b_r"].value / r**2, thor["k"].value
+    q = np.exp(-s * period)
+    law = value["K_P"] + value["K_I"] * period / 2 * (1 + q) / (1 - q)
+    law += value["K_D"] * (1 - q) / (value["T_F"] + period - value["T_F"] * q)
+    late = q * (1 - q) / (s * period)  # one sample, and the hold
+    sensitivity = 1 / (1 + law * late * k / (mass * s**2 + damping * s + k))
+    assert np.abs(sensitivity).max() == pytest.approx(controller.achieved.ms, rel=0.01)
+    assert np.abs(law * sensitivity).max() == pytest.approx(controller.achieved.noise_gain, rel=0.01)
