@@ -7,9 +7,11 @@ import seaopt
 project = "seaopt"
 author = "The seaopt developers"
 version = release = seaopt.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode", "numpydoc"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+suppress_warnings = ["toc.empty_glob"]
 nitpicky = True
+default_role = "code"
 
 # Pages are MyST; the notebooks (a link to those of the repository) are executed here, and their outputs shown.
 myst_heading_anchors = 4

@@ -49,7 +49,7 @@ class FrequencyResponse:
 
     @property
     def relative_std(self) -> Float[np.ndarray, " m"]:
-        """Standard deviation of |H1| over |H1|; overlapping neighbours count as 0.947 averages (Welch 1967, Hann)."""
+        """Relative standard deviation of abs(H1); overlapping neighbours count as 0.947 averages (Welch 1967, Hann)."""
         effective = max(1.0, 0.947 * self.averages)
         gamma = np.clip(self.coherence, 1e-6, 1.0)
         return np.sqrt((1.0 - gamma) / (2.0 * gamma * effective))

@@ -196,6 +196,6 @@ class Pass:
 
 
 def layout_of(nx: int, ny: int, np_: int, point: Point) -> Layout:
-    """Return the columns of passes at a point of a model with np_ free parameters."""
+    """Return the columns of passes at a point of a model with `np_` free parameters."""
     shared = np_ + point.clock.delay_free if point.correction is None else point.correction.shape[0] - 1
     return Layout(shared=shared, nx=nx, ny=ny, drift_terms=point.drift_terms, corrected=point.correction is not None)

@@ -257,8 +257,8 @@ class Controller:
     def force_limit(self, frequency_hz: float) -> float | None:
         """Return the largest amplitude of F_ref (N) at a frequency that `command_limit` allows on the design plant.
 
-        The motor force per reference is |T_r/P|, a property of the plant whatever the controller, and at rest, 0 Hz,
-        1/|P|; None without a limit.
+        The motor force per reference is abs(T_r/P), a property of the plant whatever the controller; at rest, 0 Hz,
+        it is 1/abs(P). None without a limit.
         """
         if self.command_limit is None or self.design is None:
             return None

@@ -50,7 +50,7 @@ class OutputFit:
     Parameters
     ----------
     fit_percent : float
-        100 (1 - |y - yhat| / |y - mean(y)|) over the samples used.
+        ``100 (1 - norm(y - yhat) / norm(y - mean(y)))`` over the samples used.
     holdout_fit_percent : float or None
         The same over the samples kept back; None if there are none.
     band_fit_percent : float or None
@@ -143,7 +143,7 @@ class ModelledOutputs:
 
     @property
     def fit_percent(self) -> dict[str, float]:
-        """100 (1 - |y - yhat| / |y - mean(y)|) of each output, over the samples that are there."""
+        """``100 (1 - norm(y - yhat) / norm(y - mean(y)))`` of each output, over the samples that are there."""
         return {name: self._score(name) for name in self.model}
 
     @property
