@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 
 DIMENSIONLESS = frozenset({"", "-", "1"})
 CELSIUS = frozenset({"degC", "°C", "celsius"})
-_SYNONYMS = {"usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC"}
+# What pint would read otherwise (Nm as a textile's length per mass, Grad as a gigaradian), or not at all.
+_SYNONYMS = {
+    "usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC",
+    "Nm": "(N*m)", "mNm": "(mN*m)", "kNm": "(kN*m)", "Nmm": "(N*mm)", "Ncm": "(N*cm)",
+    "Grad": "deg", "dps": "(deg/s)", "rev": "turn", "Amp": "A", "Amps": "A", "amps": "A", "Volt": "V", "Volts": "V",
+}  # fmt: skip
 _HEADER = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 # Python would work for years on 9^9^9^9.
 _POWER = re.compile(r"(?:\^|\*\*)[\s(+-]*(\d*)")

@@ -168,6 +168,23 @@ def inspect(
 
 
 @app.command()
+def new(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Raw logs, of any format.", show_default=False)],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="The problem file; beside the log, if left out."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Ask nothing; take the best guesses and mark them.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a problem file for logs: look at their columns, and ask what they do not say."""
+    from seaopt.cli.new import write_problem
+
+    write_problem(logs, output, yes=yes, force=force, json=json)
+
+
+@app.command()
 def tune(
     problem: ProblemFile,
     output: Folder = Path("out"),

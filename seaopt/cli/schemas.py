@@ -8,12 +8,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from seaopt.errors import SeaoptError, suggestion
+from seaopt.problem.schema import json_schema as problem_schema
 
-DOCUMENTS = {
-    "problem": ("seaopt.problem.schema", "ProblemTable"),
-    "controller": ("seaopt.control.laws.stored", "StoredController"),
-    "fit": ("seaopt.estimation.result.stored", "StoredFit"),
-    "robustness": ("seaopt.robustness.certificate.stored", "StoredCertificate"),
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+DOCUMENTS = {  # the module and model of each, its title, and the version that it stands for
+    "problem": ("seaopt.problem.schema", "ProblemTable", "seaopt problem file", 1),
+    "fit": ("seaopt.estimation.result.stored", "StoredFit", "seaopt fit.json", 2),
+    "controller": ("seaopt.control.laws.stored", "StoredController", "seaopt controller.json", 2),
+    "robustness": ("seaopt.robustness.certificate.stored", "StoredCertificate", "seaopt robustness.json", 2),
 }
 
 
@@ -27,7 +29,11 @@ def json_schema(document: str) -> dict[str, Any]:
 
     """
     if document not in DOCUMENTS:
-        raise SeaoptError(f'schema "{document}" is not known; {suggestion(document, DOCUMENTS)}')
-    module, name = DOCUMENTS[document]
-    model: type[BaseModel] = getattr(import_module(module), name)
-    return model.model_json_schema(by_alias=True)
+        raise SeaoptError(
+            f'schema "{document}" is not known; {suggestion(document, DOCUMENTS)} (type seaopt schema problem)'
+        )
+    module, name, title, version = DOCUMENTS[document]
+    loaded = import_module(module)
+    model: type[BaseModel] = getattr(loaded, name)
+    schema = problem_schema() if document == "problem" else model.model_json_schema(by_alias=True)
+    return {"$schema": DIALECT, "$id": f"urn:seaopt:{document}:{version}", **schema, "title": title}

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
 
 from seaopt.formatting import printable
+
+NARROW = 16  # characters of a cell that is never broken
 
 
 class Terminal(Console):
@@ -17,6 +23,27 @@ class Terminal(Console):
     def print(self, *objects: Any, **options: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Print as Rich does."""
         super().print(*(printable(one) if isinstance(one, str) else one for one in objects), **options)
+
+    def say(self, text: str, **options: Any) -> None:
+        """Print a text as it is: no markup, no colours of Rich's own, lines broken at blanks."""
+        self.print(text, highlight=False, markup=False, **options)
+
+    def tabulate(
+        self, rows: Iterable[Sequence[str]], head: Sequence[str] = (), align: str = "", *, indent: int = 2
+    ) -> None:
+        """Print rows in aligned columns: "<" or ">" for each; what is too wide is broken in its cell."""
+        table = Table(box=None, show_header=bool(head), pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+        cells = [[printable(cell) for cell in row] for row in rows]
+        for at in range(max(map(len, [head, *cells]))):
+            right = align[at : at + 1] == ">"
+            # Figures stay whole; words are broken.
+            whole = right or max((len(row[at]) for row in cells), default=0) <= NARROW
+            table.add_column(
+                Text(head[at]) if head else "", justify="right" if right else "left", no_wrap=whole, overflow="fold"
+            )
+        for row in cells:
+            table.add_row(*map(Text, row))
+        self.print(Padding(table, (0, 0, 0, indent)))
 
 
 def prepare_streams() -> None:

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, String
 
 from seaopt.control.laws.limits import BY_NAME
 from seaopt.documents import Flag, Number, Whole
+from seaopt.problem.key_descriptions import KEYS
 
 
 class _Strict(BaseModel):
@@ -451,5 +452,9 @@ class ProblemTable(_Strict):
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the problem file's JSON Schema, for editors."""
-    return ProblemTable.model_json_schema(by_alias=True)
+    """Return the problem file's JSON Schema, for editors, with what each key means."""
+    schema = ProblemTable.model_json_schema(by_alias=True)
+    for name, table in (("ProblemTable", schema), *schema["$defs"].items()):
+        for key, text in KEYS.get(name, {}).items():
+            table["properties"][key].setdefault("description", text)
+    return schema

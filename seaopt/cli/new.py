@@ -1,0 +1,114 @@
+"""What `seaopt new` does: show what is in some logs, ask what they do not say, write a problem file."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from seaopt.cli.terminal import Terminal
+from seaopt.errors import ProblemError
+from seaopt.files import to_json, write_text
+from seaopt.problem import read_problem
+from seaopt.problem.proposal import Proposal, Question, propose
+
+COLUMN_HEAD = ("column", "is", "unit", "")
+
+
+def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force: bool, json: bool) -> Path:
+    """Write a problem file for logs and return its path; without `yes` what they leave open is asked.
+
+    Raises
+    ------
+    SeaoptError
+        A log cannot be read, a file is there already, or an answer is missing.
+
+    """
+    target = output or (logs[0].with_suffix(".toml") if len(logs) == 1 else logs[0].parent / "problem.toml")
+    if target.exists() and not force:
+        others = " ".join(shlex.quote(str(log)) for log in logs)
+        raise ProblemError(f"{target}: is there already; to replace it type seaopt new {others} -o {target} --force")
+    folder, answers = target.parent, dict[str, str]()
+    proposal = propose(logs, answers, folder, target.stem)
+    console = Terminal(stderr=json)
+    if not yes and not json:
+        proposal = _interview(console, logs, answers, folder, proposal, target.stem)
+    write_text(target, proposal.text)
+    read_problem(target)  # what was written is what the other commands take
+    if json:
+        rows = [asdict(column) for column in proposal.columns]
+        sys.stdout.write(to_json({
+            "schema": "seaopt/new/1", "file": str(target), "columns": rows,
+            "guesses": {one.key: one.guess for one in proposal.guesses},
+        }))  # fmt: skip
+        return target
+    if yes:
+        _print_columns(console, proposal)
+    _print_end(console, proposal, target)
+    return target
+
+
+def _interview(
+    console: Terminal, logs: Sequence[Path], answers: dict[str, str], folder: Path, proposal: Proposal, title: str
+) -> Proposal:
+    """Ask question by question; an empty answer takes the guess, which stays marked as one unless it was a choice."""
+    asked: set[str] = set()
+    while question := next((one for one in proposal.questions if one.key not in asked), None):
+        asked.add(question.key)
+        if question.key == "roles":
+            _print_columns(console, proposal)
+        answer = _ask(console, question)
+        if answer or question.choices:
+            answers[question.key] = answer or question.guess
+            proposal = propose(logs, answers, folder, title)
+    return proposal
+
+
+def _ask(console: Terminal, question: Question) -> str:
+    """Return an answer that counts, "" for the guess.
+
+    Raises
+    ------
+    ProblemError
+        Nobody answers.
+
+    """
+    choices = f" ({', '.join(question.choices)})" if question.choices else ""
+    console.say(f"{question.text}{choices}", style="bold")
+    console.say(f"  Enter: {question.guess}" + (f", {question.why}" if question.why else ""), style="dim")
+    while True:
+        console.say("  > ", end="")
+        line = sys.stdin.readline()
+        if not line:
+            raise ProblemError(f'nobody answers "{question.text}"; add --yes to take the best guess of each')
+        if not line.strip():
+            return ""
+        try:
+            return question.read(line)
+        except ProblemError as error:
+            console.say(f"  {error}", style="red")
+
+
+def _print_columns(console: Terminal, proposal: Proposal) -> None:
+    """Print what was made of each column."""
+    for log in dict.fromkeys(column.log for column in proposal.columns):
+        rows = [
+            (one.column, one.role or "–", one.unit, one.description + (" (guessed)" if one.doubt else ""))
+            for one in proposal.columns
+            if one.log == log
+        ]
+        console.say(f"{log}:")
+        console.tabulate(rows, COLUMN_HEAD)
+
+
+def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
+    """Print what was written, what of it is a guess, and the command to type next."""
+    guessed = [one for one in proposal.guesses if one.key != "roles"]
+    console.say(f"wrote {target}", soft_wrap=True)
+    if guessed:
+        console.say(f"{len(guessed)} of its values are guesses, marked in it:")
+        console.tabulate([(one.label, one.guess, one.why) for one in guessed])
+    out = shlex.quote(str(target.with_suffix("")))
+    console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)

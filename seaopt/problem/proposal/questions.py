@@ -1,0 +1,105 @@
+"""Questions that logs leave open, and the answers to them: those that were given, and the guesses for the others."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from seaopt.errors import ProblemError, suggestion
+from seaopt.formatting import printable
+from seaopt.records import record
+
+UNKNOWN = "unknown"
+
+
+@record
+class Question:
+    """What the logs do not say.
+
+    Parameters
+    ----------
+    key : str
+        For the answers.
+    text : str
+        In words, with the unit.
+    guess : str
+        What is taken where nobody answers.
+    why : str
+        Where the guess is from.
+    choices : tuple of str
+        The answers that count; empty for a number.
+    open : bool
+        Whether "unknown" is an answer.
+
+    """
+
+    key: str
+    text: str
+    guess: str
+    why: str
+    choices: tuple[str, ...] = ()
+    open: bool = False
+
+    @property
+    def label(self) -> str:
+        """The question in few words, for lists."""
+        return re.split(r" \(|, |\?$", self.text)[0 if not self.text.startswith("In ") else 1]
+
+    def read(self, answer: str) -> str:
+        """Return an answer as it counts.
+
+        Raises
+        ------
+        ProblemError
+            It is none of the choices, or no positive number.
+
+        """
+        text = answer.strip()
+        if self.choices:
+            found = [one for one in self.choices if one.casefold() == text.casefold()]
+            found = found or [one for one in self.choices if text and one.casefold().startswith(text.casefold())]
+            if len(found) != 1:
+                raise ProblemError(f'"{printable(text)}" is not an answer; {suggestion(text, self.choices)}')
+            return found[0]
+        if self.open and text.casefold() in (UNKNOWN, "?", "no", "n", "-"):
+            return UNKNOWN
+        try:
+            number = float(text.replace(",", "."))
+        except ValueError:
+            number = math.nan
+        if not 0.0 < number < math.inf:
+            or_unknown = f', or "{UNKNOWN}"' if self.open else ""
+            raise ProblemError(f'"{printable(text)}" is not a positive number; give one{or_unknown}')
+        return f"{number:.10g}"
+
+
+class Interview:
+    """Answers that are there, and the questions that came up on the way."""
+
+    def __init__(self, answers: Mapping[str, str]) -> None:
+        self.answers = dict(answers)
+        self.questions: list[Question] = []
+
+    def ask(
+        self, key: str, text: str, guess: str, why: str = "", choices: Sequence[str] = (), *, open: bool = False
+    ) -> str:
+        """Return the answer to a question, or its guess."""
+        question = Question(key=key, text=text, guess=guess, why=why, choices=tuple(choices), open=open)
+        if all(question.key != one.key for one in self.questions):
+            self.questions.append(question)
+        return question.read(self.answers[key]) if key in self.answers else guess
+
+    def number(self, key: str, text: str, guess: float, why: str = "") -> float:
+        """Return a number that is always known, or guessed."""
+        return float(self.ask(key, text, f"{guess:.10g}", why))
+
+    def optional(self, key: str, text: str, why: str = "") -> float | None:
+        """Return a number, None where nobody knows it."""
+        answer = self.ask(key, text, UNKNOWN, why, open=True)
+        return None if answer == UNKNOWN else float(answer)
+
+    def mark(self, *keys: str) -> str:
+        """Return what of these answers is a guess, as the end of a comment."""
+        reasons = [one.why or one.text for one in self.questions if one.key in keys and one.key not in self.answers]
+        return f"guessed: {'; '.join(reasons)}" if reasons else ""

@@ -1,0 +1,205 @@
+"""Which column of a log is which signal of an actuator, guessed from headers and samples, for a new problem file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from seaopt.problem.proposal.survey import Survey, SurveyedColumn, find_leader, regress
+from seaopt.problem.proposal.vocabulary import UNITS_OF, Quantity
+from seaopt.records import record
+
+INPUTS = ("I", "torque", "V", "duty", "goal")  # what may drive a motor; of each kind of command its own plant
+LINEAR_OUTPUTS = ("F1", "F2", "q", "screw", "phi")  # screw: the motor's angle, which is q over the lead
+ROTARY_OUTPUTS = ("tau_s", "theta_m", "theta_l", "deflection")
+OF_INPUT: dict[str, Quantity] = {
+    "I": "current", "torque": "torque", "V": "voltage", "duty": "duty", "goal": "angle",
+}  # fmt: skip
+OF_OUTPUT: dict[str, Quantity] = {
+    "F1": "force", "F2": "force", "q": "length", "screw": "angle", "phi": "angle",
+    "tau_s": "torque", "theta_m": "angle", "theta_l": "angle", "deflection": "angle",
+}  # fmt: skip
+DESCRIPTIONS = {
+    "I": "motor current", "torque": "commanded torque", "V": "motor voltage", "duty": "duty of the bridge",
+    "goal": "goal of a position loop", "F1": "force at the spring", "F2": "force at the nut", "q": "place of the nut",
+    "screw": "angle of the motor", "phi": "angle of the link",
+    "tau_s": "torque at the spring", "theta_m": "angle of the motor", "theta_l": "angle of the link",
+    "deflection": "deflection of the spring",
+}  # fmt: skip
+FOLLOWS = 0.9  # share of variance from which two channels are one but for a factor
+STILL = 0.02  # of the motor's motion: a link that moves less is held
+
+
+@record(eq=False)
+class Assignment:
+    """Roles of a log's columns.
+
+    Parameters
+    ----------
+    rotary : bool
+        A gear's actuator, else a screw's.
+    input : str
+        One of `INPUTS`.
+    columns : mapping of role to SurveyedColumn
+        The input's and the outputs'.
+    unused : tuple of SurveyedColumn
+    doubts : tuple of str
+        What of it is a guess, one sentence each.
+
+    """
+
+    rotary: bool
+    input: str
+    columns: Mapping[str, SurveyedColumn]
+    unused: tuple[SurveyedColumn, ...]
+    doubts: tuple[str, ...]
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The roles of what is measured."""
+        return tuple(role for role in self.columns if role != self.input)
+
+
+def is_rotary(columns: Sequence[SurveyedColumn]) -> tuple[bool, bool]:
+    """Return whether an actuator turns, and whether its columns leave no doubt of it."""
+    kinds = {one.header.quantity for one in columns}
+    linear, turning = kinds & {"force", "length"}, kinds & {"torque"}
+    if linear and not turning:
+        return False, "force" in kinds
+    return True, bool(turning) and not linear
+
+
+def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignment:
+    """Return the roles of a log's columns; `given` are those that are known, column to role ("" for none)."""
+    free = [one for one in survey.columns if one.name not in given and one.header.quantity not in ("other", "time")]
+    columns = {given[one.name]: one for one in survey.columns if given.get(one.name)}
+    doubts: list[str] = []
+    role = next((role for role in columns if role in INPUTS), None)
+    if role is None:
+        role, column, doubt = _find_input(free)
+        columns = {role: column, **columns}
+        free.remove(column)
+        doubts += [doubt] if doubt else []
+    else:
+        columns = {role: columns.pop(role), **columns}
+    # Of two columns of one role, the measured one, and then the first, is taken.
+    free.sort(key=lambda one: (one.header.commanded, not one.header.measured))
+    place = _place_rotary if rotary else _place_linear
+    doubts += place([one for one in free if not one.header.commanded], columns)
+    used = {one.name for one in columns.values()}
+    return Assignment(
+        rotary=rotary, input=role, columns=columns, doubts=tuple(doubts),
+        unused=tuple(one for one in survey.columns if one.name not in used),
+    )  # fmt: skip
+
+
+def _find_input(columns: Sequence[SurveyedColumn]) -> tuple[str, SurveyedColumn, str]:
+    """Return the input's role, its column, and why that is a guess, if it is one."""
+    for role, quantity in OF_INPUT.items():
+        named = [one for one in columns if one.header.quantity == quantity]
+        if role in ("torque", "goal"):  # which are measured as often
+            named = [one for one in named if one.header.commanded]
+        if role == "goal":
+            named += [one for one in columns if one.header.commanded and not one.header.quantity]
+        if not named:
+            continue
+        # A current that was commanded is there before the one that was measured.
+        best = min(named, key=lambda one: (not one.header.commanded, one.header.side == "link"))
+        others = [one.name for one in named if one is not best]
+        return role, best, f"{best.name} is the input, and not {', '.join(others)}" if others else ""
+    unknown = [one for one in columns if not one.header.quantity] or list(columns)
+    leader = find_leader(columns if len(unknown) == len(columns) else unknown) if len(columns) > 1 else columns[0]
+    role = "torque" if leader.header.quantity == "torque" else "goal" if leader.header.quantity == "angle" else "I"
+    return role, leader, f"{leader.name} is the input: the other columns follow it"
+
+
+def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> list[str]:
+    """Give a rotary actuator's columns their roles; return what is a guess."""
+    doubts: list[str] = []
+    torques = [one for one in columns if one.header.quantity == "torque"]
+    if torques and "tau_s" not in roles:
+        # A drive's own torque is its current times a constant; the sensor's is the spring's.
+        order = {"spring": 0, "link": 1, "": 2, "motor": 3}
+        best = min(torques, key=lambda one: order[one.header.side])
+        roles["tau_s"] = best
+        if len(torques) > 1 and best.header.side != "spring":
+            doubts.append(f"{best.name} is the torque at the spring, of {len(torques)} torques")
+    angles = [one for one in columns if one.header.quantity == "angle"]
+    for one in angles:
+        side = "deflection" if one.header.deflection else {"motor": "theta_m", "link": "theta_l"}.get(one.header.side)
+        if side is not None:
+            roles.setdefault(side, one)
+    named = {id(one) for one in roles.values()}
+    open_angles = sorted(
+        (one for one in angles if id(one) not in named and not one.header.deflection and not one.header.side),
+        key=lambda one: -one.swing,
+    )
+    for one, role in zip(open_angles, [r for r in ("theta_m", "theta_l") if r not in roles], strict=False):
+        roles[role] = one
+        doubts.append(f"{one.name} is the {DESCRIPTIONS[role]}")
+    return doubts + _place_unnamed(columns, roles, ("tau_s", "theta_m", "theta_l"))
+
+
+def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> list[str]:
+    """Give a screw's columns their roles; return what is a guess."""
+    doubts: list[str] = []
+    forces = [one for one in columns if one.header.quantity == "force"]
+    for one in forces:
+        if one.header.number is not None:
+            roles.setdefault(f"F{one.header.number}", one)
+    for one in forces:
+        rest = [role for role in ("F1", "F2") if role not in roles]
+        if one not in roles.values() and rest:
+            roles[rest[0]] = one
+            doubts += [f"{one.name} is the {DESCRIPTIONS[rest[0]]}, {rest[0]}"]
+    for one in columns:
+        link = one.header.side == "link"
+        if one.header.quantity == "length":
+            roles.update({} if link or "q" in roles else {"q": one})
+        elif one.header.quantity == "angle":
+            roles.setdefault("phi" if link else "screw", one)
+    return doubts + _place_unnamed(columns, roles, ("F1", "F2"))
+
+
+def _place_unnamed(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn], wanted: Sequence[str]) -> list[str]:
+    """Take columns whose headers say nothing as what is measured, where nothing else is."""
+    if len(roles) > 1:
+        return []
+    blank = [one for one in columns if not one.header.quantity and one not in roles.values()]
+    for role, one in zip(wanted, blank, strict=False):
+        roles[role] = one
+    return [f"{one.name} is the {DESCRIPTIONS[role]}" for role, one in zip(wanted, blank, strict=False)]
+
+
+def guess_unit(role: str, column: SurveyedColumn) -> tuple[str, bool]:
+    """Return a column's unit, and whether its header says so; else the sizes of its numbers suggest one."""
+    unit, quantity = column.header.unit, OF_INPUT.get(role) or OF_OUTPUT[role]
+    if unit and not (role == "duty" and unit != "percent"):
+        return unit, True
+    large = column.largest
+    if quantity == "current":
+        return ("mA", False) if large > 100.0 else ("A", False)
+    if quantity == "duty":
+        return ("percent", False) if 1.5 < large <= 100.0 else ("-", False)
+    if quantity == "angle":
+        if column.whole and large > 50.0:
+            return "counts", False
+        turning = role in ("theta_m", "screw", "goal")
+        return ("deg", False) if not turning and large > 6.5 else ("rad", False)
+    if quantity == "length":
+        return ("mm", False) if large > 0.5 else ("m", False)
+    return UNITS_OF[quantity], False
+
+
+def is_held(assignment: Assignment, link_unit: float, motor_unit: float) -> tuple[bool, str]:
+    """Return whether a gear's link is held, and what suggests so; units are in rad per unit of the column."""
+    columns = assignment.columns
+    motor, link, torque = (columns.get(role) for role in ("theta_m", "theta_l", "tau_s"))
+    if link is not None:
+        still = motor is not None and link.swing * link_unit < STILL * motor.swing * motor_unit / 100.0
+        return still, f"{link.name} {'stands still' if still else 'moves'}"
+    if motor is not None and torque is not None:
+        _, share = regress(torque.values, motor.values)
+        return share > FOLLOWS, f"{torque.name} {'follows' if share > FOLLOWS else 'does not follow'} {motor.name}"
+    if torque is not None:
+        return True, "the link was not measured"
+    return False, "no torque was measured"

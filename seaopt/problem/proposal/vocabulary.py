@@ -1,0 +1,233 @@
+"""What the header of a log's column says of it: which quantity, in which unit, of what, commanded or measured.
+
+Names are read word by word ("mot_pos", "motorPosition" and "Motorposition [Grad]" are the same), in English and German,
+as engineers and drives write them. What a header leaves open `seaopt.problem.proposal.roles` looks up in the data.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Literal
+
+from seaopt.errors import SeaoptError
+from seaopt.records import record
+from seaopt.units import bare_name, is_unit, same_dimension, si_unit
+
+Quantity = Literal["time", "current", "voltage", "duty", "force", "torque", "angle", "length", "speed", "other", ""]
+Side = Literal["motor", "link", "spring", ""]
+
+QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
+    "time": frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout", "stamp", "clock", "sekunden"}),
+    "current": frozenset({"i", "iq", "cur", "curr", "current", "amps", "ampere", "amperes", "strom", "imot", "im"}),
+    "voltage": frozenset({"u", "uq", "vq", "volt", "volts", "voltage", "spannung"}),
+    "duty": frozenset({"duty", "dutycycle", "pwm", "tastgrad"}),
+    "force": frozenset({"f", "f1", "f2", "force", "kraft", "loadcell", "cell", "zugkraft"}),
+    "torque": frozenset({"tau", "torque", "trq", "tq", "moment", "drehmoment", "taus", "taum"}),
+    "angle": frozenset({"theta", "phi", "angle", "winkel", "ang", "deg", "thetam", "thetal", "rotation"}),
+    "length": frozenset({"weg", "stroke", "travel", "displacement", "hub", "x1", "x2"}),
+    "speed": frozenset({
+        "speed", "vel", "velocity", "omega", "drehzahl", "geschwindigkeit", "qd", "dq", "thetad", "dtheta", "rate",
+        "rpm", "winkelgeschwindigkeit", "v", "w", "acc", "accel", "acceleration",
+    }),
+    "other": frozenset({
+        "temp", "temperature", "temperatur", "status", "state", "flag", "flags", "count", "counter", "index", "idx",
+        "id", "seq", "error", "mode", "enable", "bus", "vbus", "supply", "battery", "power", "checksum", "crc", "row",
+        "sample", "samples", "no", "nr",
+    }),
+}  # fmt: skip
+PLACE_WORDS = frozenset({"pos", "position", "enc", "encoder", "q", "x", "y", "coordinate", "geber", "ist", "act"})
+SIDE_WORDS: dict[Side, frozenset[str]] = {
+    "spring": frozenset({
+        "spring", "feder", "sea", "s", "deflection", "defl", "compression", "auslenkung", "federweg", "sensor", "taus",
+        "twist", "stretch",
+    }),
+    "motor": frozenset({"motor", "mot", "m", "rotor", "screw", "nut", "spindel", "antrieb", "drive", "thetam", "taum"}),
+    "link": frozenset({
+        "link", "load", "joint", "output", "out", "l", "arm", "knee", "elbow", "ankle", "hip", "shank", "leg",
+        "gelenk", "abtrieb", "last", "pendulum", "pendel", "lever", "hebel", "phi", "thetal",
+    }),
+}  # fmt: skip
+COMMAND_WORDS = frozenset({
+    "cmd", "command", "commanded", "goal", "ref", "reference", "target", "set", "setpoint", "des", "desired", "soll",
+    "demand", "sp",
+})  # fmt: skip
+MEASURED_WORDS = frozenset({"act", "actual", "meas", "measured", "ist", "present", "fb", "feedback"})
+DEFLECTION_WORDS = frozenset({"deflection", "defl", "compression", "auslenkung", "federweg", "twist", "stretch"})
+# Within a longer word, as German composes them: Motorstrom, Gelenkwinkel, Sollposition.
+LONG = 4
+
+SUFFIXES = {
+    "ma": "mA", "a": "A", "amp": "A", "mv": "mV", "v": "V", "n": "N", "kn": "kN", "nm": "N m", "mnm": "mN m",
+    "nmm": "N mm", "rad": "rad", "mrad": "mrad", "deg": "deg", "grad": "deg", "mm": "mm", "um": "um", "m": "m",
+    "s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "pct": "percent", "percent": "percent",
+    "counts": "counts", "ticks": "counts", "cnt": "counts", "inc": "counts", "rpm": "rpm", "dps": "deg/s",
+    "rad_s": "rad/s", "deg_s": "deg/s", "m_s": "m/s", "mm_s": "mm/s",
+}  # fmt: skip
+UNITS_OF: dict[Quantity, str] = {
+    "time": "s", "current": "A", "voltage": "V", "duty": "", "force": "N", "torque": "N m", "angle": "rad",
+    "length": "m",
+}  # fmt: skip
+COUNTS = "counts"
+# Of a unit that is there: what it measures.
+_QUANTITY_OF: dict[str, Quantity] = {
+    "s": "time", "A": "current", "V": "voltage", "N": "force", "N m": "torque", "rad": "angle", "m": "length",
+    "rad/s": "speed", "m/s": "speed", "degC": "other", "K": "other", "W": "other", "Hz": "other",
+    "rad/s^2": "speed", "m/s^2": "speed",
+}  # fmt: skip
+
+
+@record
+class Header:
+    """What a column's name says.
+
+    Parameters
+    ----------
+    name : str
+        As the file has it.
+    quantity : str
+        "" where the name does not say.
+    side : "motor", "link", "spring" or ""
+        Of which part of the actuator.
+    unit : str
+        From brackets or a suffix; "counts" of an encoder's steps, "" where there is none.
+    commanded, measured, deflection : bool
+        Whether the name says so.
+    number : int or None
+        Of F1, F2.
+
+    """
+
+    name: str
+    quantity: Quantity
+    side: Side
+    unit: str
+    commanded: bool = False
+    measured: bool = False
+    deflection: bool = False
+    number: int | None = None
+
+
+def read_header(name: str, unit: str | None = None) -> Header:
+    """Return what a column's header says; `unit` is what the file itself states.
+
+    Examples
+    --------
+    >>> one = read_header("mot_pos_deg")
+    >>> one.quantity, one.side, one.unit
+    ('angle', 'motor', 'deg')
+    >>> read_header("Motorstrom [mA]").quantity, read_header("tau_s").unit
+    ('current', '')
+
+    """
+    stated, bare = _clean_unit(unit), bare_name(name)
+    suffix, rest = ("", bare) if stated else _split_suffix(bare)
+    words = split_words(rest)
+    kinds = _list_quantities(words)
+    place = bool(_matches(words, PLACE_WORDS | DEFLECTION_WORDS))
+    if suffix and not _fits(suffix, kinds, words, place=place):
+        suffix, words = "", split_words(bare)
+        kinds = _list_quantities(words)
+    own = _quantity_of_unit(stated or suffix)
+    if "other" in kinds and own in ("", "voltage", "current"):  # of the supply, say
+        own = "other"
+    quantity = "voltage" if bare == "V" else own or _decide(kinds, place=place, counts=COUNTS in (stated, suffix))
+    return Header(
+        name=name, quantity=quantity, side=_find_side(words), unit=stated or suffix,
+        commanded=bool(_matches(words, COMMAND_WORDS)), measured=bool(_matches(words, MEASURED_WORDS)),
+        deflection=bool(_matches(words, DEFLECTION_WORDS)), number=_find_number(words),
+    )  # fmt: skip
+
+
+def split_words(name: str) -> list[str]:
+    """Return the words of a name in small letters.
+
+    Examples
+    --------
+    >>> split_words("motorPosition_F1"), split_words("/joint.tau_cmd")
+    (['motor', 'position', 'f1'], ['joint', 'tau', 'cmd'])
+
+    """
+    parts = re.findall(r"[A-Z]?[a-zäöüß]+\d*|[A-Z]+\d*(?![a-z])|[A-Z]\d*|\d+", name)
+    return [part.lower() for part in parts]
+
+
+def _clean_unit(unit: str | None) -> str:
+    """Return a stated unit that can be used; percent and encoder steps by one name each."""
+    if unit is None or not unit.strip():
+        return ""
+    text = unit.strip()
+    if text.lower() in ("counts", "count", "ticks", "cnt", "inc", "increments", "inkremente", "lsb", "steps"):
+        return COUNTS
+    if text.lower() in ("%", "pct", "percent", "prozent"):
+        return "percent"
+    return text if is_unit(text) else ""
+
+
+def _quantity_of_unit(unit: str) -> Quantity:
+    if not unit or unit in (COUNTS, "percent", "-", "1"):
+        return "duty" if unit == "percent" else ""
+    try:
+        return _QUANTITY_OF.get(si_unit(unit), "other" if si_unit(unit) else "")
+    except SeaoptError:
+        return ""
+
+
+def _split_suffix(name: str) -> tuple[str, str]:
+    """Return the unit that a name may end in, as "_mA" or "_rad_s", and the rest of the name; "" where it does not."""
+    *first, last = re.split(r"[\s_.\-/]+", name.strip())
+    if len(first) > 1 and f"{first[-1]}_{last}".lower() in SUFFIXES:
+        return SUFFIXES[f"{first[-1]}_{last}".lower()], "_".join(first[:-1])
+    if first and last.lower() in SUFFIXES:
+        return SUFFIXES[last.lower()], "_".join(first)
+    return "", name
+
+
+def _fits(unit: str, kinds: list[Quantity], words: list[str], *, place: bool) -> bool:
+    """Tell whether a suffix is a unit of what the other words say; tau_s is a torque, and theta_m an angle."""
+    measured = _quantity_of_unit(unit)
+    if unit == COUNTS or measured in kinds:
+        return True
+    if measured in ("angle", "length"):
+        return place or (not kinds and unit != "m")
+    return not kinds and len(unit) > 1 and bool(words)
+
+
+def _find_number(words: list[str]) -> int | None:
+    """Return the number of F1 or F2, of "force 2" or "cell1"."""
+    found = re.search(r"(?:f|force|kraft|cell|loadcell)([12])$", "".join(words))
+    return int(found[1]) if found else None
+
+
+def _list_quantities(words: list[str]) -> list[Quantity]:
+    found: list[Quantity] = [quantity for quantity, known in QUANTITY_WORDS.items() if _matches(words, known)]
+    # What is no signal is named in full, or else "states" would be a state.
+    return [kind for kind in found if kind != "other" or any(word in QUANTITY_WORDS["other"] for word in words)]
+
+
+def _matches(words: Iterable[str], known: frozenset[str]) -> list[str]:
+    """Return the words that are known, or hold a long known one."""
+    long = [one for one in known if len(one) >= LONG]
+    bare = ((word, word.rstrip("0123456789")) for word in words)
+    return [word for word, stem in bare if word in known or stem in known or any(one in word for one in long)]
+
+
+def _decide(kinds: list[Quantity], *, place: bool, counts: bool) -> Quantity:
+    """Return the one quantity of a name's words; of several, the most telling."""
+    for quantity in ("other", "speed", "duty", "current", "voltage", "torque", "force", "angle", "length", "time"):
+        if quantity in kinds and not (quantity == "speed" and place and kinds == ["speed"]):
+            return quantity
+    return "angle" if place or counts else ""
+
+
+def _find_side(words: list[str]) -> Side:
+    for side in ("spring", "motor", "link"):
+        if _matches(words, SIDE_WORDS[side]):
+            return side
+    return ""
+
+
+def is_unit_of(unit: str, quantity: Quantity) -> bool:
+    """Tell whether a unit measures a quantity."""
+    wanted = UNITS_OF.get(quantity)
+    return wanted is not None and bool(unit) and is_unit(unit) and same_dimension(unit, wanted)

@@ -1,0 +1,97 @@
+"""`seaopt new`: a problem file from a raw log, with answers and without."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+
+import seaopt as so
+from tests.actuator_logs import drive, knee, write_csv
+
+
+@pytest.fixture
+def held(folder):
+    """Put knee.csv, a log of a held knee, into the folder."""
+    t, current = drive(3.0, 400.0, 2.0)
+    log = knee(current, 400.0, locked=True)
+    return write_csv(folder / "knee.csv", {"t [s]": t, "I [A]": log["I"], "tau_s [N m]": log["tau_s"]})
+
+
+@pytest.fixture
+def answer(monkeypatch):
+    def _answer(*lines):
+        monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{line}\n" for line in lines)))
+
+    return _answer
+
+
+def test_a_file_is_written_beside_the_log_and_never_over_another(folder, seaopt, held):
+    out = seaopt("new", "knee.csv", "--yes")
+    assert out.returncode == 0, out.stderr
+    assert "seaopt run knee.toml -o knee" in out.stdout
+    written = (folder / "knee.toml").read_text(encoding="utf-8")
+    assert "guessed: " in written and list(so.read_problem(folder / "knee.toml").plants) == ["held"]
+    again = seaopt("new", "knee.csv", "--yes")
+    assert again.returncode == 2 and "seaopt new knee.csv -o knee.toml --force" in again.stderr
+    assert (folder / "knee.toml").read_text(encoding="utf-8") == written
+    assert seaopt("new", "knee.csv", "--yes", "--force").returncode == 0
+
+
+def test_what_is_written_runs(folder, seaopt, held):
+    assert seaopt("new", "knee.csv", "-y").returncode == 0
+    assert seaopt("simulate", "knee.toml", "-o", "sim").returncode == 0
+
+
+def test_answers_are_asked_for_until_they_count(folder, seaopt, held, answer):
+    answer("", "", "hundred", "100", "0.037", "", "unknown", "20", "1000", "9")
+    out = seaopt("new", "knee.csv", "-o", "asked.toml")
+    assert out.returncode == 0, out.stderr
+    assert '"hundred" is not a positive number' in out.stdout
+    problem = so.read_problem(folder / "asked.toml")
+    assert (problem.parameters["N"].value, problem.parameters["K_tau"].value) == (100.0, 0.037)
+    assert (problem.spec.bandwidth_hz, problem.spec.sample_rate_hz, problem.spec.current_limit_A) == (20.0, 1000.0, 9.0)
+    assert "guessed" in next(line for line in problem_lines(folder / "asked.toml") if line.startswith("k_s"))
+
+
+def problem_lines(path):
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def test_without_an_answer_nothing_is_written(folder, seaopt, held, answer):
+    answer("yes")
+    out = seaopt("new", "knee.csv")
+    assert out.returncode == 2 and "--yes" in out.stderr
+    assert not (folder / "knee.toml").exists()
+
+
+def test_json_has_the_columns_and_the_guesses(folder, seaopt, held):
+    content = json.loads(seaopt("new", "knee.csv", "--json").stdout)
+    assert content["file"] == "knee.toml"
+    assert {row["column"]: row["role"] for row in content["columns"]} == {
+        "t [s]": "time", "I [A]": "input", "tau_s [N m]": "tau_s",
+    }  # fmt: skip
+    assert float(content["guesses"]["N"]) > 0
+
+
+def test_several_logs_are_several_experiments(folder, seaopt, held):
+    (folder / "second run.csv").write_bytes(held.read_bytes())
+    assert seaopt("new", "knee.csv", "second run.csv", "--yes").returncode == 0
+    problem = so.read_problem(folder / "problem.toml")
+    assert [experiment.name for experiment in problem.table.experiment] == ["knee", "second_run"]
+    assert len(problem.experiments()) == 2
+
+
+def test_a_log_that_is_not_there_is_one_line(folder, seaopt):
+    out = seaopt("new", "none.csv", "--yes")
+    (line,) = out.stderr.strip().splitlines()
+    assert out.returncode == 2 and line.startswith("seaopt: none.csv")
+
+
+def test_control_characters_of_a_header_do_not_reach_the_terminal(folder, seaopt, held):
+    text = held.read_text(encoding="utf-8").replace("I [A]", "\x1b]0;title\x07I [A]", 1)
+    (folder / "evil.csv").write_text(text, encoding="utf-8")
+    out = seaopt("new", "evil.csv", "--yes")
+    assert "\x1b" not in out.stdout + out.stderr and "\x07" not in out.stdout
+    assert "\x1b" not in (folder / "evil.toml").read_text(encoding="utf-8")

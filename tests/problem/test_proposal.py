@@ -1,0 +1,332 @@
+"""Problem files proposed for logs of the tests' own simulator: roles, units, plants, and what a fit makes of them."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.problem import json_schema
+from seaopt.problem.proposal import propose
+from seaopt.problem.proposal.vocabulary import read_header
+from tests.actuator_logs import KNEE, SCREW, drive, knee, screw, write_csv
+
+RATE = 400.0
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """Return short logs: times, and channels of a knee free and held, of a servo's, of a bridge's, and of a screw."""
+    t, current = drive(4.0, RATE, 2.0)
+    goal = 3.0 * np.sin(2 * math.pi * (0.5 + 0.6 * t) * t)
+    firmware = knee(goal, RATE, current=lambda u, angle, speed: 2.0 * (u - angle))
+    bridge = knee(current / 5.0, RATE, current=lambda u, angle, speed: (24.0 * u - 0.037 * speed) / 1.5)
+    return {
+        "t": t, "free": knee(current, RATE), "held": knee(current, RATE, locked=True), "servo": firmware, "goal": goal,
+        "bridge": bridge, "duty": current / 5.0, "screw": screw(current, RATE),
+    }  # fmt: skip
+
+
+def degrees(values):
+    return np.degrees(values)
+
+
+def steps(values):
+    return np.round(values * 4096 / (2 * math.pi))
+
+
+# Name: columns of (t, all logs), what each role should be, the plant, and how the file is written.
+CASES = {
+    "brackets": (
+        lambda t, of: {"time [s]": t, "I [A]": of["held"]["I"], "tau_s [N m]": of["held"]["tau_s"]},
+        {"I": ("I [A]", "A"), "tau_s": ("tau_s [N m]", "N m")}, "held", {},
+    ),
+    "suffixes": (
+        lambda t, of: {"t_ms": 1e3 * t, "current_mA": 1e3 * of["free"]["I"],
+                       "mot_pos_deg": degrees(of["free"]["theta_m"]), "joint_pos_deg": degrees(of["free"]["theta_l"]),
+                       "torque_Nm": of["free"]["tau_s"]},
+        {"I": ("current_mA", "mA"), "tau_s": ("torque_Nm", "N m"), "theta_m": ("mot_pos_deg", "deg"),
+         "theta_l": ("joint_pos_deg", "deg")}, "free", {},
+    ),
+    "german": (
+        lambda t, of: {"Zeit [ms]": 1e3 * t, "Motorstrom [mA]": 1e3 * of["held"]["I"],
+                       "Federmoment [Nm]": of["held"]["tau_s"], "Motorwinkel [Grad]": degrees(of["held"]["theta_m"]),
+                       "Temperatur [°C]": 25.0 + t},
+        {"I": ("Motorstrom [mA]", "mA"), "tau_s": ("Federmoment [Nm]", "Nm"),
+         "theta_m": ("Motorwinkel [Grad]", "Grad")},
+        "held", {"delimiter": ";", "decimal": ","},
+    ),
+    "bare": (
+        lambda t, of: {"t": t, "cur": of["held"]["I"], "tau": of["held"]["tau_s"], "theta_m": of["held"]["theta_m"]},
+        {"I": ("cur", "A"), "tau_s": ("tau", "N m"), "theta_m": ("theta_m", "rad")}, "held", {},
+    ),
+    "milliamperes": (
+        lambda t, of: {"timestamp": 1e3 * t, "iq": 1e3 * of["held"]["I"], "load_torque": of["held"]["tau_s"]},
+        {"I": ("iq", "mA"), "tau_s": ("load_torque", "N m")}, "held", {},
+    ),
+    "encoders": (
+        lambda t, of: {"time_us": 1e6 * t, "motorCurrent": of["free"]["I"],
+                       "motorEncoder": steps(of["free"]["theta_m"]), "outputEncoder_rad": of["free"]["theta_l"]},
+        {"I": ("motorCurrent", "A"), "theta_m": ("motorEncoder", "rad"), "theta_l": ("outputEncoder_rad", "rad")},
+        "free", {"actuator": "rotary"},
+    ),
+    "unsided": (
+        lambda t, of: {"time": t, "amps": of["free"]["I"], "enc1": of["free"]["theta_l"],
+                       "enc2": of["free"]["theta_m"]},
+        {"I": ("amps", "A"), "theta_m": ("enc2", "rad"), "theta_l": ("enc1", "rad")}, "free", {"actuator": "rotary"},
+    ),
+    "servo": (
+        lambda t, of: {"timestamp [s]": t, "goal_position [rad]": of["goal"],
+                       "present_position [rad]": of["servo"]["theta_m"]},
+        {"goal": ("goal_position [rad]", "rad"), "theta_m": ("present_position [rad]", "rad")}, "free",
+        {"actuator": "rotary"},
+    ),
+    "duty": (
+        lambda t, of: {"t [s]": t, "pwm": np.round(885 * of["duty"]), "theta_m [rad]": of["bridge"]["theta_m"],
+                       "tau_s [N m]": of["bridge"]["tau_s"]},
+        {"duty": ("pwm", "-"), "theta_m": ("theta_m [rad]", "rad"), "tau_s": ("tau_s [N m]", "N m")}, "free", {},
+    ),
+    "percent": (
+        lambda t, of: {"t [s]": t, "duty [%]": 100 * of["duty"], "theta_m [rad]": of["bridge"]["theta_m"],
+                       "theta_l [rad]": of["bridge"]["theta_l"], "v_bus [V]": 24.0 + 0.1 * np.sin(t)},
+        {"duty": ("duty [%]", "percent"), "theta_m": ("theta_m [rad]", "rad"), "theta_l": ("theta_l [rad]", "rad")},
+        "free", {"actuator": "rotary"},
+    ),
+    "command": (
+        lambda t, of: {"time [s]": t, "tau_cmd [N m]": 3.7 * of["held"]["I"], "tau_meas [N m]": of["held"]["tau_s"],
+                       "vel [rad/s]": of["held"]["omega_m"]},
+        {"torque": ("tau_cmd [N m]", "A"), "tau_s": ("tau_meas [N m]", "N m")}, "held", {},
+    ),
+    "two cells": (
+        lambda t, of: {"time [s]": t, "I [A]": of["screw"]["I"], "F1 [N]": of["screw"]["F1"],
+                       "F2 [N]": of["screw"]["F2"]},
+        {"I": ("I [A]", "A"), "F1": ("F1 [N]", "N"), "F2": ("F2 [N]", "N")}, "held", {},
+    ),
+    "one cell": (
+        lambda t, of: {"t_s": t, "Strom_A": of["screw"]["I"], "Kraft_N": of["screw"]["F1"],
+                       "motor_angle_rad": of["screw"]["theta_m"]},
+        {"I": ("Strom_A", "A"), "F1": ("Kraft_N", "N"), "screw": ("motor_angle_rad", "rad")}, "held",
+        {"delimiter": "\t"},
+    ),
+    "kilonewtons": (
+        lambda t, of: {"t [s]": t, "i_cmd [A]": of["screw"]["I"], "i_act [A]": of["screw"]["I"] + 1e-3 * np.sin(99 * t),
+                       "loadcell [kN]": 1e-3 * of["screw"]["F1"], "travel [mm]": 1e3 * of["screw"]["q"]},
+        {"I": ("i_cmd [A]", "A"), "F1": ("loadcell [kN]", "kN"), "q": ("travel [mm]", "mm")}, "held", {},
+    ),
+    "no names": (
+        lambda t, of: {"x1": t, "ch1": of["held"]["tau_s"], "ch2": of["held"]["I"]},
+        {"I": ("ch2", "A"), "tau_s": ("ch1", "N m")}, "held", {},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_columns_are_told_apart(tmp_path, logs, name):
+    columns, expected, place, how = CASES[name]
+    style = {key: value for key, value in how.items() if key != "actuator"}
+    path = write_csv(tmp_path / "log.csv", columns(logs["t"], logs), **style)
+    proposal = propose([path], {}, tmp_path)
+    found = {row.column: (row.role, row.unit) for row in proposal.columns if row.role}
+    inputs = {"I", "torque", "goal", "duty"}
+    assert {column: role for column, (role, _) in found.items() if role not in ("time", "input")} == {
+        column: role for role, (column, _) in expected.items() if role not in inputs
+    }
+    (driven,) = (role for role in expected if role in inputs)
+    assert found[expected[driven][0]][0] == "input"
+    content = tomllib.loads(proposal.text)
+    assert content["experiment"][0]["plant"] == place
+    problem = write(tmp_path, proposal.text)
+    assert next(iter(problem.plants)) == place
+    (experiment,) = problem.experiments()
+    check_values(experiment.log, logs, name)
+    jsonschema = pytest.importorskip("jsonschema")
+    jsonschema.Draft202012Validator(json_schema()).validate(content)
+
+
+def write(folder, text):
+    path = folder / "problem.toml"
+    path.write_text(text, encoding="utf-8")
+    return so.read_problem(path)
+
+
+def check_values(log, logs, name):
+    """Check that what a fit will read is, in SI, what the simulator had."""
+    kind = {"servo": "servo", "duty": "bridge", "percent": "bridge"}.get(name)
+    kind = kind or ("screw" if "F1" in log.signals else "free" if "theta_l" in log.signals else "held")
+    truth = {**logs[kind], "goal": logs["goal"], "duty": logs["duty"]}
+    if name == "command":
+        truth["I"] = 3.7 * logs["held"]["I"]
+    if name == "one cell":  # the lead that is guessed turns the angle into the nut's place
+        truth["q"] = logs["screw"]["theta_m"] * 0.002 / (2 * math.pi)
+    if name == "encoders":
+        truth["theta_m"] = steps(truth["theta_m"]) * 2 * math.pi / 4096
+    if name == "duty":
+        truth["duty"] = np.round(885 * truth["duty"]) / 885
+    np.testing.assert_allclose(log.time, logs["t"], atol=1e-6)
+    for signal in log.signals:
+        np.testing.assert_allclose(log[signal], truth[signal], rtol=1e-6, atol=1e-6 * np.ptp(truth[signal]))
+
+
+@pytest.mark.parametrize(
+    ("header", "quantity", "side", "unit"),
+    [
+        ("tau_s", "torque", "spring", ""), ("theta_m", "angle", "motor", ""), ("theta_m_rad", "angle", "motor", "rad"),
+        ("JointAngle_deg", "angle", "link", "deg"), ("t_us", "time", "", "us"),
+        ("motor_current", "current", "motor", ""),
+        ("cell2_N", "force", "", "N"), ("vel_rad_s", "speed", "", "rad/s"), ("v_bus", "other", "", ""),
+        ("pwm_percent", "duty", "", "percent"), ("enc_motor_counts", "angle", "motor", "counts"),
+        ("Sollposition", "angle", "", ""), ("/joint_states.position[0]", "angle", "link", ""), ("ch1", "", "", ""),
+    ],
+)  # fmt: skip
+def test_a_header_says_what_it_says(header, quantity, side, unit):
+    read = read_header(header)
+    assert (read.quantity, read.side, read.unit) == (quantity, side, unit)
+
+
+def test_a_fit_of_what_was_proposed_recovers_a_knee(tmp_path):
+    """With the motor's own figures known; stiffness, inertias, friction and damping come from the log."""
+    t, current = drive(10.0, RATE, 2.0)
+    held, free = knee(current, RATE, locked=True), knee(current, RATE, seed=9)
+    for name, log in (("held", held), ("free", free)):
+        columns = {"t_ms": 1e3 * t, "current_mA": 1e3 * log["I"], "torque_Nm": log["tau_s"],
+                   "motor_deg": degrees(log["theta_m"])}  # fmt: skip
+        if name == "free":
+            columns["joint_deg"] = degrees(log["theta_l"])
+        write_csv(tmp_path / f"{name}.csv", columns)
+    paths = [tmp_path / "held.csv", tmp_path / "free.csv"]
+    proposal = propose(paths, {"K_tau": "0.037"}, tmp_path)
+    assert not any(line.startswith("N ") and "usual" in line for line in proposal.text.splitlines())
+    problem = write(tmp_path, proposal.text)
+    assert problem.parameters["N"].value == 100.0  # from the two encoders
+    fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
+    assert fit.met, fit
+    for name in ("J_m", "b_r", "f_c", "k_s", "J_l", "d_l"):
+        assert fit.parameters[name].value == pytest.approx(KNEE[name], rel=0.01), name
+    assert fit.parameters["eta"].value == pytest.approx(1.0, rel=0.01)
+
+
+def test_a_fit_of_what_was_proposed_recovers_a_screw(tmp_path):
+    t, current = drive(10.0, RATE, 2.0, top_hz=60.0)
+    log = screw(current, RATE)
+    columns = {"Zeit [s]": t, "Strom [A]": log["I"], "Kraft F1 [N]": log["F1"], "Kraft F2 [N]": log["F2"]}
+    path = write_csv(tmp_path / "chirp.csv", columns, delimiter=";", decimal=",")
+    known = {"K_tau": "0.0255", "N_p": "3", "k": "655000"}
+    problem = write(tmp_path, propose([path], known, tmp_path).text)
+    fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
+    assert fit.met, fit
+    r = SCREW["l"] / (2 * math.pi * SCREW["N_p"])
+    truth = {"m_k": SCREW["J"] / r**2 + SCREW["m_l"], "b_m": SCREW["b_r"] / r**2}
+    assert fit.parameters["eta"].value == pytest.approx(1.0, rel=0.01)
+    assert {name: fit.derived[name].value for name in truth} == pytest.approx(truth, rel=0.01)
+
+
+def test_with_nothing_known_frequencies_are_right(tmp_path, logs):
+    """Whatever gear ratio and torque constant are guessed: what a held log tells is the resonance and its damping."""
+    t, current = drive(10.0, RATE, 2.0)
+    log = knee(current, RATE, locked=True)
+    columns = {"t": t, "cur": log["I"], "tau": log["tau_s"], "theta_m": log["theta_m"]}
+    problem = write(tmp_path, propose([write_csv(tmp_path / "k.csv", columns)], {}, tmp_path).text)
+    fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
+    assert fit.met
+    stiff, heavy = KNEE["k_s"], KNEE["N"] ** 2 * KNEE["J_m"]
+    natural = math.sqrt(stiff / heavy) / (2 * math.pi)
+    assert fit.derived["natural_frequency_hz"].value == pytest.approx(natural, rel=2e-3)
+
+
+def test_a_turned_sensor_and_one_behind_the_gear_are_set_right(tmp_path, logs):
+    held, free = logs["held"], logs["free"]
+    path = write_csv(tmp_path / "a.csv", {
+        "t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"], "theta_m [rad]": -held["theta_m"],
+    })  # fmt: skip
+    (experiment,) = write(tmp_path, propose([path], {}, tmp_path).text).experiments()
+    np.testing.assert_allclose(experiment.log["theta_m"], held["theta_m"], atol=1e-6)
+    path = write_csv(tmp_path / "b.csv", {
+        "t [s]": logs["t"], "I [A]": free["I"], "motor [rad]": free["theta_m"] / 100.0, "joint [rad]": free["theta_l"],
+        "tau_s [N m]": free["tau_s"],
+    })  # fmt: skip
+    proposal = propose([path], {"N": "100"}, tmp_path)
+    (experiment,) = write(tmp_path, proposal.text).experiments()
+    np.testing.assert_allclose(experiment.log["theta_m"], free["theta_m"], atol=1e-4)
+    assert "behind the gear" in proposal.text
+
+
+def test_answers_take_the_place_of_guesses(tmp_path, logs):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
+    guessed = propose([path], {}, tmp_path)
+    assert {one.key for one in guessed.guesses} == {one.key for one in guessed.questions}
+    answers = {one.key: one.guess for one in guessed.questions} | {"N": "80", "K_tau": "0.04", "k_s": "250", "m": "3"}
+    while missing := [one for one in propose([path], answers, tmp_path).questions if one.key not in answers]:
+        answers |= {one.key: one.guess for one in missing}
+    proposal = propose([path], answers, tmp_path)
+    assert not proposal.guesses and "guessed:" not in proposal.text
+    problem = write(tmp_path, proposal.text)
+    assert {name: problem.parameters[name].value for name in ("N", "K_tau", "k_s", "m")} == {
+        "N": 80.0, "K_tau": 0.04, "k_s": 250.0, "m": 3.0,
+    }  # fmt: skip
+    assert problem.parameters["k_s"].prior_std == pytest.approx(12.5)
+    assert problem.table.controller.robust_to == ["hanging"]
+
+
+def test_wrong_roles_can_be_put_right(tmp_path, logs):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "a": held["theta_m"], "b": held["I"], "c": held["tau_s"]})
+    answers = {"roles": "no", "role:a": "theta_m", "role:b": "I", "role:c": "tau_s"}
+    (experiment,) = write(tmp_path, propose([path], answers, tmp_path).text).experiments()
+    for role, values in (("I", held["I"]), ("theta_m", held["theta_m"]), ("tau_s", held["tau_s"])):
+        np.testing.assert_allclose(experiment.log[role], values, atol=1e-6)
+    with pytest.raises(so.SeaoptError, match="0 columns are inputs"):
+        propose([path], answers | {"role:b": "none"}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("answer", "text"), [("-3", "not a positive number"), ("many", "not a positive number"), ("nan", "not a positive")]
+)
+def test_an_answer_that_is_none_is_refused(tmp_path, logs, answer, text):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
+    with pytest.raises(so.SeaoptError, match=text):
+        propose([path], {"N": answer}, tmp_path)
+
+
+def test_names_that_toml_or_a_terminal_would_obey_are_kept_apart(tmp_path, logs):
+    held = logs["held"]
+    strange = 'cur\x7f"\\ [A]'
+    path = tmp_path / "ö 1.csv"
+    path.write_text(
+        f't [s];"{strange.replace(chr(34), chr(34) * 2)}";tau_s [N m]\n'
+        + "\n".join(f"{a:.6f};{b:.6f};{c:.6f}" for a, b, c in zip(logs["t"], held["I"], held["tau_s"], strict=True)),
+        encoding="utf-8",
+    )
+    proposal = propose([path], {}, tmp_path)
+    assert "\x7f" not in proposal.text
+    (experiment,) = write(tmp_path, proposal.text).experiments()
+    np.testing.assert_allclose(experiment.log["I"], held["I"], atol=1e-5)
+
+
+def test_an_uneven_clock_is_resampled(tmp_path, logs):
+    held, rng = logs["held"], np.random.default_rng(3)
+    t = logs["t"] + rng.uniform(0.0, 0.3 / RATE, logs["t"].size)
+    path = write_csv(tmp_path / "a.csv", {"t [s]": t, "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
+    problem = write(tmp_path, propose([path], {}, tmp_path).text)
+    assert problem.table.experiment[0].resample.rate_hz == pytest.approx(RATE, rel=0.01)
+    problem.experiments()
+
+
+def test_a_log_elsewhere_is_refused_with_the_command(tmp_path, logs):
+    (tmp_path / "in").mkdir()
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
+    with pytest.raises(so.SeaoptError, match=r"seaopt new .*a.csv -o .*problem.toml"):
+        propose([path], {}, tmp_path / "in")
+
+
+@pytest.mark.parametrize("text", ["note\na\nb\n", "t [s],I [A]\n0,1\n1,1\n2,1\n"])
+def test_a_log_in_which_nothing_moves_is_refused(tmp_path, text):
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match=r"no column"):
+        propose([path], {}, tmp_path)
