@@ -29,12 +29,13 @@ from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.problem import Problem, read_problem
+from seaopt.problem import Problem, Stages, read_problem
 from seaopt.problem.stages import can_design, certify_problem, fit_problem, score_problem, tune_problem
 from seaopt.reporting import verdict, write_frontier_figure, write_report
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
+from seaopt.testing.expectations import list_expectations
 
 SCHEMAS = {
     "fit": "seaopt/fit/2",
@@ -418,10 +419,23 @@ class Session:
 
     def met(self, stages: list[str]) -> bool:
         """Tell whether everything that these stages require is met."""
-        shown = ["fit", "tune", "certify"] if "report" in stages else stages
-        return all(good for stage in shown for good, _ in self._verdict(stage))
+        return all(good for stage in self._judged(stages) for good, _ in self._verdict(stage))
+
+    def _judged(self, stages: list[str]) -> list[str]:
+        """Return what has a verdict: of a whole run also what the problem file expects."""
+        return ["fit", "tune", "certify", *(["expect"] if len(stages) > 1 else [])] if "report" in stages else stages
+
+    def _expected(self) -> list[tuple[bool, str]]:
+        """Return what came of each expectation of the problem file in a whole run."""
+        results = Stages(
+            self.problem, fit=self.results.get("fit"), scores=self.results.get("scores", []),
+            controller=self.results.get("tune"), certificate=self.results.get("certify"),
+        )  # fmt: skip
+        return [expectation.check(results) for expectation in list_expectations(self.problem)]
 
     def _verdict(self, stage: str) -> list[tuple[bool, str]]:
+        if stage == "expect":
+            return self._expected()
         result = self.results.get(stage)
         if stage == "frf":
             return result.verdict() if result is not None else []
@@ -440,6 +454,8 @@ class Session:
         """Print the results of the stages on stdout."""
         if as_json:
             contents = {stage: self._json(stage) for stage in stages if stage != "report" or len(stages) == 1}
+            if "expect" in self._judged(stages) and self.problem.table.expect is not None:
+                contents["expect"] = {"outcomes": [{"met": met, "text": text} for met, text in self._expected()]}
             only = next(iter(contents.values())) if len(contents) == 1 else contents
             sys.stdout.write(to_json(only))
             return
@@ -460,7 +476,7 @@ class Session:
                     console.print(repr(score), highlight=False, markup=False)
                 for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
                     console.print(f"  note: {remark}", highlight=False, markup=False)
-        for stage in ["fit", "tune", "certify"] if "report" in stages else stages:
+        for stage in self._judged(stages):
             for good, text in self._verdict(stage):
                 console.print("[green]met    [/]" if good else "[red]not met[/]", end="  ")
                 console.print(text, highlight=False, markup=False)

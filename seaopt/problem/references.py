@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from seaopt.control.loops.sampled_plant import DELAY
-from seaopt.errors import ProblemError, SeaoptError, suggestion
+from seaopt.errors import ProblemError, SeaoptError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.columns import check_inside
-from seaopt.problem.schema import ExperimentTable, ProblemTable, SensorsTable
+from seaopt.problem.schema import ExpectTable, ExperimentTable, ProblemTable, RangeTable, SensorsTable
 from seaopt.robustness import check_ranges, place_value
 from seaopt.robustness.uncertainty.draws import find_modes
-from seaopt.units import unit_after
+from seaopt.units import factor, unit_after
 
 MAX_LINK_DELAY_SAMPLES = 20
 
@@ -45,6 +45,48 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
             raise ProblemError(f'experiment.name = "{experiment.name}" is used twice; rename one')
         seen.add(experiment.name)
         _check_experiment(experiment, plants[experiment.plant])
+    if table.expect is not None:
+        _check_expected(table, table.expect, plants, parameters)
+
+
+def _check_expected(
+    table: ProblemTable, expect: ExpectTable, plants: Mapping[str, Plant], parameters: ParameterSet
+) -> None:
+    """Refuse expectations of what this file's results do not have."""
+    experiments = {experiment.name: experiment for experiment in table.experiment}
+    of_fit = [name for name in ("parameters", "fit_percent") if getattr(expect, name)]
+    of_design = [name for name in ("controller", "certificate") if getattr(expect, name) is not None]
+    for asked, needed, there in (
+        (of_fit, "[[experiment]]", table.experiment),
+        (of_design, "[controller]", table.controller),
+    ):
+        if asked and not there:
+            raise ProblemError(f"expect.{asked[0]} is there, and no {needed} is; add one, or leave it out")
+    derived = {name: unit for plant in plants.values() for name, (_, unit) in plant.derived_values().items()}
+    units = {name: parameter.unit for name, parameter in parameters.items()} | derived
+    certified = expect.certificate.plants if expect.certificate is not None else {}
+    for place, names, known in (
+        ("expect.parameters", expect.parameters, units),
+        ("expect.fit_percent", expect.fit_percent, experiments),
+        ("expect.certificate.plants", certified, plants),
+    ):
+        _check_names(place, names, known)
+    for name, limits in expect.parameters.items():
+        if isinstance(limits, RangeTable) and limits.unit is not None:
+            try:
+                factor(limits.unit, units[name])
+            except UnitError as error:
+                raise UnitError(f"expect.parameters.{name}: {error}") from error
+    for name, limits in expect.fit_percent.items():
+        one = experiments[name]
+        known = {**plants[one.plant].outputs, **one.differences}
+        _check_names(f"expect.fit_percent.{name}", limits if isinstance(limits, dict) else (), known)
+
+
+def _check_names(place: str, names: Iterable[str], known: Iterable[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ProblemError(f'{place} names "{name}"; {suggestion(name, known)}')
 
 
 def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:

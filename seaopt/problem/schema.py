@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, StringConstraints, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Strict,
+    StringConstraints,
+    Tag,
+    model_validator,
+)
 
 from seaopt.control.laws.limits import BY_NAME
 from seaopt.documents import Flag, Number, Whole
@@ -436,6 +446,85 @@ class RobustnessTable(_Strict):
         return self
 
 
+def _check_ends(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError("should be [low, high]")
+    return ends
+
+
+Range = Annotated[tuple[Number, Number], AfterValidator(_check_ends)]
+Bound = Range | Number  # a number is the end on the bad side of the figure: an Ms at most, a margin at least
+
+
+class RangeTable(_Strict):
+    """The ends of a range, either of which may be left out, in a unit of one's own."""
+
+    min: Number | None = Field(None, description="The low end.")
+    max: Number | None = Field(None, description="The high end.")
+    unit: str | None = Field(None, description="Of both; that of the figure where it is left out.")
+
+    @model_validator(mode="after")
+    def _check_range(self) -> RangeTable:
+        if self.min is None and self.max is None:
+            raise ValueError("give min, max, or both")
+        if self.min is not None and self.max is not None:
+            _check_ends((self.min, self.max))
+        return self
+
+
+class FiguresTable(_Strict):
+    """Figures of a loop: a number is the limit on the bad side, [low, high] a range."""
+
+    bandwidth_hz: Bound | None = Field(None, description="At least, where a number.")
+    tracking_band_hz: Range | None = Field(None, description="The loop follows its reference from here to here.")
+    crossover_hz: Bound | None = Field(None, description="At least, where a number.")
+    sensitivity_bandwidth_hz: Bound | None = Field(None, description="At least, where a number.")
+    ms: Bound | None = Field(None, description="Peak of the sensitivity; at most, where a number.")
+    mt: Bound | None = Field(None, description="Peak of the complementary sensitivity; at most, where a number.")
+    reference_peak: Bound | None = Field(None, description="At most, where a number.")
+    droop_db: Bound | None = Field(None, description="At most, where a number.")
+    gain_margin_db: Bound | None = Field(None, description="At least, where a number.")
+    phase_margin_deg: Bound | None = Field(None, description="At least, where a number.")
+    delay_margin_s: Bound | None = Field(None, description="At least, where a number.")
+    disk_margin: Bound | None = Field(None, description="At least, where a number.")
+    noise_gain: Bound | None = Field(None, description="At most, where a number.")
+
+
+class ExpectedControllerTable(FiguresTable):
+    """What the tuned controller is to be on its design plant."""
+
+    feasible: Flag = Field(True, description="Every limit of [controller] is met.")
+
+
+class ExpectedPlantTable(FiguresTable):
+    """What a certified plant's loop is to be, at the nominal parameters and at the worst case; sliding and stuck."""
+
+    worst_ms: Bound | None = Field(None, description="Ms at the worst case found; at most, where a number.")
+    worst_mt: Bound | None = Field(None, description="Mt at the worst case found; at most, where a number.")
+
+
+class ExpectedCertificateTable(_Strict):
+    """What the certificate is to say."""
+
+    passed: Flag = Field(True, description="Every requirement is met.")
+    failure_probability: Number | None = Field(None, description="Its bound; at most.")
+    plants: dict[Name, ExpectedPlantTable] = Field({}, description="Figures of a certified plant's loop, by its name.")
+
+
+class ExpectTable(_Strict):
+    """What `seaopt run` and the pytest plugin check of the results."""
+
+    fit_met: Flag = Field(True, description="The fit is met; where there are experiments.")
+    parameters: dict[str, Range | RangeTable] = Field(
+        {}, description="Ranges of fitted parameters, and of figures that follow from them, in their own units."
+    )
+    fit_percent: dict[Name, Bound | dict[str, Bound]] = Field(
+        {}, description="Of an experiment, fitted or not, or of its outputs; at least, where a number."
+    )
+    controller: ExpectedControllerTable | None = Field(None, description="The tuned controller, on its design plant.")
+    certificate: ExpectedCertificateTable | None = Field(None, description="The certificate.")
+
+
 class ProblemTable(_Strict):
     """A problem file."""
 
@@ -449,6 +538,7 @@ class ProblemTable(_Strict):
     fit: FitTable = FitTable()
     controller: ControllerTable | None = None
     robustness: RobustnessTable | None = None
+    expect: ExpectTable | None = Field(None, description="What `seaopt run` and pytest check of the results.")
 
 
 def json_schema() -> dict[str, Any]:

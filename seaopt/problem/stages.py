@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from seaopt.control import Controller, tune
 from seaopt.control.laws.delay import settle_delay
-from seaopt.errors import ProblemError
+from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.parameters import ParameterSet
 from seaopt.problem.problem import Problem
@@ -38,12 +38,6 @@ def fit_problem(
     ------
     ProblemError
         There is nothing to fit.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> fit_problem(so.read_problem(so.demo_path())).met
-    True
 
     """
     if not problem.table.experiment:
@@ -127,50 +121,73 @@ def certify_problem(
 
 
 class Stages:
-    """A problem's results, each made when it is first asked for.
+    """A problem's results, each made once, when it is first asked for; an error that making one raised is kept too.
 
     Parameters
     ----------
     problem : Problem
         What `read_problem` returned.
+    **made
+        Results that are there already, by name: fit, scores, controller, certificate.
 
     Examples
     --------
     >>> import seaopt as so
     >>> stages = Stages(so.read_problem(so.demo_path()))
-    >>> stages.problem.title
+    >>> stages.problem.title  # stages.fit, stages.controller and stages.certificate take their time
     'THOR linear SEA'
 
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, **made: Any) -> None:
         self.problem = problem
+        self._made = made
 
-    @cached_property
-    def _experiments(self) -> tuple[Experiment, ...]:
-        return self.problem.experiments()
-
-    @cached_property
+    @property
     def fit(self) -> Fit | None:
         """The fit; None of a problem without experiments."""
-        return fit_problem(self.problem, self._experiments) if self.problem.table.experiment else None
+        return self._keep(
+            "fit", lambda: fit_problem(self.problem, self._experiments) if self.problem.table.experiment else None
+        )
 
-    @cached_property
+    @property
     def scores(self) -> list[ModelledOutputs]:
         """The predictions of what was not fitted."""
-        return [] if self.fit is None else score_problem(self.problem, self.fit, self._experiments)
+        fit = self.fit
+        return self._keep("scores", lambda: [] if fit is None else score_problem(self.problem, fit, self._experiments))
 
-    @cached_property
+    @property
     def controller(self) -> Controller | None:
         """The controller; None where the problem asks for none, or the fit allows none."""
+        return self._keep("controller", self._tune)
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """The certificate of the controller; None where there is none."""
+        return self._keep("certificate", self._certify)
+
+    @property
+    def _experiments(self) -> tuple[Experiment, ...]:
+        return self._keep("experiments", self.problem.experiments)
+
+    def _tune(self) -> Controller | None:
         if self.problem.spec is None or (self.fit is not None and not can_design(self.problem, self.fit)):
             return None
         tuned = tune_problem(self.problem, self.fit or self.problem.parameters)
         return tuned.controller if isinstance(tuned, JointTuning) else tuned
 
-    @cached_property
-    def certificate(self) -> Certificate | None:
-        """The certificate of the controller; None where there is none."""
+    def _certify(self) -> Certificate | None:
         if self.controller is None:
             return None
         return certify_problem(self.problem, self.controller, self.fit or self.problem.parameters)
+
+    def _keep(self, name: str, make: Callable[[], Any]) -> Any:
+        if name not in self._made:
+            try:
+                self._made[name] = make()
+            except SeaoptError as error:
+                self._made[name] = error
+        result = self._made[name]
+        if isinstance(result, SeaoptError):
+            raise result
+        return result
