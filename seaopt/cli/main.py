@@ -237,10 +237,29 @@ def _make_command(name: str, text: str) -> Callable[..., None]:
 
 for _stage_name, _help in (
     ("fit", "Fit the parameters to the logs; write fit.json."),
-    ("certify", "Certify the controller in DIR; write robustness.json."),
     ("report", "Write report.html and figures from the results in DIR."),
 ):
     app.command(_stage_name)(_make_command(_stage_name, _help))
+
+
+@app.command()
+def certify(
+    problem: ProblemFile,
+    output: Folder = Path("out"),
+    controller: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A law of your own instead (JSON or TOML); it becomes controller.json."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Certify the controller in DIR; write robustness.json."""
+    from seaopt.cli.session import Session
+
+    session = Session(problem, output)
+    if controller is not None:
+        session.take_law(controller)
+    session.run("certify")
+    _finish(session, json, ["certify"])
 
 
 @app.command()

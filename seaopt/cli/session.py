@@ -21,8 +21,9 @@ from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
 from seaopt.cli.terminal import Terminal
-from seaopt.control import Controller, ControllerSpec, sweep
+from seaopt.control import Controller, ControllerSpec, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
+from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, warn_unidentified
 from seaopt.files import check_folder, read_json, to_json, write_json
@@ -30,7 +31,14 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
-from seaopt.problem.stages import can_design, certify_problem, fit_problem, score_problem, tune_problem
+from seaopt.problem.stages import (
+    assess_problem,
+    can_design,
+    certify_problem,
+    fit_problem,
+    score_problem,
+    tune_problem,
+)
 from seaopt.reporting import verdict, write_frontier_figure, write_report
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
@@ -54,6 +62,8 @@ LABELS = {
     "report": "writing the report",
 }
 REPORT_S = 30.0  # between lines of progress that go to a file
+# Of a specification: what a law of the user's own says itself, and nothing asks for.
+OF_THE_LAW = ("structure", "notch", "reference_weights", "sample_rate_hz", "delay_samples")
 UNMET = "on a fit that is not met"
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
@@ -216,10 +226,24 @@ class Session:
             self.results["tune"] = controller
         return self.results["tune"]
 
+    def take_law(self, path: Path) -> None:
+        """Take a law of the user's own in place of a tuned one, and write it as the folder's controller.
+
+        A controller that was tuned there is kept: the law then needs another folder.
+        """
+        given = read_law(path)
+        controller = assess_problem(self.problem, given, self.parameters())
+        target = self.folder / FILES["tune"]
+        if target.exists() and read_json(target, SCHEMAS["tune"]).get("structure") != CUSTOM:
+            raise ProblemError(f"{target}: is a controller that was tuned; give the law another folder: -o DIR")
+        self.results["tune"] = controller
+        self._write("tune", controller.to_dict())
+
     def _check_spec(self, stored: ControllerSpec) -> None:
         asked, path = self._spec().to_dict(), self.folder / FILES["tune"]
+        given = OF_THE_LAW if stored.structure == CUSTOM else ()
         for name, value in stored.to_dict().items():
-            if value != asked[name]:
+            if name not in given and value != asked[name]:
                 raise ProblemError(
                     f"{path}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
                     f"{asked[name]}; correct one of them, or run seaopt tune {self.problem.source} again"

@@ -3,7 +3,9 @@
 from seaopt.control.deploy.export import export
 from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.law_file import GivenLaw, read_law
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
+from seaopt.control.laws.pid_forms import drive_pid, ideal_pid, parallel_pid
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
@@ -22,15 +24,17 @@ from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.running.closed_loop import run_loop
 from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.running.sampled_loop import SampledLoop
+from seaopt.control.tuning.assessment import assess
 from seaopt.control.tuning.corners import corners, draw
 from seaopt.control.tuning.frontier import Frontier, sweep
 from seaopt.control.tuning.tuner import tune
 
 __all__ = [
     "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "GateState", "Law", "LawState",
-    "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch", "Passivity",
-    "PlausibilityGate", "RunnableLaw", "SampledLoop", "TransferFunction", "close_loop", "command_of", "corners",
-    "draw", "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "margins", "nu_gap", "passivity",
-    "passivity_rows", "realise", "run_loop", "runnable", "sample", "sweep", "tune",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "GateState", "GivenLaw", "Law",
+    "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch",
+    "Passivity", "PlausibilityGate", "RunnableLaw", "SampledLoop", "TransferFunction", "assess", "close_loop",
+    "command_of", "corners", "draw", "drive_pid", "estimate_noise", "estimator", "export", "export_mpc",
+    "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid", "passivity", "passivity_rows", "read_law",
+    "realise", "run_loop", "runnable", "sample", "sweep", "tune",
 ]  # fmt: skip

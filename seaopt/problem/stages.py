@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from seaopt.control import Controller, tune
+from seaopt.control import Controller, GivenLaw, assess, command_of, tune
 from seaopt.control.laws.delay import settle_delay
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
@@ -89,6 +90,37 @@ def tune_problem(
         design, source, spec, problem.certified_plants(), ranges=problem.ranges, robust_to=robust_to, draws=draws,
         others=problem.parameters, samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
     )  # fmt: skip
+
+
+def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet) -> Controller:
+    """Measure a law of one's own against the problem's limits, as `seaopt certify --controller` does.
+
+    Parameters
+    ----------
+    problem : Problem
+        What `read_problem` returned.
+    given : GivenLaw
+        What `seaopt.control.read_law` returned; its rate and its delay are the loop's.
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+
+    Raises
+    ------
+    ProblemError
+        The problem has no [controller], or the law measures something else than it does.
+
+    """
+    if problem.spec is None:
+        raise ProblemError(f"{problem.source}: has no [controller], whose limits a law is measured against; add one")
+    if given.measured not in (None, problem.spec.measured):
+        raise ProblemError(
+            f"the law measures {given.measured}, and [controller] of {problem.source} {problem.spec.measured}; "
+            f'correct one of them: measured = "{given.measured}"'
+        )
+    spec = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, delay_samples=given.delay_samples)
+    design, values = problem.design_plant, problem.values(source)
+    law = given.to_effort(command_of(design, values, spec.measured).per_effort)
+    return assess(design, values, law, spec, problem.robust_to(values), draws=problem.draws(source))
 
 
 def certify_problem(

@@ -66,9 +66,9 @@ class Controller:
     Parameters
     ----------
     structure : str
-        "pd", "pid" or "pid_dob".
+        "pd", "pid", "pid_dob"; or "custom", of a law that was given (`seaopt.assess`).
     gains : mapping
-        For reading; what counts is `law`.
+        For reading; what counts is `law`. Empty of a custom law.
     sample_time_s : float
         Seconds.
     delay_samples : int
@@ -196,8 +196,8 @@ class Controller:
 
     def _noise_notes(self) -> tuple[str, ...]:
         """Say that nothing was asked of the noise, and that the derivative is for that hardly filtered."""
-        k_d, T_f, called = self.gains["k_d"], self.gains["T_f"], self.command.mechanics
-        if self.spec.level("max_noise_gain") is not None or k_d == 0.0 or T_f > UNFILTERED * self.sample_time_s:
+        called, T_f = self.command.mechanics, self.gains.get("T_f", np.inf) if self.gains.get("k_d") else np.inf
+        if self.spec.level("max_noise_gain") is not None or T_f > UNFILTERED * self.sample_time_s:
             return ()
         return (
             f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 "
@@ -408,6 +408,8 @@ class Controller:
         return f"  friction margin {format_number(loop.friction_slope)} {loop.slope_unit}{given}: {friction.describe()}"
 
     def _gain_lines(self) -> list[str]:
+        if not self.gains:
+            return [f"  a law of order {self.law.c.size}, {format_count(self.law.integrators, 'integrator')} in it"]
         law = {name: value for name, value in self.gains.items() if not name.startswith("notch_")}
         units = name_gain_units(self.command)
         lines = [
@@ -441,7 +443,7 @@ class Controller:
         ]
         explanation = [] if self.feasible else [self.explanation]
         return (
-            html_paragraph(head) + html_table(("gain", "", f"as {self.command.word}"), gains)
+            html_paragraph(head) + (html_table(("gain", "", f"as {self.command.word}"), gains) if gains else "")
             + html_table(("on the design plant", "achieved", "asked"), self._achieved_rows())
             + html_list([*explanation, *(line.strip() for line in self._force_lines())])
         )  # fmt: skip

@@ -6,8 +6,8 @@ import math
 from dataclasses import asdict, fields
 from typing import Any, Literal
 
-from seaopt.control.laws.limits import BY_NAME, FIELDS, Limit
-from seaopt.control.laws.structures import REFERENCE_WEIGHTS, STRUCTURES, Notch, ReferenceWeights, Structure
+from seaopt.control.laws.limits import BY_NAME, FIELDS, GIVEN_LAW_LIMITS, LIMITS, Limit
+from seaopt.control.laws.structures import CUSTOM, REFERENCE_WEIGHTS, STRUCTURES, Notch, ReferenceWeights, Structure
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
 
@@ -31,8 +31,9 @@ class ControllerSpec:
         Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
     bandwidth_range_hz : (low, high)
         Allowed range of bandwidth_hz; 15 to 60 if left out.
-    structure : {"pd", "pid", "pid_dob"}
-        A pid_dob has a disturbance observer whose nominal plant is the design plant.
+    structure : {"pd", "pid", "pid_dob", "custom"}
+        A pid_dob has a disturbance observer whose nominal plant is the design plant; custom is a law that is given
+        (`seaopt.assess`), which may have more than bandwidth_hz.
     notch : Notch, optional
         A notch in series; fields that are None are tuned.
     reference_weights : {"tuned", "error", "measurement"}
@@ -193,6 +194,11 @@ class ControllerSpec:
     def limit_asked(self) -> float | None:
         """The limit of the command that is asked for, in its unit; None for none."""
         return self.command_limit if self.current_limit_A is None else self.current_limit_A
+
+    @property
+    def limits(self) -> tuple[Limit, ...]:
+        """The rows that a loop is judged by."""
+        return GIVEN_LAW_LIMITS if self.structure == CUSTOM else LIMITS
 
     @property
     def sample_time_s(self) -> float:

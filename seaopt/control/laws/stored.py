@@ -11,7 +11,16 @@ from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, mod
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import AGREES, COMPARED, LAW_GAINS, DisturbanceObserver, Gains, Nominal, Notch
+from seaopt.control.laws.structures import (
+    AGREES,
+    COMPARED,
+    CUSTOM,
+    LAW_GAINS,
+    DisturbanceObserver,
+    Gains,
+    Nominal,
+    Notch,
+)
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.law import Law
@@ -230,6 +239,10 @@ def _check_gains(
     law: Law,
 ) -> None:
     """Refuse gains that do not give the law."""
+    if spec.structure == CUSTOM:
+        if gains:
+            raise _contradict("gains", f"has {', '.join(sorted(gains))}, and a custom law has none")
+        return
     needed = {*LAW_GAINS, *(NOTCH_GAINS if "notch_depth" in gains else ()), *(("T_q",) if observer is not None else ())}
     if set(gains) != needed:
         raise _contradict("gains", f"has {', '.join(sorted(gains))} where the law has {', '.join(sorted(needed))}")

@@ -66,10 +66,12 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.records import record
 
-Structure = Literal["pd", "pid", "pid_dob"]
+Structure = Literal["pd", "pid", "pid_dob", "custom"]
 ReferenceWeights = Literal["tuned", "error", "measurement"]
 REFERENCE_WEIGHTS: tuple[ReferenceWeights, ...] = ("tuned", "error", "measurement")
-STRUCTURES: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
+TUNED: tuple[Structure, ...] = ("pd", "pid", "pid_dob")
+CUSTOM: Structure = "custom"  # a law that is given, and that no gains describe
+STRUCTURES = (*TUNED, CUSTOM)
 LARGEST_INVERTED = 0.95  # zeros of larger magnitude, or of negative real part, are left in Q
 LAW_GAINS = ("k_p", "k_i", "k_d", "T_f", "k_r", "c")
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from seaopt.control.laws.limits import FIELDS, LIMITS, Limit, MeasuredLoop, Scope
+from seaopt.control.laws.limits import Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
 from seaopt.formatting import format_count, join_words
@@ -25,6 +25,11 @@ class Limits(Protocol):
     @property
     def bandwidth_hz(self) -> float:
         """The bandwidth that is asked for."""
+        ...
+
+    @property
+    def limits(self) -> Sequence[Limit]:
+        """The rows that a loop is judged by."""
         ...
 
     def allowed(self, limit: Limit) -> float | None:
@@ -112,15 +117,13 @@ class PossibleBandwidths:
         return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
 
 
-def judge(
-    spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False, limits: Sequence[Limit] = LIMITS
-) -> list[Verdict]:
+def judge(spec: Limits, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[Verdict]:
     """Judge a loop by every limit of a scope that the specification imposes.
 
     With `stuck`, only by those that also hold where the design plant is stuck by its friction.
     """
     verdicts: list[Verdict] = []
-    for limit in limits:
+    for limit in spec.limits:
         allowed = spec.allowed(limit)
         if limit.scope != scope or allowed is None or (stuck and not limit.stuck_too):
             continue
@@ -130,17 +133,15 @@ def judge(
     return verdicts
 
 
-def judge_all(
-    spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1, limits: Sequence[Limit] = LIMITS
-) -> list[Verdict]:
+def judge_all(spec: Limits, loops: Sequence[MeasuredLoop], design_states: int = 1) -> list[Verdict]:
     """Judge every plant's loop, and the design plant's, which is the first, by its own limits too.
 
     Of several `design_states` the first is the design plant sliding, the others the same plant stuck by friction.
     """
-    verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant", limits=limits)]
-    verdicts += judge(spec, loops[0], "design plant", limits=limits)
+    verdicts = [verdict for loop in loops for verdict in judge(spec, loop, "every plant")]
+    verdicts += judge(spec, loops[0], "design plant")
     stuck = loops[1:design_states]
-    return verdicts + [v for loop in stuck for v in judge(spec, loop, "design plant", stuck=True, limits=limits)]
+    return verdicts + [v for loop in stuck for v in judge(spec, loop, "design plant", stuck=True)]
 
 
 def list_broken(verdicts: Sequence[Verdict]) -> list[str]:
@@ -234,8 +235,8 @@ class DesignFigure:
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
     """Return each limit of one loop's figures; a friction margin only where there is friction, or one is asked for."""
     rows: list[DesignFigure] = []
-    for limit in FIELDS:
-        if limit.condition is None:  # a figure of the loop alone
+    for limit in spec.limits:
+        if limit.has_field and limit.condition is None:  # a figure of the loop alone
             value, allowed, unit = limit.figure(design), spec.allowed(limit), design.unit(limit)
             margin = limit.name == "min_friction_margin"
             if margin and not design.slope_unit and allowed is None:

@@ -18,19 +18,31 @@ once, so that they keep their digits down to 0 Hz.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.minimal import balance, build_chain, check_same_response, realise_rest, split
+from seaopt.control.loops.minimal import (
+    balance,
+    build_chain,
+    check_same_response,
+    realise_rest,
+    split,
+    split_integrators,
+)
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.errors import ControlError
 from seaopt.records import record
 
 if TYPE_CHECKING:
     import control
 
+SAME_RESPONSE = 1e-6  # by which taking integrators apart may change a response
+TINY = 1e-300
+EQUAL_GAINS = 1e-9  # integrals of reference and measurement that differ by less are one of the error
 NEAREST_TO_ONE = 1e-17  # abs(z - 1) at least: an integrator's response at 0 Hz is large instead of infinite
 
 
@@ -161,6 +173,95 @@ class Law:
         return {"A": self.a, "B": self.b, "C": self.c[None], "D": self.d[None]}
 
     @classmethod
+    def from_state_space(
+        cls, a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"],
+        d: Float[np.ndarray, " k"], sample_time_s: float,
+    ) -> Law:  # fmt: skip
+        """Return the balanced law of a state space in any coordinates, with what integrates set apart.
+
+        Raises
+        ------
+        ControlError
+            Shapes do not fit, or a number is not finite.
+
+        Examples
+        --------
+        >>> pi = Law.from_state_space(
+        ...     np.array([[1.0]]), np.array([[2.0, -2.0]]), np.array([0.5]), np.array([2.5, -2.5]), sample_time_s=1e-3
+        ... )
+        >>> pi.integrators, pi.b.tolist()
+        (1, [[1.0, -1.0]])
+
+        """
+        a, b, c, d = (np.asarray(part, dtype=float) for part in (a, b, c, d))
+        n, k = c.size, d.size
+        if a.shape != (n, n) or b.shape != (n, k) or c.shape != (n,) or d.shape != (k,) or k < 2:
+            raise ControlError(
+                f"law: A, B, C and D have the shapes {a.shape}, {b.shape}, {c.shape} and {d.shape}; give (n, n), "
+                "(n, 2), (n,) and (2,), the columns being reference and measured"
+            )
+        if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+            raise ControlError("law: A, B, C or D has a number that is not finite; correct it")
+        f = np.geomspace(1e-4, 0.49, 25) / sample_time_s
+        as_given = cls(a=a, b=b, c=c, d=d, sample_time_s=sample_time_s)
+        wanted = as_given.responses(f)
+        for chain, *rest in split_integrators(a, b, c):
+            given = build_chain(_equalise(chain), rest[0], rest[1], rest[2])
+            law = cls(**given, d=d, sample_time_s=sample_time_s).balanced()
+            if np.all(np.abs(law.responses(f) - wanted) <= SAME_RESPONSE * np.abs(wanted) + TINY):
+                return law
+        return as_given
+
+    @classmethod
+    def from_control(cls, system: Any) -> Law:
+        """Return the law of a python-control system: discrete, u = G(z) (r - y), or with the inputs r and y of its own.
+
+        Parameters
+        ----------
+        system : control.TransferFunction or control.StateSpace
+            With a sample time. Of one input it acts on the error r - y; of two, they are the reference and what is
+            measured, the second with its own sign (`to_control`).
+
+        Raises
+        ------
+        ControlError
+            It is none of these.
+
+        Examples
+        --------
+        >>> import control
+        >>> Law.from_control(control.tf([2.5, -1.5], [1.0, -1.0], 1e-3)).d.tolist()
+        [2.5, -2.5]
+
+        """
+        import control  # deferred: slow to import
+
+        if not isinstance(system, control.TransferFunction | control.StateSpace):
+            raise ControlError(
+                f"law is a {type(system).__name__}; give a python-control transfer function or state space"
+            )
+        ts = system.dt
+        if ts is None or isinstance(ts, bool) or not ts > 0.0:
+            raise ControlError(f"law has dt = {ts}; sample it first: control.sample_system(law, sample_time_s)")
+        if system.noutputs != 1 or system.ninputs not in (1, 2):
+            raise ControlError(
+                f"law has {system.ninputs} inputs and {system.noutputs} outputs; give one output, and the error or "
+                "(reference, measured) as inputs"
+            )
+        if isinstance(system, control.TransferFunction):
+            parts = [_in_delay(system.num[0][i], system.den[0][i]) for i in range(system.ninputs)]
+            first, second = parts if len(parts) == 2 else (parts[0], replace(parts[0], num=-parts[0].num))
+            return cls.from_transfer_functions(first, replace(second, num=-second.num), float(ts))
+        b, d = np.asarray(system.B), np.asarray(system.D)[0]
+        if system.ninputs == 1:
+            b, d = np.hstack([b, -b]), np.concatenate([d, -d])
+        return cls.from_state_space(system.A, b, np.asarray(system.C)[0], d, float(ts))
+
+    def scaled(self, factor: float) -> Law:
+        """Return the law with its output times a factor; the chain is read as before."""
+        return replace(self, b=self.b * factor, d=self.d * factor)
+
+    @classmethod
     def from_transfer_functions(
         cls, reference: TransferFunction, measurement: TransferFunction, sample_time_s: float
     ) -> Law:
@@ -193,6 +294,24 @@ class Law:
         ):  # fmt: skip
             check_same_response(name, tf, response, sample_time_s)
         return law
+
+
+def _equalise(chain: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
+    """Return the chain's gains with those of reference and measurement alike where only rounding sets them apart."""
+    out = chain.copy()
+    for row in out:
+        if row.size == 2 and abs(row[0] + row[1]) <= EQUAL_GAINS * abs(row[0]):
+            row[1] = -row[0]
+    return out
+
+
+def _in_delay(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " m"]) -> TransferFunction:
+    """Return a transfer function of z, descending powers, as one of q = 1/z."""
+    num, den = np.trim_zeros(np.asarray(num, dtype=float), "f"), np.trim_zeros(np.asarray(den, dtype=float), "f")
+    if num.size > den.size:
+        raise ControlError("law has a higher power of z in its numerator than in its denominator; delay it")
+    num = np.concatenate([np.zeros(den.size - num.size), num])
+    return TransferFunction(num=num / den[0], den=den / den[0])
 
 
 @lru_cache(maxsize=32)

@@ -16,11 +16,11 @@ nothing drives, show as Hankel singular values of zero and are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.linalg import block_diag, schur
+from scipy.linalg import block_diag, schur, solve_sylvester
 
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -31,6 +31,8 @@ POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coeffic
 ZERO_AT_ONE = 4 * EPS  # stricter for a numerator: a weak integral is to be kept, and one of rounding does no harm
 NEGLIGIBLE_HANKEL = 1e-13  # Hankel singular values below this share of the law's gain are rounding
 RESPONSE_TOLERANCE = 1e-6  # how well a state space must have the response of its transfer function
+MOST_INTEGRATORS = 2  # of a law given as matrices: three poles at 1 lie too far apart to tell from slow lags
+ROUNDED_POLES = 1e4  # of the rounding unit, by which matrices may be off that somebody wrote down
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
 
@@ -133,6 +135,37 @@ def check_same_response(
             f"{name}: slow poles are too close together to tell from integrators in double precision; sample more "
             "slowly, make them faster, or give the law as a state space"
         )
+
+
+def split_integrators(
+    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"]
+) -> Iterator[
+    tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]
+]:
+    r"""Yield a state space as chain and rest, with ever fewer of the poles about 1 taken for integrators, none at last.
+
+    Rounding moves an eigenvalue of multiplicity k by its k-th root, so that which poles are integrators is to be
+    checked on the response. An invariant subspace each (ordered Schur form and Sylvester's equation) takes the two
+    apart: with N = A_1 - I the first is :math:`\sum_j c_1 N^{j-1} b_1 w^j`.
+    """
+    distance = np.sort(np.abs(np.linalg.eigvals(a) - 1.0))
+    for m in range(min(c.size, MOST_INTEGRATORS), 0, -1):
+        reach = (ROUNDED_POLES * EPS) ** (1.0 / m)
+        if np.count_nonzero(distance < reach) != m:
+            continue
+        triangle, basis, first = schur(a, sort=lambda re, im, reach=reach: np.hypot(re - 1.0, im) < reach)
+        if first != m:
+            continue
+        one, rest = triangle[:m, :m], triangle[m:, m:]
+        link = np.asarray(solve_sylvester(one, -rest, -triangle[:m, m:])) if rest.size else np.zeros((m, 0))
+        into, out = basis.T @ b, c @ basis
+        drive, read = into[:m] - link @ into[m:], out[:m]
+        chain, power = np.zeros((m, b.shape[1])), np.eye(m)
+        for j in range(m):
+            chain[j] = read @ power @ drive
+            power = power @ (one - np.eye(m))
+        yield chain, rest, into[m:], out[m:] + read @ link
+    yield np.zeros((0, b.shape[1])), a, b, c
 
 
 def _has_root_at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:

@@ -45,7 +45,7 @@ from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, spread_knots, tune_regulator
 from seaopt.control.mpc.quadratic_program import make_solver, solve_program
-from seaopt.control.mpc.spec import MPC_LIMITS, MPCSpec
+from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
@@ -188,7 +188,7 @@ class ForceMPC:
     @memo
     def verdicts(self) -> tuple[Verdict, ...]:
         """Every limit of the specification against these loops."""
-        return tuple(judge_all(self.spec, self.measured_loops, len(self.measured_loops), MPC_LIMITS))
+        return tuple(judge_all(self.spec, self.measured_loops, len(self.measured_loops)))
 
     @property
     @memo

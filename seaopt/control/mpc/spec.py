@@ -139,6 +139,11 @@ class MPCSpec:
         """Whole samples of delay that a loop is closed with: as given, or 1."""
         return 1 if self.delay_samples is None else self.delay_samples
 
+    @property
+    def limits(self) -> tuple[Limit, ...]:
+        """The rows that its loop is judged by."""
+        return MPC_LIMITS
+
     def allowed(self, limit: Limit) -> float | None:
         """Return the value that one of `MPC_LIMITS` allows; None where it is not imposed."""
         return limit.allow(getattr(self, limit.name) if limit.has_field else None, self.bandwidth_hz)

@@ -403,16 +403,20 @@ class Task:
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
         """Return the loop of every plant as limits are judged on it, the design plant's first."""
-        port, spec, band, law = None, self.spec, self.spec.passive_band_hz, self.law_of(x).balanced()
+        return self.measure_law(
+            self.law_of(x).balanced(),
+            filter_samples=float(x[T_F] / self.spec.sample_time_s) if x[K_D] > 0.0 else np.inf,
+            integral_rad_s=float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf,
+        )
+
+    def measure_law(self, law: Law, *, filter_samples: float, integral_rad_s: float) -> list[MeasuredLoop]:
+        """Return the same of any law, whose filter and integral are known."""
+        port, spec, band = None, self.spec, self.spec.passive_band_hz
         if self.port is not None and band is not None:
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
-        filter_samples = float(x[T_F] / spec.sample_time_s) if x[K_D] > 0.0 else np.inf
-        integral_rad_s = float(x[K_I] / (1.0 + x[K_P])) if self.integrates(x) else np.inf
         slopes: dict[int, float] = {}
         if self.asks_margin:
-            slopes = {
-                one.plant: margin.least_slope for one, margin in zip(self.frictions, self.find_margins(x), strict=True)
-            }
+            slopes = {one.plant: friction_margin(replace(one.loop, law=law)).least_slope for one in self.frictions}
         return [
             MeasuredLoop(
                 name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,

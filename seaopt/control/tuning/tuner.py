@@ -24,7 +24,7 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.laws.structures import Nominal
+from seaopt.control.laws.structures import CUSTOM, DisturbanceObserver, Nominal
 from seaopt.control.laws.verdict import (
     PossibleBandwidths,
     explain_broken,
@@ -34,7 +34,7 @@ from seaopt.control.laws.verdict import (
     list_broken_limits,
 )
 from seaopt.control.loops.friction_loop import make_friction_loops
-from seaopt.control.loops.law import make_static_law
+from seaopt.control.loops.law import Law, make_static_law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
@@ -115,6 +115,8 @@ def tune(
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     require_plant(plant, "plant", ControlError)
+    if spec.structure == CUSTOM:
+        raise ControlError('structure = "custom" is of a law that is given, which nothing tunes; use seaopt.assess')
     spec = settle_delay(spec, plant, params)
     params = params.parameters if isinstance(params, Fit) else params
     values = plant.complete(params)
@@ -270,15 +272,28 @@ def make_controller(
     possible: PossibleBandwidths | None = None,
 ) -> Controller:
     """Return the controller of tuned numbers."""
-    spec, gains = task.spec, task.gains(x)
+    gains = task.gains(x)
+    return describe_law(
+        task, task.law_of(x).balanced(), loops, design, gains=gains.by_name(), observer=gains.observer,
+        possible=possible,
+    )  # fmt: skip
+
+
+def describe_law(
+    task: Task, law: Law, loops: Sequence[MeasuredLoop], design: tuple[Plant, ParameterSet], *,
+    gains: Mapping[str, float], observer: DisturbanceObserver | None = None,
+    possible: PossibleBandwidths | None = None,
+) -> Controller:  # fmt: skip
+    """Return the controller of a law whose loops are measured."""
+    spec = task.spec
     verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
     controller = Controller(
         structure=spec.structure,
-        gains=gains.by_name(),
+        gains=gains,
         sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
-        law=task.law_of(x).balanced(),
+        law=law,
         command=command_of(*design, spec.measured),
         spec=spec,
         achieved=loops[0].figures,
@@ -286,8 +301,8 @@ def make_controller(
         active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
         design=design,
-        observer=gains.observer,
-        blocked_by=tuple(explain_broken(spec, verdicts, loops[0], task.loop(x))),
+        observer=observer,
+        blocked_by=tuple(explain_broken(spec, verdicts, loops[0], Loop(plant=task.plants[0], law=law))),
         possible=None if not broken else possible,
     )
     return replace(controller, friction=find_friction_margin(controller, *design))

@@ -1,0 +1,245 @@
+"""A law of somebody else's, as JSON or TOML: controller.json's keys, or the gains of a PID."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from seaopt.control.laws.pid_forms import Integral, ideal_pid, parallel_pid
+from seaopt.control.laws.stored import Finite, StoredTransferFunction
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.documents import Whole, check_table
+from seaopt.errors import ControlError, FileError
+from seaopt.files import check_regular
+from seaopt.records import record
+
+Positive = Annotated[Finite, Field(gt=0.0)]
+AGREES = 1e-6  # share by which a law and its transfer functions may differ in one file
+PID_TIMES = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
+
+
+@record(eq=False)
+class GivenLaw:
+    """A law as a file gives it.
+
+    Parameters
+    ----------
+    law : Law
+        From reference and measured to effort; or to the command, where `to_command`.
+    delay_samples : int
+        Whole samples from measurement to output, besides the hold.
+    measured : str or None
+        What it measures; None where the file does not say.
+    to_command : bool
+        Whether it gives the command (A, V, duty) itself.
+    per_effort : float or None
+        The command that it makes of one unit of effort; None where the file does not say.
+
+    """
+
+    law: Law
+    delay_samples: int
+    measured: str | None = None
+    to_command: bool = False
+    per_effort: float | None = None
+
+    def to_effort(self, per_effort: float) -> Law:
+        """Return the law to an effort of which one unit takes the command `per_effort`: the same commands."""
+        made = 1.0 if self.to_command else self.per_effort
+        return self.law if made is None else self.law.scaled(made / per_effort)
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _StateSpace(_Strict):
+    A: list[list[Finite]]
+    B: list[list[Finite]]
+    C: list[list[Finite]]
+    D: list[list[Finite]]
+
+
+class _Pid(_Strict):
+    """The gains of a PID, with the names of its form."""
+
+    form: Literal["parallel", "ideal"] = "parallel"
+    k_p: Finite | None = None
+    k_i: Finite | None = None
+    k_d: Finite | None = None
+    T_f: Finite | None = None
+    K: Finite | None = None
+    T_i: Positive | None = None
+    T_d: Finite | None = None
+    N: Positive | None = None
+    b: Finite = 1.0
+    c: Finite = 1.0
+    feedforward: Finite = 0.0
+    integral: Integral = "trapezoid"
+
+    @model_validator(mode="after")
+    def _check_names(self) -> _Pid:
+        for form, names in PID_TIMES.items():
+            wrong = [name for name in names if form != self.form and getattr(self, name) is not None]
+            if wrong:
+                raise ValueError(
+                    f"should have {', '.join(PID_TIMES[self.form])} in the {self.form} form, not {wrong[0]}"
+                )
+        if getattr(self, PID_TIMES[self.form][0]) is None:
+            raise ValueError(f"should have {PID_TIMES[self.form][0]} in the {self.form} form")
+        return self
+
+    def build(self, sample_time_s: float) -> Law:
+        names = PID_TIMES[self.form]
+        gains = {name: value for name in names if (value := getattr(self, name)) is not None}
+        make: Any = parallel_pid if self.form == "parallel" else ideal_pid
+        return make(
+            **gains, sample_time_s=sample_time_s, b=self.b, c=self.c, feedforward=self.feedforward,
+            integral=self.integral,
+        )  # fmt: skip
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    per_effort: Positive | None = None
+
+
+class LawFile(_Strict):
+    """A law's file; of a controller.json what describes its tuning may stand in it, and is not read."""
+
+    sample_time_s: Positive | None = None
+    sample_rate_hz: Positive | None = None
+    delay_samples: Annotated[Whole, Field(ge=0)]
+    output: Literal["effort", "command"] = "effort"
+    measured: list[str] | str | None = None
+    law: _StateSpace | None = None
+    reference: StoredTransferFunction | None = None
+    measurement: StoredTransferFunction | None = None
+    pid: _Pid | None = None
+    command: _Command = _Command()
+    # Of a controller.json; none of them is the law.
+    schema_: Any = Field(default=None, alias="schema")
+    title: Any = None
+    structure: Any = None
+    gains: Any = None
+    spec: Any = None
+    achieved: Any = None
+    feasible: Any = None
+    active_constraints: Any = None
+    engineering: Any = None
+    observer: Any = None
+    heat: Any = None
+    blocked_by: Any = None
+    largest_bandwidth_hz: Any = None
+    possible: Any = None
+    notes: Any = None
+    provenance: Any = None
+    fit_met: Any = None
+    made_from: Any = None
+
+    @model_validator(mode="after")
+    def _check_law(self) -> LawFile:
+        if (self.sample_time_s is None) == (self.sample_rate_hz is None):
+            raise ValueError("should have one of sample_time_s and sample_rate_hz")
+        if (self.reference is None) != (self.measurement is None):
+            raise ValueError("should have both of reference and measurement, each with num and den")
+        if (self.pid is not None) == (self.law is not None or self.reference is not None):
+            raise ValueError("should have law (A, B, C, D), or reference and measurement (num, den), or pid (gains)")
+        if isinstance(self.measured, list) and len(self.measured) != 1:
+            raise ValueError("should name one measured signal")
+        return self
+
+    def build(self, source: str) -> GivenLaw:
+        """Return the law."""
+        ts = self.sample_time_s or 1.0 / (self.sample_rate_hz or 1.0)
+        measured = self.measured[0] if isinstance(self.measured, list) else self.measured
+        try:
+            law = self._build_law(source, ts)
+        except ControlError as error:
+            raise FileError(f"{source}: {error}") from error
+        return GivenLaw(
+            law=law, delay_samples=self.delay_samples, measured=measured, to_command=self.output == "command",
+            per_effort=self.command.per_effort,
+        )  # fmt: skip
+
+    def _build_law(self, source: str, ts: float) -> Law:
+        if self.pid is not None:
+            return self.pid.build(ts)
+        fractions = None
+        if self.reference is not None and self.measurement is not None:
+            fractions = [_normalise(source, name, getattr(self, name)) for name in ("reference", "measurement")]
+        if self.law is None:
+            assert fractions is not None
+            return Law.from_transfer_functions(*fractions, ts)
+        a, b, c, d = (
+            _make_matrix(source, name, getattr(self.law, name), len(self.law.A)) for name in ("A", "B", "C", "D")
+        )
+        law = Law.from_state_space(a, b, c[0], d[0], ts)
+        f = np.geomspace(1e-4, 0.49, 60) / ts
+        for name, fraction, response in zip(
+            ("reference", "measurement"), fractions or (), (law.reference_response(f), law.measurement_response(f)),
+            strict=False,
+        ):  # fmt: skip
+            if np.any(np.abs(fraction.response(f, ts) - response) > AGREES * np.max(np.abs(response))):
+                raise FileError(f"{source}: {name} is not what law gives; leave one of them out")
+        return law
+
+
+def read_law(path: Path | str) -> GivenLaw:
+    r"""Read a law from a JSON or TOML file.
+
+    Parameters
+    ----------
+    path : path
+        A file with sample_time_s or sample_rate_hz, delay_samples, and one of ``law`` (A, B, C, D from reference and
+        measured to effort), ``reference`` and ``measurement`` (num and den in ascending powers of 1/z: effort =
+        reference F_ref - measurement F), and ``pid`` (gains of `parallel_pid` or `ideal_pid`, by ``form``). With
+        ``output = "command"`` the law gives the command itself (A, V, a duty).
+
+    Raises
+    ------
+    FileError
+        It cannot be read, or does not say what the law is.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "law.toml"
+    >>> _ = path.write_text('sample_rate_hz = 1000.0\\ndelay_samples = 1\\n[pid]\\nk_p = 2.0\\nk_i = 30.0\\n')
+    >>> read_law(path).law.integrators
+    1
+
+    """
+    source = Path(path)
+    check_regular(source)
+    try:
+        text = source.read_text(encoding="utf-8-sig")
+        content = json.loads(text) if source.suffix.lower() == ".json" else tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise FileError(f"{source}: no such file; give the law's JSON or TOML") from error
+    except OSError as error:
+        raise FileError(f"{source}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{source}: not valid {'JSON' if source.suffix == '.json' else 'TOML'} ({error})") from error
+    return check_table(LawFile, content, str(source)).build(str(source))
+
+
+def _normalise(source: str, name: str, fraction: StoredTransferFunction) -> TransferFunction:
+    num, den = np.array(fraction.num), np.array(fraction.den)
+    if den[0] == 0.0:
+        raise FileError(f"{source}: {name}.den begins with 0; give ascending powers of 1/z, the first not 0")
+    return TransferFunction(num=num / den[0], den=den / den[0])
+
+
+def _make_matrix(source: str, name: str, rows: list[list[float]], states: int) -> np.ndarray:
+    """Return a matrix of the law; refuse one whose shape does not fit."""
+    shape = {"A": (states, states), "B": (states, 2), "C": (1, states), "D": (1, 2)}[name]
+    if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
+        raise FileError(f"{source}: law.{name} is not a matrix of {shape[0]} x {shape[1]}")
+    return np.array(rows, dtype=float).reshape(shape)

@@ -1,0 +1,87 @@
+"""Measure a law that was not tuned here against a specification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from seaopt.control.laws.controller import Controller, count_filter_samples, find_integral_rate
+from seaopt.control.laws.delay import settle_delay
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.structures import CUSTOM
+from seaopt.control.loops.law import Law
+from seaopt.control.tuning.tuner import describe_law, make_task
+from seaopt.errors import ControlError, require_type
+from seaopt.estimation import Fit
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.plant import require_plant
+
+SAME_RATE = 1e-9  # share by which a law's sample rate may be off the specification's
+
+
+def assess(
+    plant: Plant,
+    params: Fit | ParameterSet,
+    law: Any,
+    spec: ControllerSpec,
+    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    *,
+    draws: Sequence[Mapping[str, float]] = (),
+) -> Controller:
+    """Measure a law of one's own against a specification; the controller that it makes is certified and exported alike.
+
+    Parameters
+    ----------
+    plant, params
+        The design plant, and its parameters, as in `tune`.
+    law : Law or a python-control system
+        From reference and measured to effort: `Law.from_state_space`, `Law.from_transfer_functions`,
+        `seaopt.control.parallel_pid`, `ideal_pid`, or what `Law.from_control` takes. A law to the command itself (A) is
+        divided by the command for one unit of effort: `law.scaled(1/command_of(plant, params, measured).per_effort)`.
+    spec : ControllerSpec
+        Limits, and the bandwidth that the law should have at least; its structure, notch and reference_weights are
+        those of no law, and its sample rate must be the law's.
+    robust_to, draws
+        As in `tune`.
+
+    Returns
+    -------
+    Controller
+        Of the structure "custom", without gains; `feasible` tells whether every limit is met.
+
+    Raises
+    ------
+    ControlError
+        As `tune`, or the law is none, or of another sample time.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> from seaopt.control import ideal_pid
+    >>> law = ideal_pid(K=2.0, T_i=0.05, T_d=0.01, N=10.0, sample_time_s=1e-3)
+    >>> spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=2.0, max_droop_db=False)
+    >>> controller = assess(so.plants.high_impedance(), so.plants.thor(), law, spec)
+    >>> controller.structure, controller.achieved.stable
+    ('custom', True)
+
+    """
+    require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
+    require_plant(plant, "plant", ControlError)
+    given = law if isinstance(law, Law) else Law.from_control(law)
+    if given.d.size != 2:
+        raise ControlError(f"law reads {given.d.size - 1} signals; give one of reference and one measured signal")
+    if abs(given.sample_time_s * spec.sample_rate_hz - 1.0) > SAME_RATE:
+        raise ControlError(
+            f"law has a sample time of {given.sample_time_s:g} s, and the specification sample_rate_hz = "
+            f"{spec.sample_rate_hz:g}; give sample_rate_hz = {1.0 / given.sample_time_s:g}, or sample the law again"
+        )
+    given = replace(given, sample_time_s=spec.sample_time_s)
+    spec = replace(settle_delay(spec, plant, params), structure=CUSTOM, notch=None, reference_weights="tuned")
+    values = params.parameters if isinstance(params, Fit) else params
+    task = make_task(plant, plant.complete(values), spec, robust_to or {}, draws)
+    loops = task.measure_law(
+        given, filter_samples=count_filter_samples(given), integral_rad_s=find_integral_rate(given)
+    )  # fmt: skip
+    return describe_law(task, given, loops, (plant, values), gains={})
