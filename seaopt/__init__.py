@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from seaopt.bench import virtual_log as virtual_log
     from seaopt.control import Controller as Controller
     from seaopt.control import ControllerSpec as ControllerSpec
+    from seaopt.control import assess as assess
     from seaopt.control import corners as corners
     from seaopt.control import export as export
     from seaopt.control import tune as tune
@@ -83,6 +84,7 @@ _HOME = {
     "Controller": "seaopt.control",
     "corners": "seaopt.control",
     "tune": "seaopt.control",
+    "assess": "seaopt.control",
     "export": "seaopt.control",
     "Certificate": "seaopt.robustness",
     "certify": "seaopt.robustness",
@@ -97,8 +99,8 @@ __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "contents", "read_log", "write_log",
     "simulate", "Sensors", "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
     "PredictionError", "Fit", "fit", "diagnose", "compare", "profile", "bootstrap", "design_experiment",
-    "ControllerSpec", "Controller", "corners", "tune", "export", "Certificate", "certify", "verify", "demo_path",
-    "read_problem", "write_report", "testing", "SeaoptError",
+    "ControllerSpec", "Controller", "corners", "tune", "assess", "export", "Certificate", "certify", "verify",
+    "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
 ]  # fmt: skip
 
 

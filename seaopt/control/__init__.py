@@ -1,11 +1,12 @@
 """Loop algebra, controller structures, the tuner, laws that run, the state estimator and predictive control."""
 
 from seaopt.control.deploy.export import export
+from seaopt.control.given.assessment import assess
+from seaopt.control.given.law_file import GivenLaw, read_law
+from seaopt.control.given.pid_forms import drive_pid, ideal_pid, parallel_pid
 from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.law_file import GivenLaw, read_law
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
-from seaopt.control.laws.pid_forms import drive_pid, ideal_pid, parallel_pid
 from seaopt.control.laws.plausibility import GateState, PlausibilityGate
 from seaopt.control.laws.realisation import LawState, RunnableLaw, realise, runnable
 from seaopt.control.laws.spec import ControllerSpec
@@ -24,7 +25,6 @@ from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.running.closed_loop import run_loop
 from seaopt.control.running.force_run import ForceRun, close_loop
 from seaopt.control.running.sampled_loop import SampledLoop
-from seaopt.control.tuning.assessment import assess
 from seaopt.control.tuning.corners import corners, draw
 from seaopt.control.tuning.frontier import Frontier, sweep
 from seaopt.control.tuning.tuner import tune

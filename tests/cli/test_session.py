@@ -309,3 +309,27 @@ def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch
     with pytest.raises(so.SeaoptError):
         session.run("fit")
     assert not capsys.readouterr().err and "write_lines" not in " ".join(thread.name for thread in enumerate_threads())
+
+
+def test_a_law_of_ones_own_is_certified_as_the_tuned_one(write, tmp_path):
+    """The tuned law given back as matrices has its certificate; a controller that was tuned is not written over."""
+    path = write(
+        'schema = 1\n[plant.stand]\nkind = "high_impedance"\n[controller]\nplant = "stand"\nmeasured = "F1"\n'
+        "bandwidth_hz = 30\nmax_sensitivity = 1.6\n[robustness]\nsamples = 20\nparameters = { b_r = [5e-5, 2e-4] }\n"
+    )
+    tuned, mine = tmp_path / "tuned", tmp_path / "mine"
+    for stage in ("tune", "certify"):
+        Session(path, tuned).run(stage)
+    session = Session(path, mine)
+    session.take_law(tuned / "controller.json")
+    session.run("certify")
+    one, other = (json.loads((folder / "robustness.json").read_text()) for folder in (tuned, mine))
+    for name in ("ms", "mt", "bandwidth_hz", "disk_margin"):
+        assert one["plants"]["stand"][name] == pytest.approx(other["plants"]["stand"][name], rel=1e-6)
+    assert one["passed"] == other["passed"]
+    assert json.loads((mine / "controller.json").read_text())["structure"] == "custom"
+    with pytest.raises(so.SeaoptError, match="give the law another folder"):
+        Session(path, tuned).take_law(tuned / "controller.json")
+    wrong = write('sample_rate_hz = 1000\ndelay_samples = 1\nmeasured = "F2"\n[pid]\nk_p = 1.0\n', "law.toml")
+    with pytest.raises(so.SeaoptError, match='measured = "F2"'):
+        Session(path, mine).take_law(wrong)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from seaopt.control.laws.pid_forms import Integral, ideal_pid, parallel_pid
+from seaopt.control.given.pid_forms import Integral, ideal_pid, parallel_pid
 from seaopt.control.laws.stored import Finite, StoredTransferFunction
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
