@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+
 import seaopt
 
 project = "seaopt"
@@ -9,7 +15,6 @@ author = "The seaopt developers"
 version = release = seaopt.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
-suppress_warnings = ["toc.empty_glob"]
 nitpicky = True
 default_role = "code"
 
@@ -35,3 +40,16 @@ html_copy_source = False
 pygments_style = "friendly"
 pygments_dark_style = "github-dark"
 templates_path = ["_templates"]
+
+
+def find_notebooks(_app: Any, page: nodes.document) -> None:
+    """Point a page's links to notebooks at the pages made of them: MyST follows docs/notebooks out of the sources."""
+    outside = str(Path(__file__).resolve().parents[1] / "notebooks")
+    for link in page.findall(pending_xref):
+        if link["reftarget"].startswith(outside):
+            link["reftarget"] = "notebooks" + link["reftarget"].removeprefix(outside)
+
+
+def setup(app: Any) -> None:
+    """Connect to Sphinx."""
+    app.connect("doctree-read", find_notebooks)

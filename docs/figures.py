@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -307,7 +310,19 @@ def tuning() -> None:
     save(figure, "tuning")
 
 
+def paper() -> None:
+    sys.path.insert(0, str(FOLDER.parents[1] / "problems"))
+    import orekhov2015
+
+    with tempfile.TemporaryDirectory() as folder:
+        orekhov2015.figure_7(so.plants.thor(), Path(folder))
+        orekhov2015.figure_9(so.plants.thor(), Path(folder))
+        for name in ("fig7.svg", "fig9.svg"):
+            shutil.copy(Path(folder) / name, FOLDER)
+
+
 if __name__ == "__main__":
+    paper()
     force_responses(so.plants.high_impedance, "high_impedance")
     force_responses(so.plants.moving_output, "moving_output")
     impulse()

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
@@ -27,6 +28,7 @@ from seaopt.plants import modes
 FIT_16 = (2166.0, 39.53, 2279.0)  # (16): F1/F_m = 2166/(s^2 + 39.53 s + 2279)
 PRINTED_PEAKS_HZ = {"unlumped": 15.76, "lumped": 6.35}
 COLOURS = {"unlumped": "#0072b2", "lumped": "#d55e00"}
+STYLES = {"unlumped": "-", "lumped": "--"}  # they coincide in Fig. 7a
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,11 +199,10 @@ def _draw(estimates: dict, curves: dict, f: np.ndarray, path: Path, title: str) 
     for axis, (name, estimate) in zip(axes, estimates.items(), strict=True):
         good = estimate.coherence > 0.3
         axis.semilogx(estimate.frequency_hz[good], 20 * np.log10(np.abs(estimate.response[good])), ".", color="#767676",
-                      markersize=2.5, label="virtual log, H1")  # fmt: skip
+                      markersize=2.5, label="virtual log, H1", rasterized=True)  # fmt: skip
         for drive, colour in COLOURS.items():
-            axis.semilogx(
-                f, 20 * np.log10(np.abs(curves[drive][name])), color=colour, linewidth=1.4, label=f"{drive} model"
-            )
+            level, style = 20 * np.log10(np.abs(curves[drive][name])), STYLES[drive]
+            axis.semilogx(f, level, style, color=colour, linewidth=1.4, label=f"{drive} model")
         axis.set_title(name, loc="left", fontsize="medium")
         axis.set_ylabel("magnitude [dB]")
         axis.set_ylim(-60, 40)
@@ -213,7 +214,8 @@ def _draw(estimates: dict, curves: dict, f: np.ndarray, path: Path, title: str) 
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path.with_suffix(".png"), dpi=130)
-    figure.savefig(path.with_suffix(".svg"))
+    with rc_context({"svg.hashsalt": "seaopt", "svg.fonttype": "none"}):
+        figure.savefig(path.with_suffix(".svg"), metadata={"Date": None}, dpi=130)
 
 
 def rows() -> list[Row]:

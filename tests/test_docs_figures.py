@@ -186,3 +186,15 @@ def test_the_steps_of_the_pid_beside_predictive_control(stand, swing, thor):
         run = close_loop(law.step, law.reset(), stand, thor, np.where(np.arange(500) < 10, 0.0, force))
         times = " | ".join(f"{1e3 * run.settling_time_s(band):.0f} ms" for band in (0.05, 0.02))
         assert f"| {force:g} N | pid | {100 * run.overshoot:.1f} % | {times} |" in unbroken("theory/mpc.md")
+
+
+@pytest.mark.slow
+def test_the_table_of_the_paper_is_what_its_script_computes(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS.parent / "problems"))
+    import orekhov2015
+
+    printed = cells(read_page("evidence/orekhov2015.md"), "what")
+    computed = orekhov2015.rows()
+    assert [row[0] for row in printed] == [row.what for row in computed]
+    for cell, row in zip(printed, computed, strict=True):
+        assert [float(cell[1]), float(cell[2])] == [row.printed, pytest.approx(row.computed, rel=1e-4)]

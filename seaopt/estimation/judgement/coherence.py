@@ -181,7 +181,7 @@ class _Spectra:
 
 
 def _make_spectra(
-    inputs: Sequence[Float[np.ndarray, "n m"]], outputs: Sequence[Float[np.ndarray, "n s"]], length: int,
+    inputs: Sequence[Float[np.ndarray, "_ m"]], outputs: Sequence[Float[np.ndarray, "_ s"]], length: int,
     experiment: FitExperiment,
 ) -> _Spectra | None:  # fmt: skip
     """Return the spectra over stretches of one length; None where there are too few of them."""
