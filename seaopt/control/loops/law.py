@@ -255,7 +255,7 @@ class Law:
         b, d = np.asarray(system.B), np.asarray(system.D)[0]
         if system.ninputs == 1:
             b, d = np.hstack([b, -b]), np.concatenate([d, -d])
-        return cls.from_state_space(system.A, b, np.asarray(system.C)[0], d, float(ts))
+        return cls.from_state_space(np.asarray(system.A), b, np.asarray(system.C)[0], d, float(ts))
 
     def scaled(self, factor: float) -> Law:
         """Return the law with its output times a factor; the chain is read as before."""

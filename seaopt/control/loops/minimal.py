@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -153,7 +154,8 @@ def split_integrators(
         reach = (ROUNDED_POLES * EPS) ** (1.0 / m)
         if np.count_nonzero(distance < reach) != m:
             continue
-        triangle, basis, first = schur(a, sort=lambda re, im, reach=reach: np.hypot(re - 1.0, im) < reach)
+        parts: tuple[Any, ...] = schur(a, sort=lambda re, im, reach=reach: np.hypot(re - 1.0, im) < reach)
+        triangle, basis, first = parts
         if first != m:
             continue
         one, rest = triangle[:m, :m], triangle[m:, m:]
