@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.addnodes import pending_xref
 
 import seaopt
@@ -32,6 +33,7 @@ autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "seaopt"
 html_static_path = ["_static"]
@@ -50,6 +52,16 @@ def find_notebooks(_app: Any, page: nodes.document) -> None:
             link["reftarget"] = "notebooks" + link["reftarget"].removeprefix(outside)
 
 
+def write_math(writer: Any, node: nodes.Element) -> None:
+    """Write a formula as MathML, which browsers draw by themselves: the site needs no script from elsewhere."""
+    block, formula = isinstance(node, nodes.math_block), node.astext()
+    if "&" in formula and "\\begin" not in formula:
+        formula = f"\\begin{{aligned}}{formula}\\end{{aligned}}"
+    writer.body.append(tex2mathml(formula, as_block=block))
+    raise nodes.SkipNode
+
+
 def setup(app: Any) -> None:
     """Connect to Sphinx."""
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
     app.connect("doctree-read", find_notebooks)
