@@ -61,6 +61,7 @@ typedef struct {
 #define BLOCK 16
 #define ALL (NJP / 4) /* vectors of a row of Z; with one alone derivatives are not made, but for what shares it with x */
 #define INLINE static inline __attribute__((always_inline)) /* so that `wide` is a constant */
+#define ONCE static __attribute__((noinline)) /* what both ways of a pass share: compiling it twice takes longer than it saves */
 
 /* All that a sample touches stands close together. */
 typedef struct {
@@ -332,7 +333,7 @@ INLINE void residual(const seaopt_pass_args *a, int o, const double *restrict y,
     own[1 + ND] += y[0];
 }
 
-static inline void filtered(const seaopt_pass_args *a, double *restrict v, double (*restrict z)[2][NCP]) {
+ONCE void filtered(const seaopt_pass_args *a, double *restrict v, double (*restrict z)[2][NCP]) {
     for (long s = 0; s < a->sections; s++) {
         const double *c = a->sos + 5 * s;
         for (int j = 0; j < NCP; j++) {
@@ -374,7 +375,7 @@ static inline double robust(const seaopt_pass_args *a, int o, double r, double *
             for (int c = 0; c < WIDE; c++) ((vec *)q->sum[o][4 * row + r])[column + c] = sum[r][c];            \
     } while (0)
 
-static void sum_waiting(hot *q, int o) {
+ONCE void sum_waiting(hot *q, int o) {
     const long count = q->waiting[o];
     for (int row = 0; row < NCP / 4; row++) {
         int column = row;
@@ -399,8 +400,8 @@ typedef double loose __attribute__((vector_size(32), may_alias, aligned(8))); /*
 
 /* The influences a = into v of a sample, and its part of the double sum over the samples before: the ring holds each
    influence twice, so that those of the last lags always stand in a row. */
-INLINE void influence(const seaopt_pass_args *a, double *const *v, const int *counts, long k, long slot, long parts) {
-    const long size = a->lags + 1;
+ONCE void influence(const seaopt_pass_args *a, double *const *v, const int *counts, long k, long slot) {
+    const long size = a->lags + 1, parts = a->parts;
     loose *const here = (loose *)a->ring + (slot + size) * NY * parts, *const again = here - size * NY * parts;
     const loose *into = (const loose *)a->into;
     for (int o = 0; o < NY; o++)
@@ -462,7 +463,7 @@ static void restore_denormals(unsigned long before) {
 
 EXPORTED long carry_size(void) { return sizeof(state) / sizeof(double) + 1; }
 
-static void begin(hot *q, const seaopt_pass_args *a) {
+ONCE void begin(hot *q, const seaopt_pass_args *a) {
     memset(q, 0, sizeof *q);
 #if LINEAR
     memcpy(q->model, a->model, sizeof q->model);
@@ -476,7 +477,7 @@ static void begin(hot *q, const seaopt_pass_args *a) {
     for (int i = 0; i < NX; i++) { q->z[i][0] = a->x0[i]; q->z[i][1 + NP + i] = 1.0; }
 }
 
-static void deliver(hot *q, const seaopt_pass_args *a) {
+ONCE void deliver(hot *q, const seaopt_pass_args *a) {
     for (int o = 0; o < NY; o++) sum_waiting(q, o);
     if (a->carry) {
         state *after = (state *)a->carry;
@@ -529,8 +530,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
             if (a->gram && present[o] && k >= a->from + a->warm) accumulate(a, q, o);
         }
         if (a->into && wide == ALL) {
-            if (a->parts == 1) influence(a, v, present, k, slot, 1);
-            else influence(a, v, present, k, slot, a->parts);
+            influence(a, v, present, k, slot);
             slot = slot < a->lags ? slot + 1 : 0;
         }
     }
