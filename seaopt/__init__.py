@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from seaopt.robustness import verify as verify
     from seaopt.simulation import simulate as simulate
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "Parameter": "seaopt.parameters",
