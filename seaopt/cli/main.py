@@ -18,8 +18,24 @@ from seaopt.formatting import printable
 INTERRUPTED = 130  # exit code, as a shell's
 
 
+ORDER = (  # of the commands in the help: as they are used
+    "demo", "new", "inspect", "run", "fit", "tune", "certify", "report", "export", "validate", "simulate", "frf",
+)  # fmt: skip
+
+
 class _Commands(TyperGroup):
-    """The commands; Ctrl-C is one line on stderr and exit code 130."""
+    """The commands, in the order of their use; Ctrl-C is one line on stderr and exit code 130."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Print the help where nothing is asked for, which is no error."""
+        if not args and not ctx.resilient_parsing:
+            typer.echo(ctx.get_help())
+            ctx.exit(0)
+        return super().parse_args(ctx, args)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        names = super().list_commands(ctx)
+        return sorted(names, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -33,14 +49,14 @@ app = typer.Typer(
     name="seaopt",
     cls=_Commands,
     help="Series elastic actuators: from raw bench logs to a certified force controller.",
-    no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
 ProblemFile = Annotated[Path, typer.Argument(metavar="PROBLEM", help="Problem file (TOML).", show_default=False)]
 Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the verdict only.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print all figures, notes and failures.")]
 
 
 def _version(wanted: bool) -> bool:
@@ -58,26 +74,32 @@ def _add_options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Series elastic actuators: from raw bench logs to a certified force controller."""
+    """Series elastic actuators: from raw bench logs to a certified force controller.
+
+    Begin with `seaopt demo`, or on a log of your own with `seaopt new LOG`.
+    """
 
 
-def _finish(session: Any, json: bool, stages: list[str]) -> None:
+def _finish(session: Any, json: bool, stages: list[str], quiet: bool = False, verbose: bool = False) -> None:
     """Print what was asked for on stdout and leave with the exit code of the verdict."""
-    session.show(json, stages)
+    session.show(json, stages, "quiet" if quiet else "verbose" if verbose else "usual")
     if not session.met(stages):
         raise typer.Exit(1)
 
 
 @app.command()
-def demo(output: Folder = Path("out/demo"), json: Json = False) -> None:
+def demo(output: Folder = Path("out/demo"), json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Run the THOR problem on virtual logs: fit, tune, certify, report."""
     from seaopt.problem import demo_path
 
-    run(demo_path(), output, json)
+    run(demo_path(), output, json, quiet, verbose)
 
 
 @app.command()
-def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
+def run(
+    problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:  # fmt: skip
     """Fit, tune, certify and report."""
     from seaopt.cli.session import Session
 
@@ -91,7 +113,7 @@ def run(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) 
         session.run(stage)
     for what in session.explain_left_out(stages):
         session.say(f"left out: {what}")
-    _finish(session, json, stages)
+    _finish(session, json, stages, quiet, verbose)
 
 
 @app.command()
@@ -189,6 +211,8 @@ def tune(
     problem: ProblemFile,
     output: Folder = Path("out"),
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     sweep: Annotated[
         str | None,
         typer.Option(
@@ -203,7 +227,7 @@ def tune(
     stage = "tune" if sweep is None else "sweep"
     session = Session(problem, output, bandwidths_hz=() if sweep is None else parse_bandwidths(sweep))
     session.run(stage)
-    _finish(session, json, [stage])
+    _finish(session, json, [stage], quiet, verbose)
 
 
 @app.command()
@@ -224,12 +248,15 @@ def validate(
 
 
 def _make_command(name: str, text: str) -> Callable[..., None]:
-    def command(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
+    def command(
+        problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
+        verbose: Verbose = False,
+    ) -> None:  # fmt: skip
         from seaopt.cli.session import Session
 
         session = Session(problem, output)
         session.run(name)
-        _finish(session, json, [name])
+        _finish(session, json, [name], quiet, verbose)
 
     command.__doc__ = text
     return command
@@ -300,7 +327,7 @@ def export(
 @app.command()
 def schema(
     document: Annotated[
-        str, typer.Argument(metavar="problem|fit|robustness", help="Whose schema.", show_default=False)
+        str, typer.Argument(metavar="problem|fit|controller|robustness", help="Whose schema.", show_default=False)
     ],
 ) -> None:
     """Print the JSON Schema of a file that seaopt reads, for editors."""

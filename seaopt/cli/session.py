@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Thread
-from typing import Any
+from threading import Event, Thread, Timer
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -20,13 +21,16 @@ from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
+from seaopt.cli.show import show_certificate, show_controller, show_fit, show_verdicts
 from seaopt.cli.terminal import Terminal
+from seaopt.cli.verdicts import Verdict, judge_certificate, judge_controller, judge_fit
 from seaopt.control import Controller, ControllerSpec, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, warn_unidentified
 from seaopt.files import check_folder, read_json, to_json, write_json
+from seaopt.formatting import printable
 from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -39,7 +43,7 @@ from seaopt.problem.stages import (
     score_problem,
     tune_problem,
 )
-from seaopt.reporting import verdict, write_frontier_figure, write_report
+from seaopt.reporting import write_frontier_figure, write_report
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
@@ -61,6 +65,22 @@ LABELS = {
     "certify": "certifying",
     "report": "writing the report",
 }
+SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
+LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
+MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
+
+
+@runtime_checkable
+class Tell(Protocol):
+    """What a stage reports while it runs: what it does, and which share of it is done, where it knows."""
+
+    def __call__(self, note: str, share: float | None = None, /) -> None:
+        """Report."""
+        ...
+
+
+Amount = Literal["quiet", "usual", "verbose"]
+DRAWN = 0.4  # of the time of a certificate, for the draws; the rest simulates
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 OF_THE_LAW = ("structure", "notch", "reference_weights", "sample_rate_hz", "delay_samples")
@@ -69,6 +89,26 @@ SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
     "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
 )
+
+
+def format_left(spent_s: float, share: float | None) -> str:
+    """Return how long a stage still takes, of the share that is done; "" where that cannot be told.
+
+    Examples
+    --------
+    >>> format_left(10.0, 0.25), format_left(300.0, 0.5), format_left(1.0, None)
+    ('30 s left', '5 min left', '')
+
+    """
+    if share is None or share < LEAST_SHARE:
+        return ""
+    left = spent_s * (1.0 - share) / share
+    return f"{left:.0f} s left" if left < 100.0 else f"{left / 60.0:.0f} min left"
+
+
+def shorten_note(text: str) -> str:
+    """Return what fits beside the bar."""
+    return text if len(text) <= MOST_NOTE else text[: MOST_NOTE - 1] + "…"
 
 
 class Session:
@@ -122,7 +162,7 @@ class Session:
 
     def run(self, stage: str) -> None:
         """Run one stage and write its result."""
-        stages: dict[str, Callable[[Callable[[str], None]], None]] = {
+        stages: dict[str, Callable[[Tell], None]] = {
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
@@ -133,38 +173,51 @@ class Session:
             raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
 
     @contextmanager
-    def _progress(self, label: str) -> Generator[Callable[[str], None]]:
-        """Show a stage's progress on a terminal; elsewhere write lines. A stage that ends in an error is not done."""
+    def _progress(self, label: str) -> Generator[Tell]:
+        """Show a stage's progress on a terminal, with the time left where its share is known; elsewhere write lines.
+
+        A stage that ends in an error is not done.
+        """
         if not self._console.is_terminal:
             with self._write_progress(label) as tell:
                 yield tell
             return
         columns = (
-            SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description:<22}"),
-            BarColumn(bar_width=12), TimeElapsedColumn(), TextColumn("{task.fields[note]}", style="dim"),
+            SpinnerColumn(), TextColumn("{task.description:<22}"), BarColumn(bar_width=12), TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"), TextColumn("{task.fields[note]}", style="dim"),
         )  # fmt: skip
-        with Progress(*columns, console=self._console) as progress:
-            task = progress.add_task(label, total=None, note="")
+        started = time.monotonic()
+        with Progress(*columns, console=self._console, transient=True) as progress:
+            task = progress.add_task(label, total=None, note="", left="", visible=False)
+
+            def show(note: str, share: float | None = None) -> None:
+                spent = time.monotonic() - started
+                total = None if share is None else 1.0
+                left = format_left(spent, share)
+                progress.update(task, total=total, completed=share, note=shorten_note(printable(note)), left=left)
+
+            timer = Timer(SHOWN_AFTER_S, lambda: progress.update(task, visible=True))
+            timer.daemon = True
+            timer.start()
             try:
-                yield lambda note: progress.update(task, note=note)
-            except BaseException:
-                progress.remove_task(task)
-                raise
-            progress.update(task, total=1, completed=1)
+                yield show
+            finally:
+                timer.cancel()
 
     @contextmanager
-    def _write_progress(self, label: str) -> Generator[Callable[[str], None]]:
+    def _write_progress(self, label: str) -> Generator[Tell]:
         """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
-        note, ended, started = "", Event(), time.monotonic()
+        note, left, ended, started = "", "", Event(), time.monotonic()
 
-        def tell(text: str) -> None:
-            nonlocal note
-            note = text
+        def tell(text: str, share: float | None = None) -> None:
+            nonlocal note, left
+            note, left = text, format_left(time.monotonic() - started, share)
 
         def write_lines() -> None:
             with suppress(OSError):  # a stderr that cannot be written is the stage's to find
                 while not ended.wait(REPORT_S):
-                    self.say(f"{label}, {time.monotonic() - started:.0f} s: {note or 'running'}")
+                    spent = f"{time.monotonic() - started:.0f} s" + (f", {left}" if left else "")
+                    self.say(f"{label}, {spent}: {note or 'running'}")
 
         writer = Thread(target=write_lines, daemon=True)
         writer.start()
@@ -285,7 +338,7 @@ class Session:
             self._note(f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one")
         return content
 
-    def _simulate(self, tell: Callable[[str], None]) -> None:
+    def _simulate(self, tell: Tell) -> None:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to simulate; add one")
         runs: dict[str, Log] = {}
@@ -316,7 +369,7 @@ class Session:
         }
         return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
 
-    def _fit(self, tell: Callable[[str], None]) -> None:
+    def _fit(self, tell: Tell) -> None:
         tell("reading logs")
         result = fit_problem(
             self.problem,
@@ -348,7 +401,7 @@ class Session:
             self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         Terminal(soft_wrap=True).print(repr(score), highlight=False, markup=False)
 
-    def _frf(self, tell: Callable[[str], None]) -> None:
+    def _frf(self, tell: Tell) -> None:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; add one")
         experiments = self.experiments()
@@ -369,7 +422,7 @@ class Session:
             self.say(f"left out: {error}")
             return None
 
-    def _tune(self, tell: Callable[[str], None]) -> None:
+    def _tune(self, tell: Tell) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         self._design_values(design, *(plant for plant, _ in robust_to.values()))
         spec = self._spec()
@@ -381,7 +434,7 @@ class Session:
         self.results["tune"] = result
         self._write("tune", result.to_dict())
 
-    def _sweep(self, tell: Callable[[str], None]) -> None:
+    def _sweep(self, tell: Tell) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
         spec = self._spec()
@@ -394,7 +447,7 @@ class Session:
         self._write("sweep", result.to_dict())
         self.written += write_frontier_figure(result, self.folder / "frontier")
 
-    def _certify(self, tell: Callable[[str], None]) -> None:
+    def _certify(self, tell: Tell) -> None:
         plants = self.problem.certified_plants()
         controller, source = self.controller(), self.parameters()
         table = self.problem.robustness
@@ -402,16 +455,16 @@ class Session:
         self._design_values(*plants.values())
 
         def count(done: int, of: int) -> None:
-            tell(f"{table.samples} draws, {100 * done // of} %" if done < of else "simulating scenarios")
+            tell(f"{table.samples} draws" if done < of else "simulating scenarios", DRAWN * done / of)
 
         result = certify_problem(self.problem, controller, source, count)
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
-        for remark in (*result.notes, *self.problem.remarks(self.values())):
+        for remark in self.problem.remarks(self.values()):
             self._note(remark)
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 
-    def _report(self, tell: Callable[[str], None]) -> None:
+    def _report(self, tell: Tell) -> None:
         results: list[Any] = []
         if self.problem.table.experiment:
             fitted = self.parameters()
@@ -431,10 +484,7 @@ class Session:
             results += [self.results["certify"]] if "certify" in self.results else []
 
         def drawing(name: str, place: int, count: int) -> None:
-            note = f"figure {place} of {count}, {name}"
-            tell(note)
-            if not self._console.is_terminal:  # where a stage is silent otherwise until it is done
-                self.say(f"{LABELS['report']}: {note}")
+            tell(f"figure {place} of {count}, {name}", (place - 1) / count)
 
         page = write_report(results, self.folder / "report.html", title=self.problem.title, progress=drawing)
         tell("done")
@@ -443,7 +493,7 @@ class Session:
 
     def met(self, stages: list[str]) -> bool:
         """Tell whether everything that these stages require is met."""
-        return all(good for stage in self._judged(stages) for good, _ in self._verdict(stage))
+        return all(verdict.met for stage in self._judged(stages) for verdict in self._verdicts(stage))
 
     def _judged(self, stages: list[str]) -> list[str]:
         """Return what has a verdict: of a whole run also what the problem file expects."""
@@ -457,25 +507,35 @@ class Session:
         )  # fmt: skip
         return [expectation.check(results) for expectation in list_expectations(self.problem)]
 
-    def _verdict(self, stage: str) -> list[tuple[bool, str]]:
+    def _verdicts(self, stage: str) -> list[Verdict]:
+        """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
         if stage == "expect":
-            return self._expected()
+            return [Verdict(met=good, text=text) for good, text in self._expected()]
         result = self.results.get(stage)
-        if stage == "frf":
-            return result.verdict() if result is not None else []
-        joint = self.results.get("joint") if stage == "tune" else None
-        tuned = [(joint.status == "certified", f"Joint tuning: {joint.summary}")] if joint is not None else []
-        lines = tuned + verdict(
-            result if stage == "fit" else None,
-            result if stage == "tune" else None,
-            result if stage == "certify" else None,
-        )
+        if stage == "frf" and result is not None:
+            return [Verdict(met=good, text=text) for good, text in result.verdict()]
+        verdicts: list[Verdict] = []
+        if stage == "fit" and result is not None:
+            return [judge_fit(result, self._spell("fit"))]
+        if stage == "tune" and result is not None:
+            joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
+            if joint is not None:
+                verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
+            verdicts.append(judge_controller(result, sweep))
+        if stage == "certify" and result is not None:
+            again = self._spell("run" if self.problem.table.experiment else "tune")
+            verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
         if stage not in ("tune", "certify", "sweep") or self.fit_met():
-            return lines
-        return [(False, f"{text} – {UNMET}") for _, text in lines] or [(False, UNMET)]
+            return verdicts
+        unmet = [replace(one, met=False, text=f"{one.text}, {UNMET}") for one in verdicts]
+        return unmet or [Verdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
 
-    def show(self, as_json: bool, stages: list[str]) -> None:
-        """Print the results of the stages on stdout."""
+    def _spell(self, command: str) -> str:
+        """Return a command on this problem as it is typed."""
+        return f"seaopt {command} {shlex.quote(self.problem.source)} -o {shlex.quote(str(self.folder))}"
+
+    def show(self, as_json: bool, stages: list[str], amount: Amount = "usual") -> None:
+        """Print the results of the stages on stdout: verdicts first, then figures, as much as is asked for."""
         if as_json:
             contents = {stage: self._json(stage) for stage in stages if stage != "report" or len(stages) == 1}
             if "expect" in self._judged(stages) and self.problem.table.expect is not None:
@@ -483,29 +543,48 @@ class Session:
             only = next(iter(contents.values())) if len(contents) == 1 else contents
             sys.stdout.write(to_json(only))
             return
-        console = Terminal(soft_wrap=True)
+        console = Terminal()
+        judged = [one for stage in self._judged(stages) for one in self._verdicts(stage)]
+        show_verdicts(console, judged, verbose=amount == "verbose")
+        if amount == "quiet":
+            return
         for stage in stages:
-            if stage == "simulate":
-                for line in SIMULATED[: 2 if any(table.virtual for table in self.problem.table.experiment) else 1]:
-                    console.print(line, highlight=False, markup=False)
-            elif stage == "frf":
-                self.results[stage].show(console)
-            elif stage == "sweep":
-                print_frontier(self.results[stage], console)
-            elif stage in ("fit", "tune", "certify"):
-                if stage == "tune" and "joint" in self.results:
-                    console.print(repr(self.results["joint"]), highlight=False, markup=False)
-                console.print(repr(self.results[stage]), highlight=False, markup=False)
-                for score in self.results.get("scores", ()) if stage == "fit" else ():
-                    console.print(repr(score), highlight=False, markup=False)
-                for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
-                    console.print(f"  note: {remark}", highlight=False, markup=False)
-        for stage in self._judged(stages):
-            for good, text in self._verdict(stage):
-                console.print("[green]met    [/]" if good else "[red]not met[/]", end="  ")
-                console.print(text, highlight=False, markup=False)
+            if amount == "verbose" and stage in ("fit", "tune", "certify"):
+                self._show_all(console, stage)
+            else:
+                self._show_figures(console, stage)
         if self.written:
-            console.print("wrote " + ", ".join(str(path) for path in self.written), highlight=False, markup=False)
+            console.wrap("wrote " + ", ".join(str(path) for path in self.written))
+
+    def _show_figures(self, console: Terminal, stage: str) -> None:
+        """Print one screen of a stage's figures."""
+        match stage:
+            case "simulate":
+                for line in SIMULATED[: 2 if any(table.virtual for table in self.problem.table.experiment) else 1]:
+                    console.wrap(line)
+            case "frf":
+                self.results[stage].show(console)
+            case "sweep":
+                print_frontier(self.results[stage], console)
+            case "fit":
+                show_fit(console, self.results[stage], self.results.get("scores", ()))
+            case "tune":
+                show_controller(console, self.results[stage])
+            case "certify":
+                show_certificate(console, self.results[stage])
+            case _:
+                pass
+
+    def _show_all(self, console: Terminal, stage: str) -> None:
+        """Print all that a result has to say."""
+        console.say("")
+        if stage == "tune" and "joint" in self.results:
+            console.say(repr(self.results["joint"]))
+        console.say(repr(self.results[stage]))
+        for score in self.results.get("scores", ()) if stage == "fit" else ():
+            console.say(repr(score))
+        for remark in self.problem.remarks(self.values()) if stage == "certify" else ():
+            console.say(f"  note: {remark}")
 
     def _json(self, stage: str) -> dict[str, Any]:
         if stage == "simulate":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -27,6 +28,13 @@ class Terminal(Console):
     def say(self, text: str, **options: Any) -> None:
         """Print a text as it is: no markup, no colours of Rich's own, lines broken at blanks."""
         self.print(text, highlight=False, markup=False, **options)
+
+    def wrap(self, text: str, *, indent: int = 0, **options: Any) -> None:
+        """Print a text with its lines broken at blanks, all of them indented; commands in it stay whole words."""
+        for line in textwrap.wrap(
+            printable(text), max(self.width - indent, 20), break_long_words=False, break_on_hyphens=False
+        ):
+            self.say(" " * indent + line, soft_wrap=True, **options)
 
     def tabulate(
         self, rows: Iterable[Sequence[str]], head: Sequence[str] = (), align: str = "", *, indent: int = 2

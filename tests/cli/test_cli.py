@@ -58,8 +58,10 @@ def test_a_simulation_that_fails_exits_1_with_its_witness(folder, seaopt, design
     assert seaopt("tune", "clipped.toml").returncode == 0
     out = seaopt("certify", "clipped.toml")
     assert out.returncode == 1, out.stderr
-    assert "NOT MET: steady_error" in out.stdout
-    assert "(stand, " in out.stdout and ", seed 1: the force ends" in out.stdout
+    words = " ".join(out.stdout.split())
+    assert words.startswith("not met Certificate: failed, ") and words.count("steady_error") == 1
+    assert ": stand, " in words and ", seed 1: the force ends" in words
+    assert "seaopt tune clipped.toml -o out" in words
 
 
 def test_retune_tunes_until_certified(folder, seaopt, design, without_drawing, without_simulation):

@@ -50,7 +50,7 @@ def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsy
     path = write(BENCH + "[robustness]\nparameters = { f_c = [0.0, 0.01] }\n")
     run(path, tmp_path / "out")
     told = " ".join(capsys.readouterr().err.split())
-    assert "writing the report: figure 1 of 3, time_lines" in told
+    assert "writing the report: done" in told
     assert f"left out: tuning and certifying: {path} has [robustness] but no [controller]; add one" in told
     for stage in ("tune", "certify"):
         with pytest.raises(so.SeaoptError, match=r"has no \[controller\]; add one to tune or certify"):
@@ -153,7 +153,7 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
     session.show(False, ["certify"])
     told = capsys.readouterr()
     remark = "note: the nominal I_p = 0.36 lies outside its range of 0.4 to 0.5"
-    assert remark in " ".join(told.err.split()) and remark in " ".join(told.out.split())
+    assert remark in " ".join(told.out.split())
     assert (folder / "controller.json").read_bytes() == held
     with pytest.raises(so.SeaoptError, match=r"robustness.json: was made from another.*run seaopt certify"):
         Session(write(text), folder).run("report")
@@ -278,7 +278,7 @@ def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):
     assert not session.met(["fit"]) and not session.met(["tune"])
     session.show(False, ["fit", "tune"])
     out = capsys.readouterr().out
-    assert out.startswith("Fit: NOT MET") and "on a fit that is not met" in out
+    assert out.startswith("not met  Fit: ") and "on a fit that is not met" in out
     controller = json.loads((tmp_path / "out" / "controller.json").read_text(encoding="utf-8"))
     assert controller["fit_met"] is False
     assert not export_controller(tmp_path / "out", tmp_path / "c", json=False)

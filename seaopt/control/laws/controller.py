@@ -444,11 +444,12 @@ class Controller:
         explanation = [] if self.feasible else [self.explanation]
         return (
             html_paragraph(head) + (html_table(("gain", "", f"as {self.command.word}"), gains) if gains else "")
-            + html_table(("on the design plant", "achieved", "asked"), self._achieved_rows())
+            + html_table(("on the design plant", "achieved", "asked"), self.list_achieved())
             + html_list([*explanation, *(line.strip() for line in self._force_lines())])
         )  # fmt: skip
 
-    def _achieved_rows(self) -> list[tuple[str, str, str]]:
+    def list_achieved(self) -> list[tuple[str, str, str]]:
+        """Return the figures of the design plant as text: what each is, what was achieved, what was asked."""
         a = self.achieved
         limited = [
             (row.limit.label, format_figure(row.value, row.unit), _format_allowed(row))

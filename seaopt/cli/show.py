@@ -1,0 +1,172 @@
+"""How results look on a terminal: the verdict with its reasons, then one screen of figures in tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from seaopt.cli.terminal import Terminal
+from seaopt.cli.verdicts import Reason, Verdict
+from seaopt.control import Controller
+from seaopt.control.laws.controller import name_gain_units
+from seaopt.estimation import Fit, ModelledOutputs
+from seaopt.formatting import MISSING, format_count, format_number, printable
+from seaopt.parameters import Parameter
+from seaopt.robustness import Certificate
+from seaopt.units import unit_after
+
+MOST_ROWS = 14  # of a table; --verbose prints them all
+MOST_REASONS = 8
+MOST_NOTES = 4
+MOST_CHARACTERS = 240  # of a reason
+MET, UNMET = ("met    ", "green"), ("not met", "red")
+
+
+def show_verdicts(console: Terminal, verdicts: Sequence[Verdict], *, verbose: bool = False) -> None:
+    """Print a line per stage, below it what is not met, and at the end what to type next."""
+    for verdict in verdicts:
+        word, colour = MET if verdict.met else UNMET
+        console.say(word, style=colour, end="  ")
+        console.say(verdict.text)
+        show_reasons(console, verdict.reasons, verbose=verbose)
+        for text in verdict.next:
+            advice, command, rest = text.partition("type seaopt")
+            console.wrap(f"next: {advice}{'type' if command else ''}", indent=9)
+            if command:  # on a line of its own, to be copied
+                console.say(f"{' ' * 11}seaopt{rest}", soft_wrap=True)
+
+
+def show_reasons(console: Terminal, reasons: Sequence[Reason], *, verbose: bool) -> None:
+    """Print each reason once, with where it is worst and in how many places besides."""
+    shown = reasons if verbose else reasons[:MOST_REASONS]
+    for reason in shown:
+        more = f" (and {reason.count - 1} more)" if reason.count > 1 else ""
+        where = reason.where if verbose or len(reason.where) <= MOST_CHARACTERS else _cut(reason.where)
+        console.wrap(f"{reason.what}{more}" + (f": {where}" if where else ""), indent=9)
+    if len(reasons) > len(shown):
+        console.wrap(f"and {len(reasons) - len(shown)} more: --verbose prints them", indent=9)
+
+
+def _cut(text: str) -> str:
+    return text[: MOST_CHARACTERS - 4].rsplit(" ", 1)[0] + " ..."
+
+
+def show_fit(console: Terminal, fit: Fit, scores: Iterable[ModelledOutputs] = ()) -> None:
+    """Print the parameters and how well each output is explained."""
+    rows: list[tuple[str, ...]] = [
+        (
+            one.name,
+            f"{one.value:.5g}",
+            _spread(one.std),
+            unit_after(one.unit).strip(),
+            _state(one),
+        )
+        for one in fit.parameters.values()
+        if one.free
+    ]
+    for name, figure in fit.derived.items():
+        rows.append((name, f"{figure.value:.5g}", _spread(figure.std), unit_after(figure.unit).strip(), "derived"))
+    heading(console, "Fit", f"{fit.samples} samples, {fit.wall_s:.1f} s")
+    _tabulate(console, rows, ("parameter", "value", "std", "unit", ""), "<>><<")
+    outputs = [
+        (f"{name}.{output}", f"{one.fit_percent:.2f}", format_number(one.holdout_fit_percent, 4),
+         _percent(one.explained), _percent(one.explainable), f"{one.rms_residual:.4g}", unit_after(one.unit).strip())
+        for name, row in fit.outputs.items()
+        for output, one in row.items()
+    ]  # fmt: skip
+    for score in scores:
+        outputs += [
+            (f"{score.name}.{name} (not fitted)", f"{row['fit_percent']:.2f}", MISSING, MISSING, MISSING,
+             f"{row['rms_residual']:.4g}", unit_after(row["unit"]).strip())
+            for name, row in score.to_dict().items()
+        ]  # fmt: skip
+    _tabulate(
+        console, outputs, ("output", "fit %", "held out", "explained", "of at most", "residual", ""), "<>>>>><"
+    )  # fmt: skip
+    warnings = [one for one in fit.findings if one.severity == "warning"]
+    show_reasons(console, [Reason(what=f"warning, {one.where}", where=one.text) for one in warnings], verbose=False)
+    hints = [f"{one.where}: {one.text}" if one.where else one.text for one in fit.findings if one.severity == "note"]
+    _show_notes(console, [*hints, *fit.notes])
+
+
+def show_controller(console: Terminal, controller: Controller) -> None:
+    """Print the gains, and the figures of the design plant beside what was asked."""
+    spec = controller.spec
+    delay = format_count(controller.delay_samples, "sample")
+    heading(
+        console, "Controller", f"{controller.structure} on {spec.measured}, {spec.sample_rate_hz:g} Hz, {delay} late"
+    )
+    units, command = name_gain_units(controller.command), controller.engineering
+    gains = [
+        (name, f"{value:.5g}", units.get(name, ""), *(
+            (f"{command[name][0]:.5g}", command[name][1]) if name in command else ("", "")
+        ))
+        for name, value in controller.gains.items()
+    ]  # fmt: skip
+    _tabulate(console, gains, ("gain", "value", "", f"as {controller.command.word}", ""), "<><><")
+    _tabulate(console, controller.list_achieved(), ("design plant", "achieved", "asked"), "<><")
+    _show_notes(console, controller.notes)
+
+
+def show_certificate(console: Terminal, certificate: Certificate) -> None:
+    """Print the margins of each plant, nominal and in the worst case, and what was simulated."""
+    heading(console, "Certificate", str(certificate.monte_carlo).split(":")[0])
+    rows: list[tuple[str, ...]] = []
+    for name, figures in certificate.plants.items():
+        worst, margins = certificate.worst[name], certificate.margins[name]
+        if not figures.stable:
+            rows.append((name, "unstable", *[MISSING] * 7))
+            continue
+        late = margins.sampled_delay_s
+        rows.append((
+            name, f"{figures.ms:.3f}", f"{worst.ms:.3f}", f"{figures.mt:.3f}", f"{worst.mt:.3f}",
+            format_number(margins.margins.gain_up_db, 3), format_number(figures.phase_margin_deg, 3),
+            f"{1e3 * late:.3g}" if late is not None else f"> {1e3 * margins.searched_delay_s:.2g}",
+            format_number(figures.disk_margin, 3),
+        ))  # fmt: skip
+    _tabulate(
+        console, rows, ("plant", "Ms", "worst", "Mt", "worst", "gain dB", "phase °", "delay ms", "disk"), "<>>>>>>>>"
+    )  # fmt: skip
+    if certificate.simulated is not None and certificate.simulated.verification is not None:
+        runs = certificate.simulated.verification
+        failed = len(runs.failures)
+        console.wrap(f"simulation: {failed} of {len(runs.rows)} runs failed" if failed else
+                     f"simulation: {len(runs.rows)} runs passed", indent=2)  # fmt: skip
+    _show_notes(console, certificate.notes)
+
+
+def heading(console: Terminal, title: str, text: str) -> None:
+    """Print the line above a result's tables."""
+    console.say("")
+    console.say(title, style="bold", end="  ")
+    console.say(text, style="dim")
+
+
+def _tabulate(console: Terminal, rows: Sequence[Sequence[str]], head: Sequence[str], align: str) -> None:
+    if not rows:
+        return
+    console.tabulate(rows[:MOST_ROWS], head, align)
+    if len(rows) > MOST_ROWS:
+        console.wrap(f"and {len(rows) - MOST_ROWS} more: --verbose prints them", indent=2)
+
+
+def _show_notes(console: Terminal, notes: Sequence[str]) -> None:
+    """Print the beginning of each note on one line."""
+    room, cut = console.width - 2, False
+    for note in notes[:MOST_NOTES]:
+        line = f"note: {printable(note)}"
+        cut = cut or len(line) > room
+        console.say(f"  {line if len(line) <= room else line[: room - 1] + '…'}", style="dim", soft_wrap=True)
+    if cut or len(notes) > MOST_NOTES:
+        console.say(f"  {format_count(len(notes), 'note')}: --verbose prints all of it", style="dim")
+
+
+def _spread(std: float | None) -> str:
+    return f"± {std:.2g}" if std is not None else MISSING
+
+
+def _state(parameter: Parameter) -> str:
+    return "at bound" if parameter.at_bound else "prior" if parameter.prior_std is not None else ""
+
+
+def _percent(share: float | None) -> str:
+    return MISSING if share is None else f"{100 * share:.1f} %"

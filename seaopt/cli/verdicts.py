@@ -1,0 +1,169 @@
+"""The verdict of each stage for the terminal: one line, then what is not met, each once, and what to type next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from seaopt.control import Controller
+from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.control.laws.verdict import join_labels
+from seaopt.estimation import Fit
+from seaopt.formatting import format_count, format_number
+from seaopt.records import record
+from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.certificate import Requirement
+
+STABILITY = "spectral_radius"
+FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
+SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
+REMEDIES = {
+    **dict.fromkeys(FROM_DRAWS, "retune = 4 in [robustness] tunes for the worst cases, too"),
+    "step_overshoot": "lower max_reference_peak in [controller]",
+    "step_settling_s": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
+    "steady_error": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
+    "sustained_oscillation": "a lower bandwidth_hz, or min_friction_margin in [controller]",
+    "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
+}
+
+
+@record
+class Reason:
+    """One thing that is not met; of `count` places it is in, `where` is the worst."""
+
+    what: str
+    where: str
+    count: int = 1
+
+
+@record
+class Verdict:
+    """Whether a stage is met, in one line; why not; and the commands, or lines of the file, that come next."""
+
+    met: bool
+    text: str
+    reasons: tuple[Reason, ...] = ()
+    next: tuple[str, ...] = ()
+
+
+def judge_fit(fit: Fit, again: str) -> Verdict:
+    """Return the verdict on a fit; `again` is the command that fits."""
+    size = f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}"
+    percents = [one.fit_percent for row in fit.outputs.values() for one in row.values()]
+    if fit.met:
+        worst = f", outputs fit to {min(percents):.1f} %" if len(percents) == 1 else ""
+        worst = worst or (f", outputs fit to {min(percents):.1f} to {max(percents):.1f} %" if percents else "")
+        return Verdict(met=True, text=f"Fit: converged, {size}{worst}")
+    status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
+    errors = [(one.text, one.where) for one in fit.errors]
+    if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
+        errors.insert(0, (fit.message, ""))
+    reasons = _group(errors)
+    return Verdict(
+        met=False, text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met",
+        reasons=tuple(reasons), next=(f"correct the file, then type {again}",),
+    )  # fmt: skip
+
+
+def judge_controller(controller: Controller, sweep: str) -> Verdict:
+    """Return the verdict on a tuned controller; `sweep` is the command that tunes at a range of bandwidths."""
+    spec = controller.spec
+    name = f"Controller: {controller.structure} on {spec.measured}, {spec.bandwidth_hz:g} Hz"
+    if controller.feasible:
+        return Verdict(met=True, text=f"{name}, every limit met")
+    blocked = controller.blocked_by or (join_labels(controller.active_constraints),)
+    reasons = [Reason(what=text, where="") for text in blocked]
+    return Verdict(
+        met=False, text=f"{name}, {format_count(len(reasons), 'limit')} not met", reasons=tuple(reasons),
+        next=_advise_bandwidth(controller, sweep),
+    )  # fmt: skip
+
+
+def _advise_bandwidth(controller: Controller, sweep: str) -> tuple[str, ...]:
+    """Return the line of the file with a bandwidth that is possible, or how to look for what is."""
+    possible, asked = controller.possible, controller.spec.bandwidth_hz
+    look = f"{sweep} {_range_about(asked)}"
+    if possible is None:
+        return (f"to see what other bandwidths cost type {look}",)
+    text = str(possible)
+    if possible.nearest_hz:
+        nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - asked))
+        return (text, f"bandwidth_hz = {nearest:.4g} in [controller], or to see what each costs type {look}")
+    return (text, f"raise max_sensitivity, or max_noise_gain, in [controller]; to see what each costs type {look}")
+
+
+def _range_about(asked: float) -> str:
+    low, high = (factor * asked for factor in SWEEP_SPREAD)
+    step = max(float(f"{(high - low) / 6:.1g}"), 0.1)
+    return f"{step * math.floor(low / step):.4g}:{step * math.ceil(high / step):.4g}:{step:.4g}"
+
+
+def judge_certificate(certificate: Certificate, again: str, sweep: str) -> Verdict:
+    """Return the verdict on a certificate; the commands are those that run it again, and tune at other bandwidths."""
+    draws = certificate.monte_carlo
+    if certificate.passed:
+        runs = "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulated runs passed"
+        bound = f", failure probability below {draws.failure_probability_bound:.2g}" if draws.samples else ""
+        text = f"Certificate: passed, {draws.failures} failures in {draws.samples} draws{bound}{runs}"
+        return Verdict(met=True, text=text)
+    broken = [row for row in certificate.requirements if not row.met]
+    reasons = group_requirements(broken)
+    remedies = [_advise(row.name) for row in broken]
+    first = next((text for text in remedies if text), "")
+    command = f"type {again}" if not first else f"{first}; then type {again}"
+    return Verdict(
+        met=False, text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
+        reasons=tuple(reasons),
+        next=(command, f"to see what other bandwidths cost type {sweep} "
+              f"{_range_about(certificate.controller.spec.bandwidth_hz)}"),
+    )  # fmt: skip
+
+
+def _advise(name: str) -> str:
+    return BY_REQUIREMENT[name].remedy if name in BY_REQUIREMENT else REMEDIES.get(name, "")
+
+
+def group_requirements(broken: Sequence[Requirement]) -> list[Reason]:
+    """Return each requirement that is not met once, by its worst case, with the number of places where it is not.
+
+    Of a plant that is unstable only that is said: that it has no margins follows.
+    """
+    unstable = [row for row in broken if row.name == STABILITY]
+    if unstable:
+        plants = ", ".join(dict.fromkeys(row.where.split(":")[0] for row in unstable))
+        rest = [row for row in broken if row.name != STABILITY and math.isfinite(row.value)]
+        follows = len(broken) - len(unstable) - len(rest)
+        more = f"; {format_count(follows, 'more requirement')} cannot be met then" if follows else ""
+        first = [Reason(what=f"unstable on {plants}", where=f"tune with that plant in robust_to{more}")]
+    else:
+        first, rest = list[Reason](), list(broken)
+    named: dict[str, list[Requirement]] = {}
+    for row in rest:
+        named.setdefault(row.name, []).append(row)
+    return first + [_describe(rows) for rows in named.values()]
+
+
+def _describe(rows: Sequence[Requirement]) -> Reason:
+    worst = max(rows, key=_overshoot)
+    value, limit = format_number(worst.value, 4), format_number(worst.limit, 4)
+    return Reason(what=f"{worst.name} {value}, limit {worst.sense} {limit}", where=worst.where, count=len(rows))
+
+
+def _overshoot(row: Requirement) -> float:
+    """Return by how much a requirement is missed, as a ratio."""
+    if not math.isfinite(row.value):
+        return math.inf
+    if row.sense == "≥":
+        return row.limit / row.value if row.value > 0.0 else math.inf
+    return row.value / row.limit if row.limit > 0.0 else row.value
+
+
+def _group(pairs: Iterable[tuple[str, str]]) -> list[Reason]:
+    """Return each text once, with the places that it is said of."""
+    places: dict[str, list[str]] = {}
+    for text, where in pairs:
+        places.setdefault(text, []).append(where)
+    return [
+        Reason(what=", ".join(dict.fromkeys(filter(None, where[:3]))) or "the fit", where=text, count=len(where))
+        for text, where in places.items()
+    ]

@@ -1,0 +1,148 @@
+"""What reaches a terminal: eighty columns, verdicts first, each failure once, no control characters."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.cli.main import app
+from seaopt.cli.session import format_left
+from seaopt.cli.terminal import Terminal
+from seaopt.cli.verdicts import group_requirements
+from seaopt.robustness.certificate.certificate import Requirement
+
+
+def broken(name, value, limit, where):
+    return Requirement(name=name, limit=limit, value=value, met=False, where=where)
+
+
+def test_the_same_failure_in_twelve_runs_is_said_once():
+    rows = [broken("step_overshoot", 1.4 + 0.01 * k, 1.3, f"plant {k}, step") for k in range(12)]
+    (reason,) = group_requirements(rows)
+    assert (reason.count, reason.where) == (12, "plant 11, step")
+    assert "1.51" in reason.what and "1.3" in reason.what
+
+
+def test_what_must_be_large_is_worst_where_it_is_least():
+    rows = [broken("min_disk_margin", value, 0.7, str(value)) for value in (0.6, 0.2, 0.5)]
+    (reason,) = group_requirements(rows)
+    assert reason.where == "0.2"
+
+
+def test_of_an_unstable_plant_only_that_is_said():
+    rows = [
+        broken("spectral_radius", 1.2, 1.0, "swing: the loop is UNSTABLE"),
+        broken("max_sensitivity", np.inf, 1.6, "swing"),
+        broken("max_complementary", np.inf, 1.3, "swing"),
+        broken("max_noise_gain", 30.0, 25.0, "stand"),
+    ]
+    unstable, other = group_requirements(rows)
+    assert "swing" in unstable.what and "2 more" in unstable.where
+    assert other.what.startswith("max_noise_gain 30")
+
+
+@pytest.fixture
+def narrow(seaopt, monkeypatch):
+    def _narrow(*arguments):
+        monkeypatch.setenv("COLUMNS", "80")
+        return seaopt(*arguments)
+
+    return _narrow
+
+
+def test_a_controller_fits_a_terminal_of_eighty_columns(copied, narrow):
+    out = narrow("tune", "short.toml", "-o", "all")
+    lines = out.stdout.splitlines()
+    assert lines[0].startswith("met      Controller: pid on F1, 30 Hz")
+    assert max(map(len, lines)) <= 80 and len(lines) <= 40
+    assert "\x1b" not in out.stdout  # colours are a terminal's
+    quiet = narrow("tune", "short.toml", "-o", "all", "--quiet")
+    assert quiet.stdout.splitlines() == lines[:1] and quiet.returncode == 0
+    loud = narrow("tune", "short.toml", "-o", "all", "--verbose")
+    assert len(loud.stdout) > len(quiet.stdout) and "limits met with nothing to spare" in " ".join(loud.stdout.split())
+
+
+def test_a_limit_that_cannot_be_met_ends_with_the_line_to_write(copied, narrow, short):
+    hard = short.replace("max_noise_gain = 25", "max_noise_gain = 3\nbandwidth_range_hz = [28, 32]")
+    (copied / "hard.toml").write_text(hard, encoding="utf-8")
+    out = narrow("tune", "hard.toml", "-o", "all")
+    assert out.returncode == 1
+    first, *rest = out.stdout.splitlines()
+    assert first.startswith("not met  Controller: ")
+    words = " ".join(" ".join(rest).split())
+    assert words.count("max_noise_gain 3") <= 1 and "seaopt tune hard.toml -o all --sweep" in words
+    assert max(map(len, out.stdout.splitlines())) <= 90  # a command to copy is on one line
+
+
+def test_help_is_what_the_bare_command_prints(seaopt):
+    out = seaopt()
+    assert out.returncode == 0
+    assert {"demo", "new", "run", "--install-completion"} <= set(out.stdout.replace("│", " ").split())
+
+
+def test_shells_complete_commands(tmp_path):
+    asked = {"_SEAOPT_COMPLETE": "complete_bash", "COMP_WORDS": "seaopt ins", "COMP_CWORD": "1"}
+    code = "from seaopt.cli.main import app; app(prog_name='seaopt')"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path, env=os.environ | asked
+    )
+    assert process.stdout.split() == ["inspect"]
+    assert app.info.name == "seaopt"
+
+
+def test_texts_of_files_are_shown_and_not_obeyed(capsys):
+    console = Terminal()
+    evil = "a\x1b]0;title\x07b\x1b[31mc\u202ed"
+    console.say(evil)
+    console.wrap(f"word {evil}")
+    console.tabulate([(evil, "1")], ("name", "value"), "<>")
+    out = capsys.readouterr().out
+    assert not {"\x1b", "\x07", "\u202e"} & set(out)
+    assert out.count("title") == 3
+
+
+def test_a_misspelt_column_of_a_log_does_not_reach_the_terminal_raw(folder, seaopt):
+    (folder / "log.csv").write_text("t [s],I\x1b[31m [A],F1 [N]\n0,1,2\n0.1,1,3\n", encoding="utf-8")
+    (folder / "p.toml").write_text(
+        'schema = 1\n[plant.a]\nkind = "high_impedance"\n[[experiment]]\nname = "x"\nplant = "a"\nlog = "log.csv"\n'
+        'time = "t [s]"\ninputs = { I = "I [A]" }\noutputs = { F1 = "F1 [N]" }\n',
+        encoding="utf-8",
+    )
+    out = seaopt("fit", "p.toml")
+    assert out.returncode == 2 and "\x1b" not in out.stderr
+
+
+def test_no_color_and_files_have_no_colours(monkeypatch):
+    monkeypatch.setenv("NO_COLOR", "1")
+    console = Terminal(force_terminal=True, width=80, record=True)
+    with console.capture() as captured:
+        console.say("met", style="green")
+    assert "\x1b[32m" not in captured.get()
+    monkeypatch.delenv("NO_COLOR")
+    console = Terminal(force_terminal=True, width=80, color_system="standard")
+    with console.capture() as captured:
+        console.say("met", style="green")
+    assert "\x1b[32m" in captured.get()
+
+
+@pytest.mark.parametrize(("spent", "share", "left"), [(10.0, 0.5, "10 s left"), (60.0, 0.1, "9 min left"), (5, 0, "")])
+def test_the_time_left_is_that_of_the_share_that_is_done(spent, share, left):
+    assert format_left(float(spent), float(share)) == left
+
+
+def test_a_fit_that_fails_is_told_with_what_to_do(folder, narrow, stand_alone):
+    """The spring is stated twice as stiff as it is: one error for each output, said once."""
+    wrong = stand_alone.replace("[plant.stand]", "k = 1310000\n[plant.stand]", 1)
+    wrong = wrong.replace("truth = { J", "truth = { k = 655000, J")
+    (folder / "wrong.toml").write_text(wrong, encoding="utf-8")
+    out = narrow("fit", "wrong.toml", "-o", "wrong")
+    assert out.returncode == 1, out.stdout
+    assert out.stdout.startswith("not met  Fit: ")
+    assert "seaopt fit wrong.toml -o wrong" in out.stdout
+    assert not so.Fit.from_dict(json.loads((folder / "wrong" / "fit.json").read_text(encoding="utf-8"))).met
