@@ -1,9 +1,10 @@
-"""One decorator for this package's data: frozen, slotted dataclasses whose fields are given by name."""
+"""What this package's data have in common: one decorator, and the attribute through which results draw themselves."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any, TypeVar, dataclass_transform, overload
 
 T = TypeVar("T")
@@ -37,3 +38,26 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
     """
     decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
     return decorate if cls is None else decorate(cls)
+
+
+class PlotAccessor:
+    """The attribute `plot` of a result: all figures of it when called, each by itself by name, listed by `dir`.
+
+    What draws lies above the results in the layers. It is found by its name when `plot` is read, so that nothing below
+    imports it, and a plotting library is loaded when something is drawn.
+
+    Parameters
+    ----------
+    home : str
+        MODULE:CLASS of what draws; it is made with the result.
+
+    """
+
+    def __init__(self, home: str) -> None:
+        self._home = home
+
+    def __get__(self, result: object, owner: type | None = None) -> Any:
+        if result is None:
+            return self
+        module, _, name = self._home.partition(":")
+        return getattr(import_module(module), name)(result)

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from itertools import combinations
 
 import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.estimation import DerivedFigure, Experiment, Fit
 from seaopt.formatting import join_words
-from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain, survey
+from seaopt.frequency import DriveEstimate, Pair, Survey, Uncertain, h1, survey
+from seaopt.frequency.survey import ResponseFunction
+from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.friction import has_friction
-from seaopt.reporting.bode import Curve, Panel, bode_figure
+from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.response import Curve, response_panel
 from seaopt.simulation import Clock
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from seaopt.units import divide_units
 
 GIVEN, FITTED, FORM = "#d55e00", "#0072b2", "#009e73"
+_LOOKS = ((FITTED, "-"), (GIVEN, "-."), ("#cc79a7", ":"), ("#e69f00", "--"))  # of models, one after the other
 FAR = 3.0  # standard deviations: what lies farther is said to differ
 
 
@@ -42,16 +44,23 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
         The log does not allow an estimate.
 
     """
+    view = view_sensors(experiment, fit)
+    estimate = survey(
+        experiment.plant, experiment.log, outputs=experiment.outputs, clock=view.clock, gain=view.gain,
+        stretch_s=stretch_s,
+    )  # fmt: skip
+    return replace(estimate, adapt=experiment.apply_own)
+
+
+def view_sensors(experiment: Experiment, fit: Fit | None = None) -> Survey:
+    """Return an experiment's plant as its sensors see it, with a fit's delay and gains, without estimates."""
     nuisance = fit.nuisance.get(experiment.name) if fit is not None else None
     delay = experiment.delay_s
     free = isinstance(delay, Parameter) and delay.free and nuisance is None
     known = nuisance.delay_s if nuisance is not None else _value(delay)
     clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known, delay_free=free)
     gain = nuisance.gain if nuisance is not None else {name: _value(gain) for name, gain in experiment.gain.items()}
-    estimate = survey(
-        experiment.plant, experiment.log, outputs=experiment.outputs, clock=clock, gain=gain, stretch_s=stretch_s
-    )
-    return replace(estimate, adapt=experiment.apply_own)
+    return Survey(plant=experiment.plant, clock=clock, gain=gain, pairs=(), adapt=experiment.apply_own)
 
 
 def _value(number: float | Parameter) -> float:
@@ -69,12 +78,76 @@ def fit_surveys(fit: Fit) -> dict[str, Survey]:
     return surveys
 
 
-def survey_figure(
+def response_panels(
+    experiment: Experiment, measured: Survey, fits: Mapping[str, Fit], *, pair: str | None = None
+) -> list[Panel]:
+    """Return a panel for every pair of an experiment, and for outputs of one unit over each other, with models on top.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Of the first fit.
+    measured : Survey
+        Of that experiment.
+    fits : mapping of label to Fit
+        What is drawn over the measurement; each has an experiment of that name.
+    pair : str, optional
+        The only pair wanted, by its name.
+
+    """
+    views: dict[str, tuple[Survey, Fit]] = {}
+    for label, fit in fits.items():
+        own = next((one for one in fit.experiments if one.name == experiment.name), None)
+        if own is not None:
+            views[label] = (view_sensors(own, fit), fit)
+    panels: list[Panel] = []
+    for one in (*measured.pairs, *_pair_outputs(experiment.log, measured)):
+        if pair not in (None, one.name):
+            continue
+        curves = [
+            Curve(label=label, response=_respond(view, one, measured, fit), colour=colour, style=style)
+            for (label, (view, fit)), (colour, style) in zip(views.items(), _LOOKS * 3, strict=False)
+        ]
+        if one.second_order is not None:
+            form = one.second_order.response
+            curves.append(Curve(label="second-order fit", response=form, colour=FORM, style="--"))
+        name = f"response_{experiment.name}_{one.output}_{one.source}"
+        panels.append(response_panel(name, f"{experiment.name}: {one.name}", one, curves))
+    return panels
+
+
+def _pair_outputs(log: Log, measured: Survey) -> list[Pair]:
+    """Return outputs of one unit over each other, which one input moves: F1/F2 tells where a load cell may sit."""
+    units = measured.plant.outputs
+    names = list(dict.fromkeys(pair.output for pair in measured.pairs))
+    if len({pair.source for pair in measured.pairs}) != 1:
+        return []
+    pairs: list[Pair] = []
+    for first, second in combinations(names, 2):
+        if units[first] == units[second] and np.ptp(log[second]) > 0.0:
+            unit = divide_units(units[first], units[second])
+            estimate = h1(log[second], log[first], log.period)
+            pairs.append(Pair(
+                source=second, output=first, unit=unit, estimate=estimate, good_band_hz=None, peak=None,
+                second_order=None,
+            ))  # fmt: skip
+    return pairs
+
+
+def _respond(view: Survey, pair: Pair, measured: Survey, fit: Fit) -> ResponseFunction:
+    """Return a model's response from input to output, or from one output to another, both of them from the input."""
+    if pair.source in view.plant.inputs:
+        return view.model(pair, fit.parameters)
+    by_output = {one.output: view.model(one, fit.parameters) for one in measured.pairs}
+    return lambda f: by_output[pair.output](f) / by_output[pair.source](f)
+
+
+def survey_panels(
     surveys: Mapping[str, Survey],
     given: ParameterSet | None = None,
     fitted: Mapping[str, tuple[Survey, Fit]] | None = None,
-) -> Figure:
-    """Draw every pair of the surveys with its second-order fit, and the plant with given values and as fitted.
+) -> list[Panel]:
+    """Return a panel for every pair of the surveys with its second-order fit, and the plant with given values and fitted.
 
     Parameters
     ----------
@@ -91,19 +164,16 @@ def survey_figure(
         for pair in measured.pairs:
             curves: list[Curve] = []
             if fitted is not None and name in fitted:
-                fitted_survey, fit = fitted[name]
-                curves.append(
-                    Curve(label="model, fitted", response=fitted_survey.model(pair, fit.parameters), colour=FITTED)
-                )
+                view, fit = fitted[name]
+                curves.append(Curve(label="model, fitted", response=view.model(pair, fit.parameters), colour=FITTED))
             if given is not None:
                 model = measured.model(pair, given)
                 curves.append(Curve(label="model, the file's values", response=model, colour=GIVEN, style="-."))
             if pair.second_order is not None:
                 form = pair.second_order.response
                 curves.append(Curve(label="second-order fit", response=form, colour=FORM, style="--"))
-            title = f"{name}: {pair.name} [{pair.unit}]"
-            panels.append(Panel(title=title, pair=pair, curves=tuple(curves)))
-    return bode_figure(panels)
+            panels.append(response_panel(f"{name}_{pair.name}", f"{name}: {pair.name}", pair, curves))
+    return panels
 
 
 def sentence(measured: Survey, fit: Fit, experiment: str) -> str:

@@ -43,7 +43,7 @@ from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.units import divide_units, unit_after
 
 if TYPE_CHECKING:
@@ -99,6 +99,8 @@ class Controller:
         Of the design plant; None where it has no friction.
 
     """
+
+    plot = PlotAccessor("seaopt.reporting.plots:ControllerPlots")
 
     structure: str
     gains: Mapping[str, float]
@@ -445,7 +447,7 @@ class Controller:
         return (
             html_paragraph(head) + (html_table(("gain", "", f"as {self.command.word}"), gains) if gains else "")
             + html_table(("on the design plant", "achieved", "asked"), self.list_achieved())
-            + html_list([*explanation, *(line.strip() for line in self._force_lines())])
+            + html_list([*explanation, *(line.strip() for line in self._force_lines())]) + self.plot.to_html()
         )  # fmt: skip
 
     def list_achieved(self) -> list[tuple[str, str, str]]:

@@ -16,12 +16,12 @@ from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import disturbance, make_controller, make_task
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_text
+from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import require_plant
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.units import LINEAR, Mechanics
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
@@ -84,6 +84,8 @@ class FrontierRow:
 class Frontier:
     """The rows of a sweep, and their controllers."""
 
+    plot = PlotAccessor("seaopt.reporting.plots:FrontierPlots")
+
     rows: tuple[FrontierRow, ...]
     controllers: tuple[Controller, ...]
 
@@ -100,7 +102,8 @@ class Frontier:
             "controllers": [controller.to_dict() for controller in self.controllers],
         }
 
-    def __repr__(self) -> str:
+    def _list_cells(self) -> tuple[tuple[str, ...], list[list[str]]]:
+        """Return the head and the rows of the table."""
         head = ("Hz", "met", "noise gain", "Ms", "worst", "disturbance", "|S| < -3 dB", "phase margin")
         called = self.mechanics
         head = (*head, f"{called.word} limit")
@@ -114,9 +117,14 @@ class Frontier:
             for row in self.rows
         ]
         friction = ("cost of friction",) if sticks else ()
-        return "\n".join(format_table(cells, (*head, *friction, "blocked by"), "><>><>>>>" + ">" * sticks))
+        return (*head, *friction, "blocked by"), cells
 
-    _repr_html_ = html_text
+    def __repr__(self) -> str:
+        head, cells = self._list_cells()
+        return "\n".join(format_table(cells, head, "><>><>>>>" + ">" * (len(head) - 10)))
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._list_cells()) + self.plot.to_html()
 
 
 def sweep(

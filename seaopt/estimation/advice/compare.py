@@ -42,8 +42,8 @@ from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.fit_result import Fit
-from seaopt.formatting import format_table, html_text
-from seaopt.records import record
+from seaopt.formatting import format_table, html_list, html_table
+from seaopt.records import PlotAccessor, record
 
 MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0  # differences of BIC (Kass and Raftery)
 CONTRADICTION = 1.02  # ratio of held-out residuals that contradicts the likelihood
@@ -94,6 +94,9 @@ class OctavePower:
     power: Mapping[str, float]
 
 
+_HEAD = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]")
+
+
 @record(eq=False, repr=False)
 class Ranking:
     """What `compare` returns; ``print(ranking)`` is a report.
@@ -116,6 +119,8 @@ class Ranking:
         In the order of `rows`.
 
     """
+
+    plot = PlotAccessor("seaopt.reporting.plots:RankingPlots")
 
     rows: tuple[Ranked, ...]
     preferred: str | None
@@ -155,8 +160,7 @@ class Ranking:
         }  # fmt: skip
 
     def __repr__(self) -> str:
-        head = ("", "effective BIC", "BIC", "AIC", "unknowns", "free run (held out) [%]")
-        rows = format_table((self._cells(row) for row in self.rows), head, "<>>>>")
+        rows = format_table((self._cells(row) for row in self.rows), _HEAD, "<>>>>")
         return "\n  ".join([f"Ranking: {self.sentences[0]}", *self.sentences[1:], *rows])
 
     def _cells(self, row: Ranked) -> list[str]:
@@ -170,7 +174,9 @@ class Ranking:
         away = (row.effective_bic - first.effective_bic, row.bic - first.bic, row.aic - first.aic)
         return [row.name, *(f"{value:+.6g}" for value in away), str(row.unknowns), percents]
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        rows = html_table(("fit", *_HEAD[1:]), map(self._cells, self.rows))
+        return html_list(self.sentences) + rows + self.plot.to_html()
 
 
 def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:

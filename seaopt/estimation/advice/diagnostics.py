@@ -40,7 +40,7 @@ from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs
 from seaopt.estimation.uncertainty.leverage import PRIORS, Leverage, measure_leverage
 from seaopt.formatting import html_text
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.units import unit_after
 
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
@@ -100,6 +100,8 @@ class Diagnostics:
 
     """
 
+    plot = PlotAccessor("seaopt.reporting.plots:DiagnosticsPlots")
+
     outputs: Mapping[str, Mapping[str, OutputDiagnostics]]
     leverage: Mapping[str, Leverage]
     at_bound: tuple[str, ...]
@@ -151,7 +153,8 @@ class Diagnostics:
         lines.append(f"  AIC {self.aic:.6g}, BIC {self.bic:.6g}")
         return "\n".join(lines)
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        return html_text(self) + self.plot.to_html()
 
 
 def _output_dict(one: OutputDiagnostics) -> dict[str, Any]:

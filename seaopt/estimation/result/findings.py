@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.formatting import html_text
-from seaopt.records import record
+from seaopt.formatting import format_figure, html_paragraph, html_table
+from seaopt.records import PlotAccessor, record
 from seaopt.units import unit_after
 
 Severity = Literal["error", "warning", "note"]
@@ -132,6 +132,8 @@ class ModelledOutputs:
     without a band, `units` are the outputs'.
     """
 
+    plot = PlotAccessor("seaopt.reporting.plots:PredictionPlots")
+
     time: Float[np.ndarray, " n"]
     inputs: dict[str, Float[np.ndarray, " n"]]
     measured: dict[str, Float[np.ndarray, " n"]]
@@ -179,4 +181,12 @@ class ModelledOutputs:
             lines.append(f"  {name}: fit {row['fit_percent']:.2f} %{in_band}, rms residual {rms}")
         return "\n".join(lines)
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, format_figure(row["fit_percent"], "%"), format_figure(row["band_fit_percent"], "%"),
+             format_figure(row["rms_residual"], unit_after(row["unit"]).strip()))
+            for name, row in self.to_dict().items()
+        ]  # fmt: skip
+        head, *_ = repr(self).splitlines()
+        table = html_table(("output", "fit", "in the band", "rms residual"), rows)
+        return html_paragraph(head) + table + self.plot.to_html()

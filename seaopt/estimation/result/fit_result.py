@@ -19,10 +19,10 @@ from seaopt.estimation.result.findings import DerivedFigure, FitFinding, Modelle
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.result.nuisance import estimate_nuisance, take_sensors
 from seaopt.estimation.solver.methods import Method
-from seaopt.formatting import html_text
+from seaopt.formatting import format_figure, format_number, html_list, html_paragraph, html_table
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.simulation import Clock, Point, make_model, run_passes
 from seaopt.units import unit_after
 
@@ -88,6 +88,8 @@ class Fit:
         The problem and its unknowns, from which refits start; None when read from a file.
 
     """
+
+    plot = PlotAccessor("seaopt.reporting.plots:FitPlots")
 
     status: str
     message: str
@@ -326,7 +328,36 @@ class Fit:
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        return format_fit(self) + self.plot.to_html()
+
+
+def format_fit(fit: Fit) -> str:
+    """Return as HTML the verdict, the findings, the fitted parameters and what follows from them, and every output."""
+    findings = (f"{one.severity}: {f'{one.where}: ' if one.where else ''}{one.text}" for one in fit.findings)
+    fitted = [
+        (one.name, format_number(one.value, 6), format_number(one.std, 2), unit_after(one.unit).strip())
+        for one in fit.parameters.values()
+        if one.free
+    ]
+    derived = [
+        (name, format_number(one.value, 6), format_number(one.std, 2), unit_after(one.unit).strip())
+        for name, one in fit.derived.items()
+    ]
+    outputs = [
+        (name, output, *(format_figure(value, "%") for value in (one.fit_percent, one.holdout_fit_percent)),
+         format_figure(one.rms_residual, unit_after(one.unit).strip()))
+        for name, row in fit.outputs.items()
+        for output, one in row.items()
+    ]  # fmt: skip
+    return (
+        html_paragraph(f"Fit: {'met' if fit.met else 'NOT MET'}, {fit.status} ({fit.message})")
+        + html_list(findings)
+        + (html_paragraph(fit.caveat) if fit.caveat else "")
+        + html_table(("parameter", "value", "std", "unit"), [*fitted, *derived])
+        + html_table(("experiment", "output", "fit", "held out", "rms residual"), outputs)
+        + html_list(fit.notes)
+    )
 
 
 def _fields(record: Any) -> dict[str, Any]:

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number, require_type, suggestion
-from seaopt.formatting import format_count, html_text
+from seaopt.formatting import format_count, html_list, html_paragraph, html_table
 from seaopt.logs.log import decimation, frames, resampling
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.clock import GAP, JITTER_LIMIT, sample_rate_hz, split_at_gaps
 from seaopt.logs.quality.report import Quality, assess_quality
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.signals import Signal
 from seaopt.units import factor, si_unit
 
@@ -50,6 +50,8 @@ class Log:
     (400.0, 240.0)
 
     """
+
+    plot = PlotAccessor("seaopt.reporting.plots:LogPlots")
 
     time: Float[np.ndarray, " n"]
     signals: Mapping[str, Signal]
@@ -373,20 +375,38 @@ class Log:
         return replace(cls.from_arrays(units=units, source=source, **arrays), notes=notes)
 
     def __repr__(self) -> str:
-        lines = [f"Log {self.source}: {len(self)} samples, {self.duration_s:.6g} s at {self.rate_hz:.6g} Hz"]
+        lines = [self._describe()]
         for name, signal in self.signals.items():
-            finite = signal.values[np.isfinite(signal.values)]
-            span = f"{finite.min():.4g} to {finite.max():.4g}" if finite.size else "no finite sample"
-            missing = signal.values.size - finite.size
+            span, missing = _describe_range(signal.values)
             lines.append(f"  {name} [{signal.unit or 'SI'}]  {span}" + (f", {missing} missing" if missing else ""))
-        lines += [f"  {note}" for note in self.notes]
-        count = len(self.gaps)
-        if count:
-            first = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])
-            lines.append(f"  {format_count(count, 'gap')}: {first}{', ...' if count > 3 else ''}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"  {note}" for note in self._remarks())])
 
-    _repr_html_ = html_text
+    def _describe(self) -> str:
+        return f"Log {self.source}: {len(self)} samples, {self.duration_s:.6g} s at {self.rate_hz:.6g} Hz"
+
+    def _remarks(self) -> list[str]:
+        """Return the notes, and where the first gaps are."""
+        count = len(self.gaps)
+        if not count:
+            return [*self.notes]
+        first = ", ".join(f"{start:.6g} to {stop:.6g} s" for start, stop in self.gaps[:3])
+        return [*self.notes, f"{format_count(count, 'gap')}: {first}{', ...' if count > 3 else ''}"]
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, signal.unit or "SI", span, str(missing))
+            for name, signal in self.signals.items()
+            for span, missing in (_describe_range(signal.values),)
+        ]
+        table = html_table(("channel", "unit", "range", "missing"), rows)
+        return html_paragraph(self._describe()) + table + html_list(self._remarks()) + self.plot.to_html()
+
+
+def _describe_range(values: Float[np.ndarray, " n"]) -> tuple[str, int]:
+    """Return from where to where the samples of a channel go, and how many are missing."""
+    finite = values[np.isfinite(values)]
+    span = f"{finite.min():.4g} to {finite.max():.4g}" if finite.size else "no finite sample"
+    return span, values.size - finite.size
 
 
 def _steps(time: Float[np.ndarray, " n"]) -> Iterator[Float[np.ndarray, " _"]]:

@@ -7,6 +7,7 @@ from dataclasses import field, fields, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, LoopFigures
@@ -28,7 +29,7 @@ from seaopt.formatting import (
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, remembers, split_friction
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
 from seaopt.robustness.certificate.simulated import (
@@ -205,8 +206,12 @@ class Certificate:
     remarks : tuple of str
         What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
         the bandwidth at amplitudes of use.
+    drawn_ms : mapping of name to array, shape (n,)
+        Ms of the draws, up to `DRAWS_KEPT` of them, infinite where unstable; empty where it was read from a file.
 
     """
+
+    plot = PlotAccessor("seaopt.reporting.plots:CertificatePlots")
 
     passed: bool
     requirements: tuple[Requirement, ...]
@@ -225,6 +230,9 @@ class Certificate:
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
     friction_draws: Mapping[str, FrictionDraws] = field(default_factory=dict[str, FrictionDraws])
     remarks: tuple[str, ...] = ()
+    drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
+        default_factory=dict[str, Float[np.ndarray, " n"]], repr=False
+    )
 
     @property
     def linear_models(self) -> dict[str, Plant]:
@@ -543,7 +551,7 @@ class Certificate:
         return lines
 
     def _repr_html_(self) -> str:
-        return format_certificate(self)
+        return format_certificate(self) + self.plot.to_html()
 
 
 def _require_runs(runs: Verification | str) -> tuple[Requirement, ...]:

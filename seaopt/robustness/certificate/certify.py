@@ -55,6 +55,7 @@ from seaopt.robustness.verification.scenarios import STEP_SHARES
 CONFIDENCE = 1.0 - 1e-6
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 DRAWS_PER_BLOCK = 50_000
+DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
 MOST_DELAY_SAMPLES = 20  # samples
 WORST_KEPT = 64  # worst draws kept of each plant
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
@@ -203,7 +204,7 @@ def certify(
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
-    failures, drawn = _measure_draws(controller, plants, unknown, samples, rng, progress)
+    failures, drawn, drawn_ms = _measure_draws(controller, plants, unknown, samples, rng, progress)
     worst = {name: find_worst(controller, plant, unknown, drawn[name]) for name, plant in plants.items()}
     brackets: dict[str, Bracket] = {}
     if bounds is not None:
@@ -231,7 +232,7 @@ def certify(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
-        brackets=brackets, friction=friction, friction_draws=friction_draws,
+        brackets=brackets, friction=friction, friction_draws=friction_draws, drawn_ms=drawn_ms,
         remarks=(*_remark_delay(controller, parameters), *_remark_amplitude(controller, models, nominal)),
     )  # fmt: skip
     certificate = certificate.with_steps()
@@ -356,12 +357,13 @@ def _digest(controller: Controller) -> int:
 def _measure_draws(
     controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
     progress: DrawProgress | None,
-) -> tuple[_Failures, dict[str, Float[np.ndarray, "n k"]]]:  # fmt: skip
-    """Draw and measure in blocks: the draws that fail on some plant, and the worst of each plant."""
+) -> tuple[_Failures, dict[str, Float[np.ndarray, "n k"]], dict[str, Float[np.ndarray, " m"]]]:  # fmt: skip
+    """Draw and measure in blocks: the draws that fail on some plant, the worst of each plant, and Ms of the first."""
     none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
     tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
     ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
     failures, steps = _Failures(), samples * len(plants)
+    first: dict[str, list[Float[np.ndarray, " m"]]] = {name: [] for name in plants}
     for start in range(0, samples, DRAWS_PER_BLOCK):
         points = unknown.draw(min(DRAWS_PER_BLOCK, samples - start), rng)
         values = unknown.values(points)
@@ -373,13 +375,15 @@ def _measure_draws(
             unstable |= batch.spectral_radius >= STABLE
             over_ms |= batch.ms > ms
             over_mt |= batch.mt > mt
+            if start < DRAWS_KEPT:
+                first[name].append(batch.ms[: DRAWS_KEPT - start])
             tallies[name] = [
                 tally.add(points, severities(controller, batch, by))
                 for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)
             ]
         failures.add(unstable, over_ms, over_mt)
     drawn = {name: np.unique(np.vstack([tally.points for tally in own]), axis=0) for name, own in tallies.items()}
-    return failures, drawn
+    return failures, drawn, {name: np.concatenate(parts) for name, parts in first.items() if parts}
 
 
 def failure_bound(samples: int, failures: int, confidence: float) -> float:

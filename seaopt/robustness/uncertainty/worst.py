@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -87,6 +88,10 @@ class Worst(tuple[Plant, ParameterSet]):
         self = super().__new__(cls, (plant, values))
         self.witness, self.limited, self.largest = witness, limited, largest or (witness, witness)
         return self
+
+    def __getnewargs_ex__(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Return what a copy, or one that is unpickled, is made of."""
+        return (*self, self.witness), {"limited": self.limited, "largest": self.largest}
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -30,7 +30,7 @@ from seaopt.formatting import html_text
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import take_sliding
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
@@ -90,6 +90,8 @@ class StabilityMap:
 
     """
 
+    plot = PlotAccessor("seaopt.reporting.plots:StabilityPlots")
+
     mass: Float[np.ndarray, " m"]
     stiffness: Float[np.ndarray, " k"]
     damping: Float[np.ndarray, " d"]
@@ -142,7 +144,8 @@ class StabilityMap:
         )
         return "\n".join([*lines, f"  link 2 fixed: {'stable' if self.fixed_stable else 'NOT STABLE'}"])
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        return html_text(self) + self.plot.to_html()
 
 
 def attach_environment(plant: Plant) -> Plant:

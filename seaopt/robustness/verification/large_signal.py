@@ -29,7 +29,7 @@ from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import find_dry_friction, take_sliding
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
 from seaopt.units import LINEAR
 
@@ -72,6 +72,8 @@ class LargeSignal:
 
     """
 
+    plot = PlotAccessor("seaopt.reporting.plots:LargeSignalPlots")
+
     plant: str
     frequency_hz: Float[np.ndarray, " f"]
     amplitude_N: Float[np.ndarray, " a"]
@@ -107,7 +109,8 @@ class LargeSignal:
             lines.append(f"  {amplitude:.4g} {self.unit}: {bandwidth}{from_hz}")
         return "\n".join(lines)
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        return html_text(self) + self.plot.to_html()
 
 
 def large_signal(

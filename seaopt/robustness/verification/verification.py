@@ -16,7 +16,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
-from seaopt.records import record
+from seaopt.records import PlotAccessor, record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
@@ -52,6 +52,8 @@ class Verification:
         With a swinging link it does not begin at 0 Hz, and a step does not reach its reference.
 
     """
+
+    plot = PlotAccessor("seaopt.reporting.plots:VerificationPlots")
 
     passed: bool
     rows: tuple[Outcome, ...]
@@ -182,7 +184,8 @@ class Verification:
         speed = ", ".join(f"{name} {value:.0f}" for name, value in self.real_time_factor.items())
         return "\n".join([*lines, f"  simulated seconds per second: {speed}; seed {self.seed}"])
 
-    _repr_html_ = html_text
+    def _repr_html_(self) -> str:
+        return html_text(self) + self.plot.to_html()
 
 
 def verify(

@@ -1,0 +1,118 @@
+"""Figures of measured frequency responses: H1 with its deviation and its coherence, and models on top."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from seaopt.frequency import Pair
+from seaopt.records import record
+from seaopt.reporting.figures.panel import Panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+H1, DEVIATION = "H1 estimate", "± 2 std"
+SHOWN = 0.3  # of coherence: below it an estimate says too little to be drawn
+ROWS = (1.0, 0.8, 0.45)  # heights of magnitude, phase and coherence
+POINTS = 600  # of a model
+LINES = 500  # of an estimate: of more, those at even distances on the axis
+
+
+@record(eq=False)
+class Curve:
+    """A model's response, a function of frequencies in Hz."""
+
+    label: str
+    response: Any
+    colour: str
+    style: str = "-"
+
+
+def response_panel(name: str, title: str, pair: Pair, curves: Sequence[Curve], caption: str = "") -> Panel:
+    """Draw magnitude with two standard deviations, phase and coherence; the first curve tells the phase's branch."""
+
+    def draw(axes: Sequence[Axes]) -> None:
+        _draw(axes, pair, curves)
+
+    said = f"H1 estimate of {pair.name} with two standard deviations, phase and coherence, and models on top."
+    count = pair.estimate.frequency_hz.size
+    if count > LINES:
+        said += f" Of {count} lines, those nearest to {LINES} frequencies evenly spaced on the axis are drawn."
+    return Panel(
+        name=name, title=title, draw=draw, heights=ROWS, link="frequency", caption=f"{said} {caption}".strip()
+    )
+
+
+def _draw(axes: Sequence[Axes], pair: Pair, curves: Sequence[Curve]) -> None:
+    from seaopt.reporting.figures.canvas import MEASURED, scale_log
+
+    magnitude, phase, coherence = axes
+    estimate = pair.estimate
+    f = estimate.frequency_hz
+    shown = (estimate.coherence > SHOWN) & spread_lines(f)
+    ends = (float(f[0]), float(f[shown][-1] if np.any(shown) else f[-1]))
+    dense = np.geomspace(*ends, POINTS)
+    branch = _model_curves(magnitude, phase, curves, dense)
+    if np.any(shown):  # after the models, whose branch it takes
+        _measured(magnitude, phase, pair, shown, np.interp(f[shown], dense, branch))
+    drawn = spread_lines(f)
+    coherence.plot(f[drawn], estimate.coherence[drawn], color=MEASURED, linewidth=0.8)
+    coherence.set_ylim(0.0, 1.05)
+    coherence.set_xlim(*ends)
+    scale_log(axes)
+    for axis, label in zip(
+        axes, (f"|{pair.name}| [dB re {pair.unit}]", "phase [deg]", "coherence [-]"), strict=True
+    ):
+        axis.set_ylabel(label)
+    coherence.set_xlabel("frequency [Hz]")
+
+
+def spread_lines(f: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Return which lines of an estimate are drawn: all of them, or those nearest to frequencies evenly spaced in log f."""
+    drawn = np.full(f.size, f.size <= LINES)
+    if f.size > LINES:
+        wanted = np.geomspace(f[0], f[-1], LINES)
+        above = np.clip(np.searchsorted(f, wanted), 1, f.size - 1)
+        drawn[np.where(wanted - f[above - 1] < f[above] - wanted, above - 1, above)] = True
+    return drawn
+
+
+def _model_curves(magnitude: Axes, phase: Axes, curves: Sequence[Curve], f: Any) -> Any:
+    """Draw the models, all on the phase branch of the first; return that phase in degrees."""
+    branch = np.zeros(f.size)
+    for number, curve in enumerate(curves):
+        response = curve.response(f)
+        angle = np.degrees(np.unwrap(np.angle(response)))
+        if number == 0:
+            branch = angle = angle - 360.0 * np.round(angle[0] / 360.0)
+        else:
+            angle = angle - 360.0 * np.round(np.median(angle - branch) / 360.0)
+        look: dict[str, Any] = {
+            "color": curve.colour, "linestyle": curve.style, "linewidth": 1.4, "zorder": 3, "label": curve.label
+        }  # fmt: skip
+        magnitude.plot(f, 20 * np.log10(np.maximum(np.abs(response), 1e-12)), **look)
+        phase.plot(f, angle, **look)
+    return branch
+
+
+def _measured(magnitude: Axes, phase: Axes, pair: Pair, shown: Any, branch: Any) -> None:
+    """Draw H1; its phase on the branch nearest the model's: noise at a dip must not shift the rest by a turn."""
+    from seaopt.reporting.figures.canvas import BAND, MEASURED
+
+    estimate = pair.estimate
+    f, h, std = estimate.frequency_hz[shown], estimate.response[shown], estimate.relative_std[shown]
+    level = 20 * np.log10(np.maximum(np.abs(h), 1e-300))
+    angle = np.degrees(np.angle(h * np.exp(-1j * np.radians(branch)))) + branch
+    low, high = (20 * np.log10(np.maximum(1.0 + side * 2.0 * std, 0.05)) for side in (-1.0, 1.0))
+    magnitude.fill_between(f, level + low, level + high, color=BAND, linewidth=0.0, label=DEVIATION)
+    dots: dict[str, Any] = {"color": MEASURED, "marker": ".", "markersize": 2.5, "linestyle": "", "label": H1}
+    magnitude.plot(f, level, **dots)
+    phase.plot(f, angle, **dots)
+    span = float(np.ptp(level))
+    magnitude.set_ylim(float(level.min()) - 0.15 * span - 3.0, float(level.max()) + 0.15 * span + 3.0)
+    width = max(float(np.ptp(angle)), 45.0)
+    phase.set_ylim(float(angle.min()) - 0.15 * width, float(angle.max()) + 0.15 * width)

@@ -1,0 +1,210 @@
+"""Figures of simulated loops: runs of scenarios, gain and bandwidth against amplitude, stability against environments."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from seaopt.reporting.figures.fit import label_channel
+from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.figures.thinning import thin_series
+from seaopt.robustness.verification.environments import StabilityMap
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome, find_judged_window
+from seaopt.robustness.verification.large_signal import LargeSignal
+from seaopt.robustness.verification.playback import Playback
+from seaopt.robustness.verification.verification import Verification
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LAST_PHASE_S = 0.6  # drawn of the last phase of a run that passed, where the others are shorter
+HELD_COLOUR, JUDGED_COLOUR = "#f1f1f1", "#fdf3d8"
+STABLE_COLOUR, UNSTABLE_COLOUR = "#cfe3f1", "#f6d9c6"
+
+
+def simulation_panels(verification: Verification, plant: str) -> list[Panel]:
+    """Return a panel per scenario on one plant: the run that failed, or has the largest force."""
+    return [simulation_panel(verification, row) for row in verification.worst() if row.plant == plant]
+
+
+def simulation_panel(verification: Verification, row: Outcome) -> Panel:
+    """Draw force (torque) and command of one run, simulated again.
+
+    Of a run that passed the end of the last phase is left out; a run that failed is drawn whole, with the window that
+    it is judged in.
+    """
+    controller = verification.stages[row.plant].controller
+    name, limit = controller.spec.measured, controller.command_limit
+    trace = verification.replay(row)
+    visible = trace.time <= (_visible_until(trace) if row.passed else trace.time[-1])
+    time = trace.time[visible]
+
+    def draw(axes: Sequence[Axes]) -> None:
+        from seaopt.reporting.figures.canvas import BLUE, LIMIT, MEASURED, VERMILION
+
+        upper, lower = axes
+        upper.plot(*thin_series(time, trace.reference[0][visible]), color=MEASURED, linewidth=1.8, label="reference")
+        upper.plot(*thin_series(time, trace.outputs[name][0][visible]), color=BLUE, linewidth=1.0, label=name)
+        lower.plot(*thin_series(time, trace.current[0][visible]), drawstyle="steps-post", color=VERMILION,
+                   linewidth=0.9, label=controller.command.word)  # fmt: skip
+        if limit is not None and row.saturated > 0.0:
+            for side in (-limit, limit):
+                lower.axhline(side, color=LIMIT, linestyle=":", linewidth=0.9, label="limit")
+        _draw_phases(axes, trace, float(time[-1]), verification, row)
+        upper.set_ylabel(label_channel(name, controller.command.reference_unit))
+        lower.set_ylabel(controller.command.label)
+        lower.set_xlabel("time [s]")
+        upper.margins(x=0.0)
+
+    drawn = "" if row.draw == NOMINAL else f", draw {row.draw}"
+    cut = "" if visible.all() else f", {time[-1]:.2g} of {trace.time[-1]:.3g} s"
+    return Panel(
+        name=f"simulation_{row.plant}_{row.scenario}", title=f"{row.plant}, {row.scenario}{drawn}{cut if row.passed else ': FAILED'}",
+        draw=draw, heights=(0.8, 0.5),
+        caption=f"{name} and {controller.command.word} of {row.scenario} on {row.plant}"
+        + ("." if row.passed else f": {row.reason}. Yellow: the window that is judged."),
+    )  # fmt: skip
+
+
+def _visible_until(trace: Playback) -> float:
+    """Return how much of a trace is drawn: all of one phase, else the last one's beginning."""
+    if len(trace.edges) == 2:
+        return float(trace.time[-1])
+    return float(trace.time[trace.edges[-2]]) + max(LAST_PHASE_S, float(trace.time[trace.edges[-2]]))
+
+
+def _draw_phases(
+    axes: Sequence[Axes], trace: Playback, until: float, verification: Verification, row: Outcome
+) -> None:
+    """Shade where the link is held, and of a run that failed the window that it is judged in."""
+    if not row.passed:
+        window = find_judged_window(trace)
+        for axis in axes:
+            axis.axvspan(
+                float(trace.time[window.start]), float(trace.time[window.stop - 1]), color=JUDGED_COLOUR, zorder=0
+            )
+    for phase, start, stop in zip(verification.scenario(row).phases, trace.edges[:-1], trace.edges[1:], strict=True):
+        if phase.held:
+            for axis in axes:
+                axis.axvspan(trace.time[start], min(trace.time[stop - 1], until), color=HELD_COLOUR, zorder=0)
+
+
+def bandwidth_panel(sweeps: Sequence[LargeSignal]) -> Panel:
+    """Draw bandwidth against amplitude, one curve per plant: simulated as points, predicted as a line."""
+
+    def draw(axes: Sequence[Axes]) -> None:
+        from seaopt.reporting.figures.canvas import COLOURS, scale_log
+
+        (axis,) = axes
+        for sweep, colour in zip(sweeps, itertools.cycle(COLOURS), strict=False):
+            points, line = (
+                np.array([np.nan if hz is None else hz for hz in values])
+                for values in (sweep.bandwidth_hz, sweep.predicted_hz)
+            )
+            axis.plot(sweep.amplitude_N, line, color=colour, linewidth=1.3, label=f"{sweep.plant}, predicted")
+            axis.plot(sweep.amplitude_N, points, "o", color=colour, markersize=4, label=f"{sweep.plant}, simulated")
+            saturated = np.any(sweep.saturated, axis=1)
+            axis.plot(sweep.amplitude_N[saturated], points[saturated], "s", color=colour, markersize=8,
+                      fillstyle="none", label="the command saturates")  # fmt: skip
+            if sweep.friction_N:
+                axis.axvline(sweep.friction_N, color=colour, linestyle=":", linewidth=1.0, label="dry friction")
+        scale_log(axes)
+        scale_log(axes, "y")
+        axis.set_xlabel(f"amplitude of the reference [{_units(sweeps)}]")
+        axis.set_ylabel("bandwidth [Hz]")
+
+    return Panel(
+        name="bandwidth", title="Bandwidth against amplitude", draw=draw, heights=(1.2,),
+        caption="Bandwidth against the amplitude of a sine, simulated and predicted by describing functions: below its "
+        "dry friction a plant sticks, at large amplitudes the command saturates.",
+    )  # fmt: skip
+
+
+def _units(sweeps: Sequence[LargeSignal]) -> str:
+    return " or ".join(dict.fromkeys(sweep.unit for sweep in sweeps))
+
+
+def amplitude_panel(sweep: LargeSignal) -> Panel:
+    """Draw the gain against frequency at each amplitude."""
+
+    def draw(axes: Sequence[Axes]) -> None:
+        from seaopt.reporting.figures.canvas import LIMIT, scale_log
+
+        (axis,) = axes
+        shades = np.linspace(0.85, 0.0, sweep.amplitude_N.size)
+        for amplitude, gain, hit, shade in zip(sweep.amplitude_N, sweep.gain, sweep.saturated, shades, strict=True):
+            colour = (shade * 0.75, 0.30 + shade * 0.55, 0.55 + shade * 0.4)
+            size = 20 * np.log10(np.maximum(np.abs(gain), 1e-6))
+            axis.plot(sweep.frequency_hz, size, color=colour, linewidth=1.3, label=f"{amplitude:.3g} {sweep.unit}")
+            axis.plot(sweep.frequency_hz[hit], size[hit], ".", color=colour, markersize=6)
+        axis.axhline(-3.0103, color=LIMIT, linestyle=":", linewidth=0.9)
+        scale_log(axes)
+        axis.set_xlabel("frequency [Hz]")
+        axis.set_ylabel("|F/F_ref| [dB]")
+
+    return Panel(
+        name=f"amplitude_{sweep.plant}", title=f"{sweep.plant}: gain at amplitudes", draw=draw, link="frequency",
+        caption="First harmonic of what is measured over the reference's amplitude; dots: the command saturates.",
+    )  # fmt: skip
+
+
+def saturation_panel(sweep: LargeSignal) -> Panel:
+    """Draw the amplitude at which the command of the linear loop saturates."""
+
+    def draw(axes: Sequence[Axes]) -> None:
+        from seaopt.reporting.figures.canvas import BLUE, scale_log
+
+        (axis,) = axes
+        axis.plot(sweep.frequency_hz, sweep.onset_N, color=BLUE, linewidth=1.4, label="the command saturates above")
+        scale_log(axes)
+        scale_log(axes, "y")
+        axis.set_xlabel("frequency [Hz]")
+        axis.set_ylabel(f"amplitude [{sweep.unit}]")
+
+    return Panel(
+        name=f"saturation_{sweep.plant}", title=f"{sweep.plant}: where the command saturates", draw=draw,
+        link="frequency",
+        caption="The amplitude of a sinusoidal reference at which the linear loop's command reaches its limit.",
+    )  # fmt: skip
+
+
+def environment_panels(stability: StabilityMap) -> list[Panel]:
+    """Return where the loop is stable against a mass (an inertia) on a spring, a panel per damper."""
+    return [_environment_panel(stability, number) for number in range(stability.damping.size)]
+
+
+def _environment_panel(stability: StabilityMap, number: int) -> Panel:
+    damping, called = stability.damping[number], stability.called
+    stable, edge = stability.stable[number], stability.boundary[number]
+
+    def draw(axes: Sequence[Axes]) -> None:
+        from matplotlib.colors import BoundaryNorm, ListedColormap
+
+        from seaopt.reporting.figures.canvas import VERMILION, scale_log
+
+        (axis,) = axes
+        axis.pcolormesh(
+            stability.mass, stability.stiffness, (~stable).T.astype(float),
+            cmap=ListedColormap([STABLE_COLOUR, UNSTABLE_COLOUR]), norm=BoundaryNorm([0, 0.5, 1], 2), shading="nearest",
+            rasterized=True,
+        )  # fmt: skip
+        if len(edge):
+            axis.plot(edge[:, 0], edge[:, 1], ".", color=VERMILION, markersize=3, label="edge of stability")
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        scale_log(axes)
+        scale_log(axes, "y")
+        axis.minorticks_off()  # hundreds over these decades, behind the map, and slow to draw
+        axis.set_xlabel(f"{called.inertia_word} on link 2 [{called.inertia}]")
+        axis.set_ylabel(f"spring to ground [{called.stiffness}]")
+
+    share = 100.0 * float(np.mean(stable))
+    return Panel(
+        name=f"environment_{number + 1}", hover="", title=f"Damper of {damping:g} {called.damping}: stable in {share:.3g} %",
+        draw=draw,
+        caption=f"Blue: the loop is stable with such a {called.inertia_word} on link 2, tied to the ground by a spring "
+        f"and a damper of {damping:g} {called.damping}; orange: it is not.",
+    )  # fmt: skip

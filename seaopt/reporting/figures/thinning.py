@@ -1,0 +1,63 @@
+"""Long series drawn with few points: of each stretch the least and the largest sample, in the order they come.
+
+This min-max method keeps every peak, and each point drawn is a sample; what lies between the two is left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+STRETCHES = 1000
+METHOD = "least and largest sample of each of {} stretches (min-max)"
+
+
+def thin_series(
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stretches: int = STRETCHES
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return a series of at most two samples per stretch; one that is short enough as it is.
+
+    Parameters
+    ----------
+    time, values : arrays, shape (n,)
+        NaN where a sample is missing.
+    stretches : int
+        Into how many, of equally many samples, the series is cut.
+
+    Returns
+    -------
+    time, values : arrays, shape (m,)
+        A stretch without a sample gives NaN.
+
+    Examples
+    --------
+    >>> thin_series(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -3.0, 0.0]), 2)
+    (array([0., 1., 3., 4.]), array([ 0.,  5.,  2., -3.]))
+
+    """
+    n = values.size
+    if n <= 2 * stretches:
+        return time, values
+    edges = np.linspace(0, n, stretches + 1).astype(int)
+    width = int(np.max(np.diff(edges)))
+    rows = np.minimum(edges[:-1, None] + np.arange(width), edges[1:, None] - 1)  # the last of a short one twice
+    block = values[rows]
+    low = np.argmin(np.where(np.isnan(block), np.inf, block), axis=1)
+    high = np.argmax(np.where(np.isnan(block), -np.inf, block), axis=1)
+    ends = np.sort(np.stack([low, high], axis=1), axis=1)
+    kept = np.take_along_axis(rows, ends, axis=1).ravel()
+    return time[kept], values[kept]
+
+
+def break_at(
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return a series with a missing sample in front of each sample of a row number, so that no line joins them."""
+    rows = np.asarray(gaps, dtype=int)
+    middles = 0.5 * (time[rows - 1] + time[rows])
+    return np.insert(time, rows, middles), np.insert(values, rows, np.nan)
+
+
+def describe_thinning(count: int, stretches: int = STRETCHES) -> str:
+    """Return how a series of so many samples is drawn, as a sentence for captions; empty where it is drawn whole."""
+    return "" if count <= 2 * stretches else f"Of {count} samples, {METHOD.format(stretches)} are drawn."

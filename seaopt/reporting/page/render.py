@@ -1,0 +1,56 @@
+"""The report's HTML templates, with the filters that write numbers."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from seaopt.estimation.advice.forecasts import Percent
+from seaopt.formatting import MISSING, format_band, format_number
+from seaopt.units import unit_after
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Return a template of this package with its values filled in, every text escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=PackageLoader("seaopt.reporting.page", "templates"), autoescape=True, trim_blocks=True,
+        lstrip_blocks=True, undefined=StrictUndefined,
+    )  # fmt: skip
+    environment.filters |= {
+        "number": format_number, "band": _format_band, "interval": _format_interval, "percent": _format_percent,
+        "unit": lambda unit: unit_after(unit).strip(), "slug": make_slug,
+    }  # fmt: skip
+    folder = files("seaopt.reporting.page").joinpath("templates")
+    fixed = {kind: Markup(folder.joinpath(kind).read_text(encoding="utf-8")) for kind in ("style.css", "script.js")}  # noqa: S704
+    return environment.get_template(name).render(**values, style=fixed["style.css"], script=fixed["script.js"])
+
+
+def make_slug(text: str) -> str:
+    """Return a text as an id.
+
+    Examples
+    --------
+    >>> make_slug("Margins on every plant")
+    'margins-on-every-plant'
+
+    """
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+def _format_band(ends: tuple[float, float] | None) -> str:
+    return format_band(ends, missing=MISSING)
+
+
+def _format_interval(ends: tuple[float, float] | None) -> str:
+    return " to ".join(format_number(end, 6) for end in ends) if ends and np.all(np.isfinite(ends)) else "unknown"
+
+
+def _format_percent(percent: Percent) -> str:
+    held_out = "" if percent.held_out is None else f" ({format_number(percent.held_out)})"
+    return format_number(percent.used) + held_out

@@ -1,0 +1,428 @@
+"""The report: one self-contained HTML page of fits, a controller and a certificate, and its figures as files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from seaopt.control import Controller, ForceMPC
+from seaopt.control.deploy.export import export
+from seaopt.control.laws.controller import name_gain_units
+from seaopt.control.laws.verdict import list_design_figures
+from seaopt.errors import SeaoptError, require_type
+from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
+from seaopt.files import write_text
+from seaopt.formatting import format_count, format_figure, format_number
+from seaopt.frequency import Survey
+from seaopt.records import record
+from seaopt.reporting.comparison import fit_surveys, response_panels, sentence
+from seaopt.reporting.drawing import write_figure
+from seaopt.reporting.figures import certificate as certificates
+from seaopt.reporting.figures import fit as fits
+from seaopt.reporting.figures import log as logs
+from seaopt.reporting.figures import loop as loops
+from seaopt.reporting.figures import simulation as simulations
+from seaopt.reporting.figures.panel import Panel, compose_sheet
+from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
+from seaopt.reporting.page.chart import Chart, make_chart
+from seaopt.reporting.page.provenance import describe_provenance
+from seaopt.reporting.page.render import render_template
+from seaopt.reporting.verdict import group_failures, label_requirement, verdict
+from seaopt.robustness import Certificate
+from seaopt.robustness.verification.environments import StabilityMap
+from seaopt.robustness.verification.judgement import Outcome
+from seaopt.robustness.verification.large_signal import LargeSignal
+from seaopt.robustness.verification.verification import Verification, describe_witness
+
+Result = Fit | Ranking | Controller | ForceMPC | Certificate | Verification | StabilityMap | LargeSignal
+KINDS = (Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap)
+FILED = ("controller", "fit", "ranking", "certificate", "amplitude", "contact")  # parts with figures as files
+LAW_NAME = "force_law"  # of the C header that can be copied
+
+
+@record(eq=False)
+class Material:
+    """What a report is made of; what was not given is None or empty."""
+
+    fit: Fit | None
+    ranking: Ranking | None
+    controller: Controller | None
+    mpc: ForceMPC | None
+    certificate: Certificate | None
+    verification: Verification | None
+    coupled: StabilityMap | None
+    large: tuple[LargeSignal, ...]
+    surveys: Mapping[str, Survey]
+    diagnostics: Diagnostics | None
+
+
+@record(eq=False)
+class Plate:
+    """Panels that stand together on the page, and in one file: the section's part that they belong to, and a text."""
+
+    name: str
+    part: str
+    heading: str
+    panels: tuple[Panel, ...]
+    text: str = ""
+
+
+@record(eq=False)
+class DrawnPlate:
+    """A plate with its charts, for the page."""
+
+    name: str
+    heading: str
+    charts: tuple[Chart, ...]
+    text: str
+
+
+def write_report(
+    results: Sequence[Result],
+    path: Path | str,
+    *,
+    title: str = "Series elastic actuator",
+    progress: Callable[[str, int, int], None] | None = None,
+    files: Sequence[Path | str] = (),
+    command: str = "",
+) -> Path:
+    """Write an HTML page that needs no network and no other file; its figures also stand beside it as SVG and PNG.
+
+    Parameters
+    ----------
+    results : sequence of Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, LargeSignal
+        At most one of each, of the last any number; sections without a result are left out. A fit that was not
+        read from a file has a section of diagnostics. A certificate's simulations need not be listed.
+    path : path
+        The page; figures go to the folder ``figures`` beside it.
+    title : str
+        Heading of the page.
+    progress : callable, optional
+        Called before each group of figures is drawn, which takes the most time, with its name, its number from 1 and
+        how many there are.
+    files : sequence of path
+        What the results were made of, besides the logs: named with their hashes.
+    command : str
+        What was typed to make the report, to be stated in it.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    SeaoptError
+        There is nothing to report, or two results of a kind.
+    FileError
+        The folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile, seaopt as so
+    >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), so.ControllerSpec(bandwidth_hz=30))
+    >>> so.write_report([controller], tempfile.mkdtemp() + "/report.html").name
+    'report.html'
+
+    """
+    require_type(results, Sequence, "results", "give a list of results")
+    require_type(path, (str, Path), "path", "give the page to write")
+    material, target = _sort_results(results), Path(path)
+    plates = list_plates(material)
+    drawn: dict[str, list[DrawnPlate]] = {}
+    for place, plate in enumerate(plates, start=1):
+        if progress is not None:
+            progress(plate.name, place, len(plates))
+        if plate.part in FILED:
+            write_figure(compose_sheet(plate.panels), target.parent / "figures" / plate.name)
+        charts = tuple(make_chart(panel) for panel in plate.panels)
+        drawn.setdefault(plate.part, []).append(
+            DrawnPlate(name=plate.name, heading=plate.heading, charts=charts, text=plate.text)
+        )
+    return write_text(target, _render(material, drawn, title, files, command))
+
+
+def _sort_results(results: Sequence[Result]) -> Material:
+    """Return the results by their kind, with what a certificate brings besides."""
+    fit, ranking, controller, mpc, certificate, verification, coupled = (_select(results, kind) for kind in KINDS)
+    large = tuple(result for result in results if isinstance(result, LargeSignal))
+    if not any(isinstance(result, (*KINDS, LargeSignal)) for result in results):
+        raise SeaoptError(
+            "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
+        )
+    if certificate is not None:
+        controller = controller or certificate.controller
+        simulation, verification = certificate.simulated, verification or certificate.runs
+        if simulation is not None:
+            coupled = coupled or simulation.environments
+            large = large or simulation.large_signal
+    return Material(
+        fit=fit, ranking=ranking, controller=controller, mpc=mpc, certificate=certificate, verification=verification,
+        coupled=coupled, large=large, surveys=fit_surveys(fit) if fit is not None else {},
+        diagnostics=diagnose(fit) if fit is not None and fit.minimum is not None else None,
+    )  # fmt: skip
+
+
+def _select(results: Sequence[Result], kind: type) -> Any:
+    matches = [result for result in results if isinstance(result, kind)]
+    if len(matches) > 1:
+        raise SeaoptError(
+            f"write_report got {len(matches)} results of kind {kind.__name__}; give one, or write two pages"
+        )
+    return matches[0] if matches else None
+
+
+def list_plates(material: Material) -> list[Plate]:
+    """Return every figure that the results allow, in the order of the page."""
+    return [
+        *_plates_of_controller(material), *_plates_of_fit(material), *_plates_of_certificate(material),
+        *_plates_of_simulation(material), *_plates_of_parameters(material), *_plates_of_logs(material),
+    ]  # fmt: skip
+
+
+def _plates_of_controller(material: Material) -> list[Plate]:
+    controller, certificate = material.controller, material.certificate
+    if controller is None or (controller.design is None and certificate is None):
+        return []
+    plants = certificates.plants_of(certificate) if certificate is not None else None
+    names = ("step", "bode", "tracking", "sensitivity", "nyquist", "noise")
+    panels = tuple(loops.LOOP_PANELS[name](controller, plants) for name in names)
+    return [Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)]
+
+
+def _plates_of_fit(material: Material) -> list[Plate]:
+    fit, plates = material.fit, list[Plate]()
+    for experiment in fit.experiments if fit is not None else ():
+        assert fit is not None
+        name, prediction = experiment.name, fit.predict(experiment)
+        panels = [fits.outputs_panel(prediction), fits.residuals_panel(prediction), fits.spectrum_panel(prediction)]
+        plates.append(Plate(name=f"time_{name}", part="fit", heading=f"{name} in time", panels=tuple(panels)))
+        if name in material.surveys:
+            responses = response_panels(experiment, material.surveys[name], _models(material))
+            text = sentence(material.surveys[name], fit, name)
+            plates.append(Plate(
+                name=f"response_{name}", part="fit", heading=f"{name} in frequency", panels=tuple(responses), text=text
+            ))  # fmt: skip
+    if material.diagnostics is not None:
+        for name in material.diagnostics.outputs:
+            panels = [fits.autocorrelation_panel(material.diagnostics, name)]
+            panels.append(fits.input_correlation_panel(material.diagnostics, name))
+            plates.append(Plate(
+                name=f"residual_{name}", part="diagnostics", heading=f"What {name} leaves", panels=tuple(panels)
+            ))  # fmt: skip
+    if material.ranking is not None:
+        panels = [evidence_panel(material.ranking), *octave_panels(material.ranking)]
+        plates.append(Plate(name="ranking", part="ranking", heading="", panels=tuple(panels)))
+    return plates
+
+
+def _models(material: Material) -> dict[str, Fit]:
+    """Return the fits that are drawn over measured responses: those that are compared, or the only one."""
+    if material.ranking is not None:
+        return {f"model, {row.name}": material.ranking.fits[row.name] for row in material.ranking.rows}
+    return {} if material.fit is None else {"model, fitted": material.fit}
+
+
+def _plates_of_certificate(material: Material) -> list[Plate]:
+    certificate = material.certificate
+    if certificate is None:
+        return []
+    panels = [certificates.worst_panel(certificate)]
+    if certificate.drawn_ms:
+        panels.append(certificates.draws_panel(certificate))
+    panels.append(certificates.requirements_panel(certificate))
+    if certificate.friction or certificate.friction_draws:
+        panels.append(certificates.friction_panel(certificate))
+    return [Plate(name="certificate", part="certificate", heading="", panels=tuple(panels))]
+
+
+def _plates_of_simulation(material: Material) -> list[Plate]:
+    plates: list[Plate] = []
+    played = material.verification
+    for name in dict.fromkeys(row.plant for row in played.rows) if played is not None else ():
+        assert played is not None
+        panels = simulations.simulation_panels(played, name)
+        plates.append(Plate(
+            name=f"simulation_{name}", part="simulation", heading=f"Runs on {name}", panels=tuple(panels)
+        ))  # fmt: skip
+    if material.large:
+        panels = [simulations.bandwidth_panel(material.large)]
+        plates.append(Plate(name="bandwidth", part="amplitude", heading="", panels=tuple(panels)))
+        panels = [each for sweep in material.large
+                  for each in (simulations.amplitude_panel(sweep), simulations.saturation_panel(sweep))]  # fmt: skip
+        plates.append(Plate(name="amplitude", part="amplitude", heading="", panels=tuple(panels)))
+    if material.coupled is not None:
+        panels = simulations.environment_panels(material.coupled)
+        simulated = material.certificate.simulated if material.certificate is not None else None
+        if simulated is not None and simulated.passivity is not None and material.controller is not None:
+            panels.insert(0, certificates.impedance_panel(material.controller))
+        plates.append(Plate(name="environments", part="contact", heading="", panels=tuple(panels)))
+    return plates
+
+
+def _plates_of_parameters(material: Material) -> list[Plate]:
+    fit = material.fit
+    if fit is None:
+        return []
+    panels: list[Panel] = []
+    for make in (fits.parameters_panel, fits.correlation_panel):
+        try:
+            panels.append(make(fit))
+        except SeaoptError:  # nothing is free, or nothing is known of it
+            continue
+    return [Plate(name="parameters", part="parameters", heading="", panels=tuple(panels))] if panels else []
+
+
+def _plates_of_logs(material: Material) -> list[Plate]:
+    experiments = material.fit.experiments if material.fit is not None else ()
+    return [
+        Plate(
+            name=f"log_{one.name}", part=f"log {one.name}", heading="",
+            panels=tuple(logs.log_panels(one.log, one.log.quality)),
+        )
+        for one in experiments
+    ]  # fmt: skip
+
+
+def _render(
+    material: Material, drawn: Mapping[str, Sequence[DrawnPlate]], title: str, files: Sequence[Path | str],
+    command: str,
+) -> str:  # fmt: skip
+    """Return the page."""
+    fit, controller, certificate = material.fit, material.controller, material.certificate
+    experiments = fit.experiments if fit is not None else ()
+    runs = material.verification
+    apart = runs if certificate is None or runs is not certificate.runs else None  # else the certificate speaks of them
+    met = verdict(fit, controller, certificate, apart, material.mpc)
+    return render_template(
+        "page.html.jinja", title=title, verdict=met, reasons=list_reasons(material), glance=list_figures(material),
+        plates=drawn, fit=fit, diagnostics=material.diagnostics, ranking=material.ranking, controller=controller,
+        mpc=material.mpc, certificate=certificate, verification=material.verification, large=material.large,
+        coupled=material.coupled, simulated=None if certificate is None else certificate.simulated,
+        limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
+        units={} if controller is None else name_gain_units(controller.command),
+        header=None if controller is None else write_header(controller),
+        forces=_describe_forces(controller), swinging=_swings(certificate),
+        requirements=[] if certificate is None else group_requirements(certificate),
+        failures=[] if material.verification is None else list_failed_runs(material.verification),
+        logs=[(one, one.log.quality) for one in experiments],
+        provenance=describe_provenance(experiments, files, command),
+    )  # fmt: skip
+
+
+def list_reasons(material: Material) -> list[str]:
+    """Return why something is not met, the same failure once: errors of the fit, limits, requirements."""
+    reasons: list[str] = []
+    if material.fit is not None:
+        reasons += [f"{one.where}: {one.text}" if one.where else one.text for one in material.fit.errors]
+    for one in (material.controller, material.mpc):
+        if one is not None and not one.feasible:
+            reasons.append(one.explanation)
+    if material.certificate is not None:
+        reasons += [one.text for one in group_failures(material.certificate.requirements)]
+    elif material.verification is not None:
+        reasons += [f"{row.plant}, {row.scenario}: {row.reason}" for row in material.verification.failures[:1]]
+    return reasons
+
+
+def list_figures(material: Material) -> list[tuple[str, str, str]]:
+    """Return what to see at a glance: a name, a figure with its unit, and what it is compared with."""
+    figures: list[tuple[str, str, str]] = []
+    if material.fit is not None and material.fit.outputs:
+        name, output, one = min(
+            ((name, output, one) for name, row in material.fit.outputs.items() for output, one in row.items()),
+            key=lambda each: each[2].fit_percent,
+        )
+        figures.append(("fit", f"{one.fit_percent:.2f} %", f"least of the outputs: {name}.{output}"))
+    controller, certificate = material.controller, material.certificate
+    if controller is not None:
+        a, spec = controller.achieved, controller.spec
+        ms = spec.level("max_sensitivity")
+        figures += [
+            ("bandwidth", format_figure(a.bandwidth_hz, "Hz", 3), f"asked {spec.bandwidth_hz:g} Hz"),
+            ("Ms", format_number(a.ms, 3), "" if ms is None else f"at most {ms:g}"),
+            ("phase margin", format_figure(a.phase_margin_deg, "deg", 3), "design plant"),
+            ("noise gain", format_figure(a.noise_gain, controller.command.gain_unit, 3), "design plant"),
+        ]
+    if certificate is not None:
+        worst = max(certificate.worst.values(), key=lambda one: one.ms)
+        draws = certificate.monte_carlo
+        figures.append(("worst Ms found", format_number(worst.ms, 3), f"on {len(certificate.plants)} plants"))
+        if draws.samples:
+            figures.append(("draws failed", f"{draws.failures} of {draws.samples}", "all plants together"))
+    if material.verification is not None:
+        failed, count = len(material.verification.failures), len(material.verification.rows)
+        figures.append(("runs failed", f"{failed} of {count}", "simulated, nonlinear"))
+    return figures
+
+
+@record(eq=False)
+class RequirementRow:
+    """A requirement in words; of several that are missed in the same way, the worst and how many."""
+
+    label: str
+    value: float
+    limit: float
+    sense: str
+    met: bool
+    where: str
+    count: int
+
+
+def group_requirements(certificate: Certificate) -> list[RequirementRow]:
+    """Return what is missed, each kind once with its count, and then what is met."""
+    groups = [(one.worst, one.count) for one in group_failures(certificate.requirements)]
+    groups += [(row, 1) for row in certificate.requirements if row.met]
+    return [
+        RequirementRow(
+            label=label_requirement(row), value=row.value, limit=row.limit, sense=row.sense, met=row.met,
+            where=row.where, count=count,
+        )
+        for row, count in groups
+    ]  # fmt: skip
+
+
+def list_failed_runs(verification: Verification) -> list[str]:
+    """Return what failed in simulation: the same kind of fault on a plant once, with its first run and a count."""
+    kinds: dict[tuple[str, str], list[Outcome]] = {}
+    for row in verification.failures:
+        kinds.setdefault((row.plant, row.faults[0].kind if row.faults else row.reason), []).append(row)
+    return [
+        f"{row.plant}, {row.scenario}, draw {row.draw}: {row.reason}{describe_witness(row)}"
+        + (f" (and {format_count(len(more), 'more such run')})" if more else "")
+        for row, *more in kinds.values()
+    ]
+
+
+def write_header(controller: Controller) -> tuple[bool, str]:
+    """Return the C header of the gains, and True; or False, and why there is none."""
+    try:
+        with TemporaryDirectory() as folder:
+            paths = export(controller, folder, name=LAW_NAME, allow_infeasible=True)
+            return True, next(path for path in paths if path.name.endswith("_gains.h")).read_text(encoding="utf-8")
+    except SeaoptError as error:
+        return False, str(error)
+
+
+def _swings(certificate: Certificate | None) -> bool:
+    """Tell whether some plant's -3 dB bandwidth says nothing: its tracking band does not start at 0 Hz."""
+    plants = certificate.plants.values() if certificate is not None else ()
+    return any(figures.tracking_band_hz is not None and figures.tracking_band_hz[0] > 1.0 for figures in plants)
+
+
+def _describe_forces(controller: Controller | None) -> str:
+    """Return what the limit of the command allows, and what the motor can do without overheating."""
+    if controller is None:
+        return ""
+    slow, band, unit = controller.force_limit(0.0), controller.spec.bandwidth_hz, controller.command.reference_unit
+    sentences = [] if controller.rating is None else [f"Motor: {line}." for line in controller.rating.describe()]
+    if slow is not None and controller.command_limit is not None:
+        sentences.insert(
+            0,
+            f"The limit of {controller.command.show(controller.command_limit)} allows a reference of "
+            f"{format_number(slow)} {unit} at rest and {format_number(controller.force_limit(band))} {unit} at "
+            f"{band:g} Hz, whatever the gains.",
+        )
+    return " ".join(sentences)
