@@ -29,7 +29,8 @@ from seaopt.control import (
 from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.loops.port import hold_response, port_of
 from seaopt.estimation import Limits, design_experiment
-from seaopt.reporting.verification import large_signal_figure, stability_figure
+from seaopt.reporting.figures.panel import compose_sheet
+from seaopt.reporting.figures.simulation import amplitude_panel, environment_panels, saturation_panel
 from seaopt.robustness.verification.environments import coupled_stability
 from seaopt.robustness.verification.large_signal import large_signal
 
@@ -163,8 +164,9 @@ def verification() -> None:
     spec = so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
     controller = so.tune(stand, params, spec, robust_to={"swing": swing})
     found = [large_signal(controller, plant, params) for plant in (stand, swing)]
-    save(large_signal_figure(found), "large_signal")
-    save(stability_figure(coupled_stability(controller, stand, params)), "environments")
+    drawn = [panel for sweep in found for panel in (amplitude_panel(sweep), saturation_panel(sweep))]
+    save(compose_sheet(drawn), "large_signal")
+    save(compose_sheet(environment_panels(coupled_stability(controller, stand, params))), "environments")
 
 
 GAINS = Gains(k_p=3.18, k_i=1.31, k_d=0.0328, T_f=1.01e-3, k_r=4.18)  # 30 Hz on the stand

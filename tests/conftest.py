@@ -187,5 +187,21 @@ def short_log(stand, thor) -> so.Log:
 
 @pytest.fixture
 def without_drawing(monkeypatch):
-    """Let reports write empty figures: drawing takes most of their time."""
+    """Let reports have empty figures: drawing takes most of their time."""
+    from seaopt.reporting.page.chart import Chart
+
+    def leave_empty(panel):
+        return Chart(
+            name=panel.name,
+            title=panel.title,
+            caption=panel.caption,
+            link="",
+            svg="<svg></svg>",
+            axes="",
+            hover="",
+            key=(),
+        )
+
     monkeypatch.setattr("seaopt.reporting.drawing.render_figure", lambda figure, kind: b"<svg></svg>")
+    monkeypatch.setattr("seaopt.reporting.page.report.make_chart", leave_empty)
+    monkeypatch.setattr("seaopt.reporting.page.report.compose_sheet", lambda panels: None)

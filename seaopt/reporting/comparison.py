@@ -147,7 +147,7 @@ def survey_panels(
     given: ParameterSet | None = None,
     fitted: Mapping[str, tuple[Survey, Fit]] | None = None,
 ) -> list[Panel]:
-    """Return a panel for every pair of the surveys with its second-order fit, and the plant with given values and fitted.
+    """Return a panel for every pair of the surveys with its second-order fit, the plant as given, and as fitted.
 
     Parameters
     ----------

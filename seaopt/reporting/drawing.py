@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from seaopt.files import write_bytes
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 130
-TEXT_AS_TEXT = {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "seaopt"}
+TEXT_AS_TEXT: dict[Any, Any] = {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "seaopt"}
 
 
 def write_figure(figure: Figure, path: Path | str) -> list[Path]:
@@ -29,6 +29,6 @@ def render_figure(figure: Figure, kind: str) -> bytes:
     metadata = {"Date": None} if kind == "svg" else None
     with rc_context(TEXT_AS_TEXT), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # a character that the font lacks is a box
-        options = {"pil_kwargs": {"compress_level": 1}} if kind == "png" else {}  # in half the time
+        options: dict[str, Any] = {"pil_kwargs": {"compress_level": 1}} if kind == "png" else {}  # in half the time
         figure.savefig(stream, format=kind, dpi=DPI, metadata=metadata, **options)
     return stream.getvalue()

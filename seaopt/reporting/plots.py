@@ -226,9 +226,7 @@ def _select(prediction: ModelledOutputs, output: str | None) -> ModelledOutputs:
         return prediction
     if output not in prediction.measured:
         raise SeaoptError(f'output = "{output}" was not measured; {suggestion(output, prediction.measured)}')
-    return replace(
-        prediction, measured={output: prediction.measured[output]}, model={output: prediction.model[output]}
-    )
+    return replace(prediction, measured={output: prediction.measured[output]}, model={output: prediction.model[output]})
 
 
 class DiagnosticsPlots(Plots):
@@ -447,9 +445,7 @@ class CertificatePlots(Plots):
         """Draw the gain against frequency at several amplitudes."""
         return _draw([simulations.amplitude_panel(one) for one in self._sweeps() if plant in (None, one.plant)], ax)
 
-    def simulations(
-        self, plant: str | None = None, scenario: str | None = None, *, ax: Place = None
-    ) -> PlainFigure:
+    def simulations(self, plant: str | None = None, scenario: str | None = None, *, ax: Place = None) -> PlainFigure:
         """Draw the worst run of each scenario, simulated again; of one plant, or one scenario, if named."""
         if self._certificate.runs is None:
             raise ControlError("nothing was simulated for this certificate; call with_simulation()")
@@ -482,7 +478,9 @@ class VerificationPlots(Plots):
         rows = [row for row in rows if scenario in (None, row.scenario)]
         if not rows:
             played = ", ".join(f"{row.scenario} on {row.plant}" for row in self._verification.worst())
-            raise ControlError(f"{scenario or 'no scenario'} on {plant or 'any plant'} was not played; these were: {played}")
+            raise ControlError(
+                f"{scenario or 'no scenario'} on {plant or 'any plant'} was not played; these were: {played}"
+            )
         return [simulations.simulation_panel(self._verification, row) for row in rows]
 
     def runs(self, plant: str | None = None, scenario: str | None = None, *, ax: Place = None) -> PlainFigure:

@@ -54,7 +54,9 @@ def group_failures(requirements: Sequence[Requirement]) -> list[Failure]:
     for row in requirements:
         if not row.met:
             kinds.setdefault(row.name, []).append(row)
-    failures = [Failure(worst=max(rows, key=lambda row: usage_of(row) or 0.0), count=len(rows)) for rows in kinds.values()]
+    failures = [
+        Failure(worst=max(rows, key=lambda row: usage_of(row) or 0.0), count=len(rows)) for rows in kinds.values()
+    ]
     return sorted(failures, key=lambda one: -(usage_of(one.worst) or 0.0))
 
 

@@ -247,12 +247,9 @@ def test_the_report_stands_alone(done):
     page = (done.results / "report.html").read_text(encoding="utf-8")
     for fetched in re.findall(r'(?:src|href)="([^"]+)"', page):
         assert fetched.startswith(("#", "data:image/png;base64,")), fetched
-    assert "<script" not in page
-    # Each of two experiments: time, response, residuals; the loop; simulations of two plants, gain and bandwidth
-    # against amplitude, environments.
-    assert page.count("<svg") == 12
+    assert page.count('<figure class="chart"') > 40
     for words in (
-        "Parameters", "Measured against model", "Margins on every plant", "Requirements", "tracking band",
+        "Parameters", "How well the model fits", "Margins on every plant", "Requirements", "tracking band",
         "Simulation of the nonlinear plants", "Bandwidth against amplitude",
         "Contact with an environment", "Re Z falls to",
     ):  # fmt: skip

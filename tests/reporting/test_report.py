@@ -1,9 +1,15 @@
 from __future__ import annotations
 
+import hashlib
+import html
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.reporting import verdict
 
 
 def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
@@ -13,8 +19,8 @@ def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
     page = so.write_report([controller], tmp_path / "r.html", title=title, progress=lambda *each: told.append(each))
     assert told == [("loop", 1, 1)]
     text = page.read_text(encoding="utf-8")
-    assert "<script>" not in text
-    assert "&lt;script&gt;" in text
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)" in text
 
 
 def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path, without_drawing):
@@ -60,10 +66,10 @@ def test_a_fit_has_diagnostics_and_a_ranking_says_why(stand, short_log, thor, tm
     page = so.write_report([fits["lumped"], ranking], tmp_path / "r.html").read_text(encoding="utf-8")
     assert "chirp.F2: the residual follows I" in page
     assert "unlumped is preferred, with very strong evidence against lumped" in page
-    for name in ("residual_chirp", "ranking"):
+    for name in ("time_chirp", "ranking"):
         assert (tmp_path / "figures" / f"{name}.svg").exists()
     alone = so.write_report([ranking], tmp_path / "alone.html").read_text(encoding="utf-8")
-    assert "Which model" in alone and "Parameters" not in alone
+    assert "Which model" in alone and 'id="parameters"' not in alone
 
 
 def test_findings_of_a_fit_stand_in_the_report(stand, short_log, thor, tmp_path, without_drawing):
@@ -74,16 +80,18 @@ def test_findings_of_a_fit_stand_in_the_report(stand, short_log, thor, tmp_path,
     read = so.Fit.from_dict(fit.to_dict(), (bench,))  # a report of a stored fit says the same
     for number, each in enumerate((fit, read)):
         page = so.write_report([each], tmp_path / f"{number}.html").read_text(encoding="utf-8")
-        section = page.split("<h2>Findings</h2>")[1].split("</ul>")[0]
-        assert section.count("<li") == len(fit.findings)
-        assert section.count("<b>error</b>") == len(fit.errors)
+        section = page.split('id="findings-heading"')[1].split("</ul>")[0]
+        assert section.count('<b class="error">') == len(fit.errors)
+        assert section.count("<i>fit</i>") == len(fit.findings) + len(fit.notes)
         assert "F1 and F2 are swapped" in section
+        why = page.split("<h3>Why</h3>")[1].split("</ul>")[0]
+        assert why.count("<li>") == len(fit.errors)
         for text in (page, repr(each)):  # beside the standard deviations
             assert text.lower().count("hold only if the model is right") == 1
     clean = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1",))], thor.free("J"))
     assert not clean.findings
     page = so.write_report([clean], tmp_path / "clean.html").read_text(encoding="utf-8")
-    assert "Findings" not in page
+    assert "<h3>Why</h3>" not in page and '<b class="error">' not in page.split('id="findings"')[1]
     assert not clean.caveat and "only if the model is right" not in page + repr(clean)
 
 
@@ -92,7 +100,7 @@ def test_a_fit_from_a_file_has_no_diagnostics(stand, short_log, thor, tmp_path, 
     bench = so.Experiment(plant=stand, log=short_log, name="chirp", outputs=("F1",))
     read = so.Fit.from_dict(so.fit([bench], thor.free("J")).to_dict(), (bench,))
     page = so.write_report([read], tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "Measured against model" in page and "Diagnostics" not in page
+    assert "How well the model fits" in page and 'id="diagnostics"' not in page
 
 
 def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, tmp_path, without_drawing):
@@ -101,3 +109,57 @@ def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, 
     fit = so.fit([experiment], thor.free("J", "b_r"))
     page = so.write_report([fit], tmp_path / "report.html").read_text(encoding="utf-8")
     assert "at or beyond its declared range" in page
+
+
+SECTIONS = [
+    "verdict", "controller", "fit", "diagnostics", "certificate", "simulation", "amplitude", "contact", "parameters",
+    "logs", "findings", "provenance",
+]  # fmt: skip
+
+
+def test_the_page_has_its_order_and_needs_nothing_else(fitted, controller, certificate, tmp_path):
+    problem = tmp_path / "actuator.toml"
+    problem.write_bytes(b"schema = 1")
+    page = so.write_report(
+        [fitted, controller, certificate], tmp_path / "r.html", files=[problem], command="seaopt run actuator.toml"
+    )
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r'<section id="(\w+)"', text) == SECTIONS
+    assert re.findall(r'<li><a href="#(\w+)">', text) == SECTIONS
+    for fetched in re.findall(r'(?:src|href)="([^"]+)"|url\(([^)]+)\)', text):
+        assert "".join(fetched).startswith(("#", "data:image/png;base64,")), fetched
+    assert "http" not in re.sub(r"http://www\.w3\.org/[\w/]+", "", text)  # names of vocabularies are not fetched
+    assert page.stat().st_size < 6e6
+    ids = re.findall(r'\bid="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+    charts = text.count('<figure class="chart"')
+    assert charts == text.count('role="img"') == text.count("<figcaption>") > 40
+    own = text.split('id="provenance"')[1]
+    digest = hashlib.sha256(b"schema = 1").hexdigest()
+    assert digest in own and "seaopt run actuator.toml" in own and so.__version__ in own
+    header = re.search(r'aria-label="C header">(.*?)</pre>', text, flags=re.DOTALL).group(1)
+    written = so.export(controller, tmp_path / "c", name="force_law", allow_infeasible=True)
+    assert html.unescape(header) == next(one for one in written if one.name.endswith("_gains.h")).read_text("utf-8")
+    assert f"k_p = {controller.gains['k_p']!r}" in text
+
+
+def test_a_failure_is_said_once_with_a_count(fitted, controller, certificate, tmp_path, without_drawing):
+    row = next(one for one in certificate.requirements if one.name == "max_sensitivity")
+    broken = [replace(row, value=1.7 + 0.01 * k, met=False, where=f"plant {k}") for k in range(12)]
+    failed = replace(certificate, passed=False, requirements=(*broken, row))
+    text = so.write_report([failed], tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Ms (12 times)" in text.split("<h3>Why</h3>")[0]
+    why = text.split("<h3>Why</h3>")[1].split("</ul>")[0]
+    assert why.count("<li>") == 1 and "Ms 1.81, above 1.6 (the worst of 12): plant 11" in why
+    table = text.split('id="certificate"')[1].split("</table>")[0]
+    assert table.count("plant 11") == 1 and "plant 10" not in table
+    worst = dict(verdict(None, None, failed))
+    assert worst == {False: "Certificate: failed – Ms (12 times)"}
+
+
+@pytest.mark.parametrize("kind", ["nothing uncertain", "simulated"])
+def test_what_a_certificate_says_in_a_line(certificate, kind):
+    drawn = certificate.monte_carlo if kind == "simulated" else replace(certificate.monte_carlo, samples=0)
+    ((met, text),) = verdict(None, None, replace(certificate, passed=True, monte_carlo=drawn))
+    assert met and f"{len(certificate.runs.rows)} simulations passed" in text
+    assert ("nothing was uncertain" in text) == (kind == "nothing uncertain")

@@ -96,9 +96,8 @@ def add_axes(
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
         axis.tick_params(labelsize=FONT, length=3, labelbottom=axis is axes[-1])
-        axis.xaxis.label.set_size(FONT)
-        axis.yaxis.label.set_size(FONT)
-        axis.yaxis.get_offset_text().set_size(FONT)
+        for text in (axis.xaxis.label, axis.yaxis.label, axis.yaxis.get_offset_text()):
+            text.set_fontsize(FONT)
     return tuple(axes)
 
 

@@ -95,7 +95,7 @@ def worst_panel(certificate: Certificate) -> Panel:
         for (name, plant), colour in zip(certificate.linear_models.items(), COLOURS * 9, strict=False):
             cases = [("", (plant, certificate.parameters), "-")]
             if name in certificate.worst and certificate.worst[name].parameters:
-                cases.append((", worst case", tuple(certificate.worst[name]), "--"))
+                cases.append((", worst case", (certificate.worst[name][0], certificate.worst[name][1]), "--"))
             for word, (model, values), style in cases:
                 loop = controller.close(model, values)
                 f = loop.grid()
@@ -184,7 +184,8 @@ def friction_panel(certificate: Certificate) -> Panel:
 
     said = " ".join(f"{name}: {margin.describe()}." for name, margin in margins.items())
     return Panel(
-        name="friction", hover="", title="Friction margin", draw=draw, heights=(0.5 + 0.12 * len(names),), left=NAMES_LEFT,
+        name="friction", title="Friction margin", draw=draw, heights=(0.5 + 0.12 * len(names),), left=NAMES_LEFT,
+        hover="",
         caption=f"{said} What has no bound stands at the right edge, what is not shown at the left one.",
     )  # fmt: skip
 
@@ -206,7 +207,7 @@ def impedance_panel(controller: Controller) -> Panel:
         open_port, closed = port.response(f).impedance(np.zeros(f.size, dtype=complex)), port.response(f).impedance(law)
         for z, colour, style, label in ((open_port, MEASURED, "--", "no control"), (closed, BLUE, "-", "controlled")):
             upper.plot(f, np.abs(z), color=colour, linestyle=style, linewidth=1.3, label=label)
-            lower.plot(f, z.real / np.abs(z), color=colour, linestyle=style, linewidth=1.3, label=label)
+            lower.plot(f, np.real(z) / np.abs(z), color=colour, linestyle=style, linewidth=1.3, label=label)
         lower.axhline(0.0, color=LIMIT, linewidth=0.9, linestyle=":")
         lower.set_ylim(-1.1, 1.1)
         upper.margins(x=0.0)

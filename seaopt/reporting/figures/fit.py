@@ -1,4 +1,4 @@
-"""Figures of a fit and of a prediction: outputs, residuals, spectra, correlations, and how well parameters are known."""
+"""Figures of a fit and of a prediction: outputs, residuals, spectra, correlations, and the parameters' intervals."""
 
 from __future__ import annotations
 

@@ -46,7 +46,10 @@ def frontier_panel(frontier: Frontier, figure: str) -> Panel:
         axis.set_ylabel(label.format(called=frontier.mechanics))
 
     return Panel(
-        name=f"frontier_{figure}", title=title, draw=draw, link="bandwidth",
+        name=f"frontier_{figure}",
+        title=title,
+        draw=draw,
+        link="bandwidth",
         caption="Of the best controller for each bandwidth; hollow: it misses a limit.",
     )
 

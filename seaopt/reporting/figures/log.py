@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.report import describe_jitter
 from seaopt.reporting.figures.fit import label_channel
 from seaopt.reporting.figures.panel import Panel
-from seaopt.reporting.figures.thinning import break_at, describe_thinning, thin_series
+from seaopt.reporting.figures.thinning import STRETCHES, break_at, describe_thinning, thin_series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -145,7 +146,10 @@ def density_panel(quality: Quality, name: str) -> Panel:
         scale_log(axes, "y")
 
     return Panel(
-        name=f"density_{name}", title=f"{name} in frequency", draw=draw, link="log frequency",
+        name=f"density_{name}",
+        title=f"{name} in frequency",
+        draw=draw,
+        link="log frequency",
         caption=f"Amplitude spectral density of {name} (Welch, Hann window).",
     )
 
@@ -171,8 +175,8 @@ def _draw_series(
     gaps = gaps[(gaps > 0) & (gaps < time.size)] if gaps.size <= MOST_MARKS else gaps[:0]
     ends = [0, *gaps.tolist(), time.size]
     parts = [
-        thin_series(time[first:last], values[first:last], max(2, 1000 * (last - first) // time.size))
-        for first, last in zip(ends[:-1], ends[1:], strict=True)
+        thin_series(time[first:last], values[first:last], max(2, STRETCHES * (last - first) // time.size))
+        for first, last in pairwise(ends)
     ]
     starts = np.cumsum([part[0].size for part in parts])[:-1]
     times, kept = (np.concatenate([part[side] for part in parts]) for side in (0, 1))

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 Plants = Mapping[str, tuple[Plant, ParameterSet]]
 LOWEST_HZ = 0.05
 STYLES = ("-", "--", "-.", ":")
-LEAST_PERIODS, MOST_S, SETTLED, SPARE = 4.0, 4.0, 0.01, 1.25  # of a step that is drawn until it has settled on the first plant
+LEAST_PERIODS, MOST_S, SETTLED, SPARE = (
+    4.0,
+    4.0,
+    0.01,
+    1.25,
+)  # of a step that is drawn until it has settled on the first plant
 RUNAWAY = 3.0  # steps of size beyond which an unstable loop is not drawn
 FLOOR_DB = -40.0
 
@@ -173,7 +178,7 @@ def nyquist_panel(controller: Controller, plants: Plants | None = None) -> Panel
             axis.plot(x, y, color=LIMIT, linewidth=0.9, linestyle="--", label=f"Ms = {ms:g}")
         for _, loop, look in _looks(loops):
             response = loop.open_loop(_frequencies(loop))
-            axis.plot(response.real, response.imag, **look)
+            axis.plot(np.real(response), np.imag(response), **look)
         axis.plot([-1.0], [0.0], "+", color=LIMIT, markersize=9, markeredgewidth=1.4)
         axis.set_xlim(-2.6, 1.6)
         axis.set_ylim(-2.2, 1.3)
@@ -183,7 +188,11 @@ def nyquist_panel(controller: Controller, plants: Plants | None = None) -> Panel
 
     said = "" if ms is None else f", and must stay out of the shaded disk of radius 1/{ms:g} about it"
     return Panel(
-        name="nyquist", hover="point", title="Nyquist", draw=draw, heights=(1.6,),
+        name="nyquist",
+        hover="point",
+        title="Nyquist",
+        draw=draw,
+        heights=(1.6,),
         caption=f"The open loop in the complex plane: it must not encircle -1{said}.",
     )
 

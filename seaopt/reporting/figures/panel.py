@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from seaopt.errors import SeaoptError
@@ -89,7 +89,7 @@ def draw_panel(panel: Panel, ax: Axes | Sequence[Axes] | None = None, *, bare: b
         figure = new_figure(WIDTH, HEIGHT * sum(panel.heights))
         axes = add_axes(figure, panel.heights, panel.left, title=not bare)
     else:
-        axes = (ax,) if isinstance(ax, Axes) else tuple(ax)
+        axes = tuple(ax) if isinstance(ax, Iterable) else (ax,)
     if len(axes) != count or not all(isinstance(axis, Axes) for axis in axes):
         what = "one Axes" if count == 1 else f"a sequence of {count} Axes"
         raise SeaoptError(f"ax = {str(ax)[:60]} does not fit the figure {panel.name}; give {what}, or leave it out")

@@ -66,6 +66,7 @@ def evidence_panel(ranking: Ranking) -> Panel:
         axis.set_xlabel("effective BIC above the best [-]")
 
     return Panel(
-        name="evidence", hover="", title="Evidence against each fit", draw=draw, heights=(0.5 + 0.12 * len(ranking.rows),), left=NAMES_LEFT,
+        name="evidence", title="Evidence against each fit", draw=draw, heights=(0.5 + 0.12 * len(ranking.rows),),
+        left=NAMES_LEFT, hover="",
         caption="How far the effective BIC of each fit lies above the best one's, on an axis that is linear up to 10.",
     )  # fmt: skip

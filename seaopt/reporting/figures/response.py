@@ -42,9 +42,7 @@ def response_panel(name: str, title: str, pair: Pair, curves: Sequence[Curve], c
     count = pair.estimate.frequency_hz.size
     if count > LINES:
         said += f" Of {count} lines, those nearest to {LINES} frequencies evenly spaced on the axis are drawn."
-    return Panel(
-        name=name, title=title, draw=draw, heights=ROWS, link="frequency", caption=f"{said} {caption}".strip()
-    )
+    return Panel(name=name, title=title, draw=draw, heights=ROWS, link="frequency", caption=f"{said} {caption}".strip())
 
 
 def _draw(axes: Sequence[Axes], pair: Pair, curves: Sequence[Curve]) -> None:
@@ -64,15 +62,13 @@ def _draw(axes: Sequence[Axes], pair: Pair, curves: Sequence[Curve]) -> None:
     coherence.set_ylim(0.0, 1.05)
     coherence.set_xlim(*ends)
     scale_log(axes)
-    for axis, label in zip(
-        axes, (f"|{pair.name}| [dB re {pair.unit}]", "phase [deg]", "coherence [-]"), strict=True
-    ):
+    for axis, label in zip(axes, (f"|{pair.name}| [dB re {pair.unit}]", "phase [deg]", "coherence [-]"), strict=True):
         axis.set_ylabel(label)
     coherence.set_xlabel("frequency [Hz]")
 
 
 def spread_lines(f: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Return which lines of an estimate are drawn: all of them, or those nearest to frequencies evenly spaced in log f."""
+    """Return which lines of an estimate are drawn: all, or those nearest to frequencies evenly spaced in log f."""
     drawn = np.full(f.size, f.size <= LINES)
     if f.size > LINES:
         wanted = np.geomspace(f[0], f[-1], LINES)

@@ -1,4 +1,4 @@
-"""Figures of simulated loops: runs of scenarios, gain and bandwidth against amplitude, stability against environments."""
+"""Figures of simulated loops: runs of scenarios, gain and bandwidth by amplitude, stability against environments."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ def simulation_panel(verification: Verification, row: Outcome) -> Panel:
     drawn = "" if row.draw == NOMINAL else f", draw {row.draw}"
     cut = "" if visible.all() else f", {time[-1]:.2g} of {trace.time[-1]:.3g} s"
     return Panel(
-        name=f"simulation_{row.plant}_{row.scenario}", title=f"{row.plant}, {row.scenario}{drawn}{cut if row.passed else ': FAILED'}",
+        name=f"simulation_{row.plant}_{row.scenario}",
+        title=f"{row.plant}, {row.scenario}{drawn}{cut if row.passed else ': FAILED'}",
         draw=draw, heights=(0.8, 0.5),
         caption=f"{name} and {controller.command.word} of {row.scenario} on {row.plant}"
         + ("." if row.passed else f": {row.reason}. Yellow: the window that is judged."),
@@ -76,9 +77,7 @@ def _visible_until(trace: Playback) -> float:
     return float(trace.time[trace.edges[-2]]) + max(LAST_PHASE_S, float(trace.time[trace.edges[-2]]))
 
 
-def _draw_phases(
-    axes: Sequence[Axes], trace: Playback, until: float, verification: Verification, row: Outcome
-) -> None:
+def _draw_phases(axes: Sequence[Axes], trace: Playback, until: float, verification: Verification, row: Outcome) -> None:
     """Shade where the link is held, and of a run that failed the window that it is judged in."""
     if not row.passed:
         window = find_judged_window(trace)
@@ -203,7 +202,8 @@ def _environment_panel(stability: StabilityMap, number: int) -> Panel:
 
     share = 100.0 * float(np.mean(stable))
     return Panel(
-        name=f"environment_{number + 1}", hover="", title=f"Damper of {damping:g} {called.damping}: stable in {share:.3g} %",
+        name=f"environment_{number + 1}", hover="",
+        title=f"Damper of {damping:g} {called.damping}: stable in {share:.3g} %",
         draw=draw,
         caption=f"Blue: the loop is stable with such a {called.inertia_word} on link 2, tied to the ground by a spring "
         f"and a damper of {damping:g} {called.damping}; orange: it is not.",

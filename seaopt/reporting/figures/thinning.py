@@ -6,9 +6,9 @@ This min-max method keeps every peak, and each point drawn is a sample; what lie
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-STRETCHES = 1000
+STRETCHES = 800
 METHOD = "least and largest sample of each of {} stretches (min-max)"
 
 
@@ -50,12 +50,11 @@ def thin_series(
 
 
 def break_at(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Float[np.ndarray, " k"]
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Return a series with a missing sample in front of each sample of a row number, so that no line joins them."""
-    rows = np.asarray(gaps, dtype=int)
-    middles = 0.5 * (time[rows - 1] + time[rows])
-    return np.insert(time, rows, middles), np.insert(values, rows, np.nan)
+    middles = 0.5 * (time[gaps - 1] + time[gaps])
+    return np.insert(time, gaps, middles), np.insert(values, gaps, np.nan)
 
 
 def describe_thinning(count: int, stretches: int = STRETCHES) -> str:

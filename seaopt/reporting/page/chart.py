@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 POINTS_PER_INCH = 72.0  # the units of a drawing
 _COLOUR = re.compile(r"#[0-9a-f]{6}\b")
+_DIGITS = re.compile(r"\b\d+\.\d{4,}\b")  # of a drawing of 350 points: 3e-6 of an axis is left
 _STYLE = re.compile(r'style="([^"]*)"')
 
 
@@ -68,7 +69,14 @@ class Chart:
 
 
 def make_chart(panel: Panel) -> Chart:
-    """Draw a panel for a page."""
+    """Draw a panel for a page, with every point of its curves in the drawing."""
+    from matplotlib import rc_context
+
+    with rc_context({"path.simplify": False}):
+        return _make_chart(panel)
+
+
+def _make_chart(panel: Panel) -> Chart:
     from seaopt.reporting.figures.canvas import label_lines
 
     name = re.sub(r"[^A-Za-z0-9]+", "-", panel.name).strip("-") or "figure"
@@ -158,7 +166,8 @@ def _fit_to_page(svg: str, name: str, alternative: str) -> str:
         if attribute != "xmlns:xlink":
             body = re.sub(rf'(<svg[^>]*?)\s{attribute}="[^"]*"', r"\1", body, count=1)
     body = _STYLE.sub(lambda found: f'style="{_COLOUR.sub(_follow, found.group(1))}"', body)
-    body = re.sub(r"\n\s*", "\n", body)
+    body = _DIGITS.sub(lambda found: f"{float(found.group(0)):.3f}".rstrip("0").rstrip("."), body)
+    body = re.sub(r"\s*\n\s*", "\n", body).replace("\nL ", "L")
     return body.replace("<svg", f'<svg role="img" aria-label="{escape(printable(alternative))}"', 1).strip()
 
 

@@ -24,7 +24,7 @@ def render_template(name: str, **values: Any) -> str:
     )  # fmt: skip
     environment.filters |= {
         "number": format_number, "band": _format_band, "interval": _format_interval, "percent": _format_percent,
-        "unit": lambda unit: unit_after(unit).strip(), "slug": make_slug,
+        "unit": _format_unit, "slug": make_slug,
     }  # fmt: skip
     folder = files("seaopt.reporting.page").joinpath("templates")
     fixed = {kind: Markup(folder.joinpath(kind).read_text(encoding="utf-8")) for kind in ("style.css", "script.js")}  # noqa: S704
@@ -41,6 +41,10 @@ def make_slug(text: str) -> str:
 
     """
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+def _format_unit(unit: str) -> str:
+    return unit_after(unit).strip()
 
 
 def _format_band(ends: tuple[float, float] | None) -> str:

@@ -9,7 +9,8 @@ import pytest
 
 import seaopt as so
 from seaopt.errors import SeaoptError
-from seaopt.reporting.verification import verification_figure
+from seaopt.reporting.figures.panel import draw_panel
+from seaopt.reporting.figures.simulation import simulation_panel
 from seaopt.robustness.verification.environments import coupled_stability
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.scenarios import Phase, Scenario
@@ -27,9 +28,9 @@ def test_the_page_names_what_failed_and_shows_every_figure(stand, swing, thor, t
     coupled = coupled_stability(controller, stand, thor, points=4, dampings_N_s_per_m=(0.0, 50.0, 100.0))
     page = so.write_report([controller, found, large, coupled], tmp_path / "r.html").read_text(encoding="utf-8")
     assert {item.name for item in (tmp_path / "figures").glob("*.png")} == {
-        "loop.png", "simulation_swing.png", "bandwidth.png", "amplitude.png", "environments.png",
+        "loop.png", "bandwidth.png", "amplitude.png", "environments.png",
     }  # fmt: skip
-    assert page.count("<svg") == 5
+    assert page.count('<figure class="chart"') == 6 + 1 + 1 + 2 + 3
     assert "&lt;knock&gt;" in page and "<knock>" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
     assert "Simulation: failed" in page and "are allowed" in page
     assert "Not played: &lt;knock&gt; on stand" in page
@@ -47,10 +48,10 @@ def test_a_run_that_failed_is_drawn_whole_and_what_is_cut_is_said(stand, thor):
             name="step", phases=(Phase(duration_s=0.1), Phase(duration_s=2.0, force_N=50.0)), max_force_N=allowed
         )
         found = verify(controller, {"stand": stand}, thor, scenarios=[step])
-        left = verification_figure(found, "stand").axes[0]
-        assert left.get_title(loc="left") == title
-        assert left.lines[0].get_xdata()[-1] == pytest.approx(end, abs=2e-3)
-        judged = [patch.get_x() for patch in left.patches]
+        upper = draw_panel(simulation_panel(found, found.rows[0])).axes[0]
+        assert upper.get_title(loc="left") == f"stand, {title}"
+        assert upper.lines[0].get_xdata()[-1] == pytest.approx(end, abs=2e-3)
+        judged = [patch.get_x() for patch in upper.patches]
         assert judged == ([] if found.passed else pytest.approx([0.5]))  # a fifth of 2 s after 0.1 s
 
 
