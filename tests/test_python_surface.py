@@ -107,9 +107,4 @@ def test_every_object_prints_itself(named):
 @pytest.mark.parametrize("name", ["fit", "ctl", "cert", "score"])
 def test_results_plot_themselves(named, name):
     result = getattr(named, name)
-    if not hasattr(result, "plot"):
-        pytest.skip(f"{type(result).__name__} has no plot yet")
-    import matplotlib.pyplot as plt
-
-    result.plot()
-    plt.close("all")
+    assert result.plot().axes and dir(result.plot)

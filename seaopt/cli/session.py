@@ -486,7 +486,10 @@ class Session:
         def drawing(name: str, place: int, count: int) -> None:
             tell(f"figure {place} of {count}, {name}", (place - 1) / count)
 
-        page = write_report(results, self.folder / "report.html", title=self.problem.title, progress=drawing)
+        page = write_report(
+            results, self.folder / "report.html", title=self.problem.title, progress=drawing,
+            files=[self.problem.source], command=shlex.join(["seaopt", *sys.argv[1:]]),
+        )  # fmt: skip
         tell("done")
         self.results["report"] = page
         self.written.append(page)

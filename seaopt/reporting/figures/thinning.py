@@ -1,6 +1,7 @@
 """Long series drawn with few points: of each stretch the least and the largest sample, in the order they come.
 
-This min-max method keeps every peak, and each point drawn is a sample; what lies between the two is left out.
+This min-max method keeps every peak, and each point drawn is a sample; what lies between the two is left out. The ends
+of a series are drawn, too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ METHOD = "least and largest sample of each of {} stretches (min-max)"
 def thin_series(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stretches: int = STRETCHES
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return a series of at most two samples per stretch; one that is short enough as it is.
+    """Return a series of at most two samples per stretch, and its ends; one that is short enough as it is.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ def thin_series(
     Examples
     --------
     >>> thin_series(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -3.0, 0.0]), 2)
-    (array([0., 1., 3., 4.]), array([ 0.,  5.,  2., -3.]))
+    (array([0., 1., 3., 4., 5.]), array([ 0.,  5.,  2., -3.,  0.]))
 
     """
     n = values.size
@@ -45,7 +46,7 @@ def thin_series(
     low = np.argmin(np.where(np.isnan(block), np.inf, block), axis=1)
     high = np.argmax(np.where(np.isnan(block), -np.inf, block), axis=1)
     ends = np.sort(np.stack([low, high], axis=1), axis=1)
-    kept = np.take_along_axis(rows, ends, axis=1).ravel()
+    kept = np.unique(np.concatenate([[0], np.take_along_axis(rows, ends, axis=1).ravel(), [n - 1]]))
     return time[kept], values[kept]
 
 

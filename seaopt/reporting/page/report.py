@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -276,14 +277,14 @@ def _plates_of_parameters(material: Material) -> list[Plate]:
 
 
 def _plates_of_logs(material: Material) -> list[Plate]:
-    experiments = material.fit.experiments if material.fit is not None else ()
-    return [
-        Plate(
-            name=f"log_{one.name}", part=f"log {one.name}", heading="",
-            panels=tuple(logs.log_panels(one.log, one.log.quality)),
+    plates: list[Plate] = []
+    for one in material.fit.experiments if material.fit is not None else ():
+        panels = tuple(
+            replace(panel, name=f"log_{one.name}_{panel.name}", link=f"{one.name}, {panel.link}")
+            for panel in logs.log_panels(one.log, one.log.quality)
         )
-        for one in experiments
-    ]  # fmt: skip
+        plates.append(Plate(name=f"log_{one.name}", part=f"log {one.name}", heading="", panels=panels))
+    return plates
 
 
 def _render(
