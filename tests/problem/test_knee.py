@@ -42,7 +42,7 @@ def test_the_knee_runs_with_everything_met(tmp_path):
     stored = {name: json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8")) for name in
               ("fit", "controller", "robustness")}  # fmt: skip
     page = re.sub(
-        r"<style.*?</style>|<[^>]*>", " ", (tmp_path / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL
+        r"<(style|script).*?</\1>|<[^>]*>", " ", (tmp_path / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL
     )
     own = r"N\s+gear ratio\s+100|m\s+pendulum mass\s+4\s+kg"  # the table's rows of a name and of a mass
     check_words(run.stdout, re.sub(own, "", unescape(page)))
