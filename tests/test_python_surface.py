@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import control
@@ -51,6 +53,13 @@ def named(tmp_path_factory, short_log, stand, thor):
         exec(PATH, space)
     assert (folder / "out" / "report.html").stat().st_size > 10_000
     return SimpleNamespace(**{name: value for name, value in space.items() if not name.startswith("_")})
+
+
+def test_importing_is_clean_and_loads_nothing_heavy():
+    heavy = ("numpy", "casadi", "pydantic", "matplotlib", "scipy", "polars")
+    code = f"import sys, seaopt; print([name for name in {heavy} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
 
 
 def test_the_fit_says_what_it_found(named):

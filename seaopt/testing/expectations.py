@@ -26,6 +26,8 @@ LIMITS = {  # of [controller], by figure
     "mt": "max_complementary", "reference_peak": "max_reference_peak", "droop_db": "max_droop_db",
     "disk_margin": "min_disk_margin", "noise_gain": "max_noise_gain",
 }  # fmt: skip
+BANDS = ("bandwidth_hz", "crossover_hz", "sensitivity_bandwidth_hz", "tracking_band_hz")
+FASTER = "another bandwidth_hz in [controller] moves it"
 SHOWN = 3  # requirements of a certificate that a message names
 
 Ends = float | tuple[float, float]
@@ -217,8 +219,10 @@ def _judge_percent(results: Stages, experiment: str, output: str, ends: Ends, so
 
 def _judge_design(results: Stages, figure: str, ends: Ends) -> Judgement:
     assert results.controller is not None
-    remedy = "a larger min_disk_margin or a lower bandwidth_hz in [controller] moves it"
-    if figure in LIMITS:
+    remedy = "a larger min_disk_margin or a lower bandwidth_hz in [controller] raises it"
+    if figure in BANDS:
+        remedy = FASTER
+    elif figure in LIMITS:
         asked = ends if not isinstance(ends, tuple) else ends[1] if figure in AT_MOST else ends[0]
         remedy = f"ask the tuner for it: {LIMITS[figure]} = {asked:g} in [controller]"
     return _judge_figure({"": _measure(results.controller.achieved, figure)}, figure, ends, remedy)
@@ -242,9 +246,14 @@ def _judge_plant(results: Stages, plant: str, figure: str, ends: Ends) -> Judgem
         else _measure(loops[state], figure)
         for state in states
     }
+    table = results.problem.table.controller
     remedy = f'put "{plant}" into robust_to in [controller], or lower bandwidth_hz there'
     if not states:
         remedy = f'it is not certified; put "{plant}" into plants in [robustness]'
+    elif figure in BANDS:
+        remedy = FASTER
+    elif table is not None and plant in (table.plant, *table.robust_to):
+        remedy = "ask more of it in [controller], or lower bandwidth_hz there"
     return _judge_figure(values, figure, ends, remedy)
 
 
