@@ -513,7 +513,10 @@ class Session:
     def _verdicts(self, stage: str) -> list[Verdict]:
         """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
         if stage == "expect":
-            return [Verdict(met=good, text=text) for good, text in self._expected()]
+            outcomes = self._expected()
+            unmet = [Verdict(met=False, text=text) for met, text in outcomes if not met]
+            text = f"Expectations: {len(outcomes) - len(unmet)} of {len(outcomes)} met"
+            return [Verdict(met=True, text=text), *unmet] if len(unmet) < len(outcomes) else unmet
         result = self.results.get(stage)
         if stage == "frf" and result is not None:
             return [Verdict(met=good, text=text) for good, text in result.verdict()]
