@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ html_title = "seaopt"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+html_show_copyright = False
 pygments_style = "friendly"
 pygments_dark_style = "github-dark"
 templates_path = ["_templates"]
@@ -52,12 +54,23 @@ def find_notebooks(_app: Any, page: nodes.document) -> None:
             link["reftarget"] = "notebooks" + link["reftarget"].removeprefix(outside)
 
 
+# What docutils' MathML does not know, and what says the same.
+SYNONYMS = (
+    (r"\\[bB]igg?(?![A-Za-z])", ""),
+    (r"\\dots", r"\\ldots"),
+    (r"\\iff", r"\\Leftrightarrow"),
+    ("°", r"{}^\\circ "),
+)
+
+
 def write_math(writer: Any, node: nodes.Element) -> None:
     """Write a formula as MathML, which browsers draw by themselves: the site needs no script from elsewhere."""
-    block, formula = isinstance(node, nodes.math_block), node.astext()
+    formula = node.astext()
+    for pattern, known in SYNONYMS:
+        formula = re.sub(pattern, known, formula)
     if "&" in formula and "\\begin" not in formula:
         formula = f"\\begin{{aligned}}{formula}\\end{{aligned}}"
-    writer.body.append(tex2mathml(formula, as_block=block))
+    writer.body.append(tex2mathml(formula, as_block=isinstance(node, nodes.math_block)))
     raise nodes.SkipNode
 
 

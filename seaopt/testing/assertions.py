@@ -78,7 +78,7 @@ def assert_predicts(fit: Fit, experiment: Experiment, fit_percent: float | Mappi
     experiment : Experiment
         Another log: its initial state and offsets are estimated from it, nothing else.
     fit_percent : float or mapping of output to float
-        At least this much of each output, 100 (1 - |y - yhat|/|y - mean(y)|), or of the outputs named.
+        At least this much of each output, ``100 (1 - norm(y - yhat)/norm(y - mean(y)))``, or of those named.
 
     Raises
     ------
