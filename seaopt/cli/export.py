@@ -8,6 +8,7 @@ from typing import Any
 
 from seaopt.cli.provenance import FILES, check_unedited, digest
 from seaopt.cli.session import SCHEMAS, UNMET
+from seaopt.cli.terminal import Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ProblemError
@@ -29,7 +30,9 @@ def export_controller(
     """
     path = results / FILES["tune"]
     if not path.is_file():
-        raise ProblemError(f"{path}: no such file; give the folder of results of seaopt run or seaopt tune")
+        raise ProblemError(
+            f"{path}: no such file; give the folder of results, or make them: seaopt run PROBLEM -o {results}"
+        )
     content = read_json(path, SCHEMAS["tune"])
     fitted, made_from = results / FILES["fit"], content.get("made_from")
     check_unedited(path, content, "run seaopt tune again")
@@ -47,13 +50,14 @@ def export_controller(
         }  # fmt: skip
         sys.stdout.write(to_json(result))
     else:
+        console = Terminal()
         if not met:
-            sys.stdout.write(f"not met: {UNMET}\n")
+            console.wrap(f"not met: {UNMET}")
         if not content["feasible"]:
-            sys.stdout.write(f"not met: {join_labels(content['active_constraints'])}\n")
+            console.wrap(f"not met: {join_labels(content['active_constraints'])}")
         if broken:
-            sys.stdout.write(f"not met: the certificate of this controller FAILED: {', '.join(broken)}\n")
-        sys.stdout.write(f"wrote {', '.join(written)}\n")
+            console.wrap(f"not met: the certificate of this controller FAILED: {', '.join(broken)}")
+        console.wrap(f"wrote {', '.join(written)}")
     return content["feasible"] and met and not broken
 
 

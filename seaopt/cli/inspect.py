@@ -8,12 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import check_folder, to_json, write_json
-from seaopt.formatting import format_table
+from seaopt.formatting import format_count, join_words
 from seaopt.logs import Column, Counter, Hold, Linear, Quality, assess_quality, contents, read_table
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.quality.report import CHANNEL_HEAD, format_channel
@@ -132,24 +131,29 @@ def _parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def _print_report(quality: Quality, written: list[Path]) -> None:
-    console = Terminal(soft_wrap=True)
-    plain: dict[str, Any] = {"highlight": False, "markup": False}
-    console.print(f"{quality.source}: {quality.summary}", **plain)
-    for note in quality.notes:
-        console.print(note, style="dim", **plain)
-    rows = map(format_channel, quality.channels.values())
-    head, *lines = format_table(rows, CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2))
-    console.print(head, style="dim", **plain)
-    for line in lines[:MOST_LINES]:
-        console.print(line, **plain)
-    if len(lines) > MOST_LINES:
-        console.print(f"... and {len(lines) - MOST_LINES} more channels: --json and -o list all of them", **plain)
+    console = Terminal()
+    console.wrap(f"{quality.source}: {_describe_verdict(quality)}", style="bold")
+    console.wrap(quality.summary)
     for finding in quality.findings[:MOST_LINES]:
-        console.print(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ", **plain)
-        console.print(finding.sentence, **plain)
+        first, *rest = console.break_lines(finding.sentence, indent=9)
+        console.say(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ")
+        console.say("\n".join([first, *(" " * 9 + line for line in rest)]), soft_wrap=True)
     if len(quality.findings) > MOST_LINES:
-        console.print(f"... and {len(quality.findings) - MOST_LINES} more findings", **plain)
-    if not quality.findings:
-        console.print("No problem found.", **plain)
+        console.say(f"... and {len(quality.findings) - MOST_LINES} more findings")
+    rows = [format_channel(channel) for channel in quality.channels.values()]
+    console.tabulate(rows[:MOST_LINES], CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2), indent=0, gap=1)
+    if len(rows) > MOST_LINES:
+        console.say(f"... and {len(rows) - MOST_LINES} more channels: --json and -o list all of them")
+    for note in quality.notes:
+        console.wrap(note, style="dim")
     if written:
-        console.print("wrote " + ", ".join(str(path) for path in written), **plain)
+        console.wrap("wrote " + ", ".join(str(path) for path in written))
+
+
+def _describe_verdict(quality: Quality) -> str:
+    """Return whether a log can be fitted as it is, and how many findings say otherwise."""
+    errors, warnings = (sum(one.severity == kind for one in quality.findings) for kind in ("error", "warning"))
+    if not errors and not warnings:
+        return "No problem found."
+    counts = join_words([format_count(n, word) for n, word in ((errors, "error"), (warnings, "warning")) if n])
+    return f"{counts}: " + ("mend them before a fit" if errors else "look at them")

@@ -140,7 +140,10 @@ class Session:
         if self.problem.spec is not None:
             stages += ["tune", "certify"]
         if not stages:
-            raise ProblemError(f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them")
+            raise ProblemError(
+                f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them (a whole file is "
+                "written by seaopt new LOG)"
+            )
         return [*stages, "report"]
 
     def explain_left_out(self, stages: list[str]) -> list[str]:

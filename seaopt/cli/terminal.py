@@ -15,6 +15,7 @@ from rich.text import Text
 
 from seaopt.formatting import printable
 
+LEAST_WIDTH = 20  # of a wrapped text, in characters
 NARROW = 16  # characters of a cell that is never broken
 
 
@@ -31,16 +32,19 @@ class Terminal(Console):
 
     def wrap(self, text: str, *, indent: int = 0, **options: Any) -> None:
         """Print a text with its lines broken at blanks, all of them indented; commands in it stay whole words."""
-        for line in textwrap.wrap(
-            printable(text), max(self.width - indent, 20), break_long_words=False, break_on_hyphens=False
-        ):
+        for line in self.break_lines(text, indent=indent):
             self.say(" " * indent + line, soft_wrap=True, **options)
 
+    def break_lines(self, text: str, *, indent: int = 0) -> list[str]:
+        """Return a text as the lines that fit the terminal behind an indent; at least one."""
+        width = max(self.width - indent, LEAST_WIDTH)
+        return textwrap.wrap(printable(text), width, break_long_words=False, break_on_hyphens=False) or [""]
+
     def tabulate(
-        self, rows: Iterable[Sequence[str]], head: Sequence[str] = (), align: str = "", *, indent: int = 2
+        self, rows: Iterable[Sequence[str]], head: Sequence[str] = (), align: str = "", *, indent: int = 2, gap: int = 2
     ) -> None:
         """Print rows in aligned columns: "<" or ">" for each; what is too wide is broken in its cell."""
-        table = Table(box=None, show_header=bool(head), pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+        table = Table(box=None, show_header=bool(head), pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
         cells = [[printable(cell) for cell in row] for row in rows]
         for at in range(max(map(len, [head, *cells]))):
             right = align[at : at + 1] == ">"

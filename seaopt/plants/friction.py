@@ -249,6 +249,11 @@ def let_stick(plant: Plant) -> Plant:
 
     """
     if not can_stick(plant):
+        if any(friction.bristles is not None for friction in plant.friction.values()):
+            raise PlantError(
+                f"plant {plant.name} has friction with bristles (part lugre), which sticks by itself; leave out "
+                "sticks = true, or the part"
+            )
         raise PlantError(
             f"plant {plant.name} has no friction that sticks; declare its jump where the plant is made: "
             "friction={NAME: Friction(..., jump=lambda speed, p: ...)}"

@@ -568,13 +568,15 @@ def _read_table(source: Path) -> ProblemTable:
 def _read_toml(source: Path) -> dict[str, Any]:
     try:
         if source.is_dir():
-            raise ProblemError(f"{source}: is a folder; give a problem file (TOML)")
+            found = next(iter(sorted(source.glob("*.toml"))), source / "problem.toml")
+            raise ProblemError(f"{source}: is a folder; give a problem file (TOML), such as {found}")
         if source.stat().st_size > MAX_BYTES:
             raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
         check_regular(source)
         return tomllib.loads(source.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
-        raise ProblemError(f"{source}: no such file; check the path") from error
+        remedy = f"check the path, or write one from a log: seaopt new LOG -o {source}"
+        raise ProblemError(f"{source}: no such file; {remedy}") from error
     except OSError as error:
         raise ProblemError(f"{source}: cannot be read ({error.strerror}); check the path") from error
     except (ValueError, RecursionError) as error:  # also a number of more digits than Python reads

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ProblemError, SeaoptError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.columns import check_inside
+from seaopt.problem.proposal.vocabulary import read_header
 from seaopt.problem.schema import ExpectTable, ExperimentTable, ProblemTable, RangeTable, SensorsTable
 from seaopt.robustness import check_ranges, place_value
 from seaopt.robustness.uncertainty.draws import find_modes
@@ -99,10 +101,20 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         *(table.robustness.plants if table.robustness else ()),
     ):
         if measured not in plants[name].outputs:
+            given = "measured" in table.controller.model_fields_set
+            sensing = plants[name].sensing
+            regulated = sensing.regulated if sensing is not None else ()
+            known = [*regulated, *(one for one in plants[name].outputs if one not in regulated)]
             raise ProblemError(
-                f'controller.measured = "{measured}" is not an output of plant.{name}; '
-                f"{suggestion(measured, plants[name].outputs)}"
+                f'controller.measured{"" if given else ", which is left out,"} = "{measured}" is not an output of '
+                f'plant.{name}, which has {", ".join(known)}; write measured = "{_nearest(measured, known)}" in '
+                "[controller]"
             )
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    """Return the name that was likely meant, else the first of those that are there."""
+    return next(iter(get_close_matches(name, known, n=1, cutoff=0.6)), known[0] if known else "...")
 
 
 def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
@@ -151,6 +163,10 @@ def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
         )
 
 
+def _first_log(experiment: ExperimentTable) -> str:
+    return experiment.log if isinstance(experiment.log, str) else next(iter(experiment.log or ["LOG"]))
+
+
 def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
     place = f"experiment.{experiment.name}"
     if (experiment.log is None) == (experiment.virtual is None):
@@ -158,7 +174,10 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
     if experiment.log is not None:
         driven = any(name not in plant.optional_inputs for name in plant.inputs)
         if not experiment.outputs or (driven and not experiment.inputs):
-            raise ProblemError(f"{place}: a log needs time, inputs and outputs; name their columns")
+            raise ProblemError(
+                f"{place}: a log needs time, inputs and outputs; name their columns, as outputs = "
+                f'{{ NAME = "COLUMN" }} (seaopt inspect {_first_log(experiment)} --list lists them)'
+            )
         check_inside(place, experiment)
     for kind, names, known in (
         ("inputs", experiment.inputs, plant.inputs),
@@ -166,7 +185,14 @@ def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
     ):
         for name in names:
             if name not in known:
-                raise ProblemError(f'{place}.{kind} names "{name}"; {suggestion(name, known)}')
+                remedy = suggestion(name, known)
+                if kind == "outputs" and read_header(name).quantity == "speed":
+                    position = plant.sensing.motor_position if plant.sensing is not None else None
+                    remedy += (
+                        "; a speed that a device computed from a position is declared with differences = "
+                        f'{{ {name} = {{ of = "{position or next(iter(plant.outputs))}" }} }}'
+                    )
+                raise ProblemError(f'{place}.{kind} names "{name}"; {remedy}')
 
 
 def range_remarks(
