@@ -278,6 +278,8 @@ def certify(
         typer.Option(metavar="FILE", help="A law of your own instead (JSON or TOML); it becomes controller.json."),
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Certify the controller in DIR; write robustness.json."""
     from seaopt.cli.session import Session
@@ -286,7 +288,7 @@ def certify(
     if controller is not None:
         session.take_law(controller)
     session.run("certify")
-    _finish(session, json, ["certify"])
+    _finish(session, json, ["certify"], quiet, verbose)
 
 
 @app.command()

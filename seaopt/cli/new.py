@@ -108,7 +108,8 @@ def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
     guessed = [one for one in proposal.guesses if one.key != "roles"]
     console.say(f"wrote {target}", soft_wrap=True)
     if guessed:
-        console.say(f"{len(guessed)} of its values are guesses, marked in it:")
+        are = "is a guess" if len(guessed) == 1 else "are guesses"
+        console.say(f"{len(guessed)} of its values {are}, marked in it:")
         console.tabulate([(one.label, one.guess, one.why) for one in guessed])
     out = shlex.quote(str(target.with_suffix("")))
     console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)

@@ -201,12 +201,16 @@ def test_a_requirement_not_met_exits_1(copied, seaopt, short):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("fit", "nothing.toml"), "no such file"),
+        (("fit", "nothing.toml"), "seaopt new LOG -o nothing.toml"),
         (("tune", "short.toml", "-o", "empty"), "run seaopt fit"),
         (("certify", "short.toml", "-o", "empty"), "run seaopt tune"),
         (("report", "short.toml", "-o", "empty"), "run seaopt fit"),
         (("fit", "short.toml", "-o", "short.toml"), "is a file"),
-        (("fit", "."), "is a folder"),
+        (("fit", "."), "is a folder.*toml"),
+        (("fit", "rotary.toml"), 'write measured = "tau_s" in \\[controller\\]'),
+        (("fit", "speed.toml"), 'differences = { speed = { of = "theta_m" } }'),
+        (("fit", "bristles.toml"), "leave out sticks = true"),
+        (("export", "empty", "--c", "c"), "seaopt run PROBLEM -o empty"),
         (("schema", "robust"), 'did you mean "robustness"'),
         (("fit", "wide.toml"), "bandwidth_hz = 99 is outside 15 to 60"),
         (("fit", "column.toml"), 'no column "F1 \\[kN\\]"'),
@@ -215,6 +219,11 @@ def test_a_requirement_not_met_exits_1(copied, seaopt, short):
 def test_bad_input_is_one_line_and_exits_2(folder, seaopt, short, arguments, words):
     (folder / "wide.toml").write_text(short.replace("bandwidth_hz = 30", "bandwidth_hz = 99"), encoding="utf-8")
     (folder / "log.csv").write_text("time [s],I [A],F1 [N]\n0,1,2\n0.1,1,2\n", encoding="utf-8")
+    rotary = 'schema = 1\n[plant.a]\nkind = "rotary"\n'
+    (folder / "rotary.toml").write_text(rotary + '[controller]\nplant = "a"\nbandwidth_hz = 15\n', encoding="utf-8")
+    (folder / "bristles.toml").write_text(rotary + 'parts = ["lugre"]\nsticks = true\n', encoding="utf-8")
+    columns = 'log = "log.csv"\ninputs = { I = "I [A]" }\noutputs = { speed = "F1 [N]" }\n'
+    (folder / "speed.toml").write_text(rotary + f'[[experiment]]\nname = "x"\nplant = "a"\n{columns}', encoding="utf-8")
     (folder / "column.toml").write_text(
         'schema = 1\n[parameters]\nJ = { value = 1e-6, free = true }\n[plant.a]\nkind = "high_impedance"\n'
         '[[experiment]]\nname = "x"\nplant = "a"\nlog = "log.csv"\ntime = "time [s]"\ninputs = { I = "I [A]" }\n'
