@@ -80,7 +80,7 @@ class Tell(Protocol):
 
 
 Amount = Literal["quiet", "usual", "verbose"]
-DRAWN = 0.4  # of the time of a certificate, for the draws; the rest simulates
+
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 OF_THE_LAW = ("structure", "notch", "reference_weights", "sample_rate_hz", "delay_samples")
@@ -210,17 +210,18 @@ class Session:
     @contextmanager
     def _write_progress(self, label: str) -> Generator[Tell]:
         """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
-        note, left, ended, started = "", "", Event(), time.monotonic()
+        note, done, ended, started = "", None, Event(), time.monotonic()
 
         def tell(text: str, share: float | None = None) -> None:
-            nonlocal note, left
-            note, left = text, format_left(time.monotonic() - started, share)
+            nonlocal note, done
+            note, done = text, share
 
         def write_lines() -> None:
             with suppress(OSError):  # a stderr that cannot be written is the stage's to find
                 while not ended.wait(REPORT_S):
-                    spent = f"{time.monotonic() - started:.0f} s" + (f", {left}" if left else "")
-                    self.say(f"{label}, {spent}: {note or 'running'}")
+                    spent = time.monotonic() - started
+                    left = format_left(spent, done)
+                    self.say(f"{label}, {spent:.0f} s{f', {left}' if left else ''}: {note or 'running'}")
 
         writer = Thread(target=write_lines, daemon=True)
         writer.start()
@@ -458,7 +459,8 @@ class Session:
         self._design_values(*plants.values())
 
         def count(done: int, of: int) -> None:
-            tell(f"{table.samples} draws" if done < of else "simulating scenarios", DRAWN * done / of)
+            # How long the simulations take that follow is not known before they are done.
+            tell(f"{table.samples} draws, {100 * done // of} %" if done < of else "simulating scenarios")
 
         result = certify_problem(self.problem, controller, source, count)
         tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
