@@ -102,7 +102,7 @@ class Scratch:
     ("structure", "bandwidth", "delay"),
     [
         ("pid", 60, 1),
-        ("pd", 45, 2),
+        pytest.param("pd", 45, 2, marks=pytest.mark.slow),
         pytest.param("pid", 30, 1, marks=pytest.mark.slow),
         pytest.param("pd", 15, 1, marks=pytest.mark.slow),
     ],

@@ -56,11 +56,12 @@ def _count_delayed(model: Model, point: Point) -> int:
     return clock.delay_free * (2 if clock.hold == "first" else 1)
 
 
-def kernel_source(model: Model, layout: Layout, delayed: int) -> str:
-    """Return the C source of the passes of a model."""
+def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
+    """Return the C source of the passes of a model, over data with measured outputs or of simulations alone."""
     constants = {
         "NX": model.nx, "NU": model.nu, "NY": model.ny, "NP": layout.shared, "NQ": model.np, "ND": layout.drift_terms,
         "LINEAR": int(model.linear), "STEPPED": int(model.sticks), "CORRECT": int(layout.corrected), "DELAYED": delayed,
+        "MEASURED": int(measured),
     }  # fmt: skip
     generated = _write_sampling(model)
     if model.linear:
@@ -121,9 +122,9 @@ def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int,
 
 
 @memo
-def load_passes(model: Model, layout: Layout, delayed: int) -> Kernel | None:
+def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
-    kernel = load_kernel(kernel_source(model, layout, delayed), "seaopt_passes")
+    kernel = load_kernel(kernel_source(model, layout, delayed, measured=measured), "seaopt_passes")
     if kernel is not None:
         kernel.library.carry_size.restype = ctypes.c_long
     return kernel
@@ -228,7 +229,7 @@ class Program:
     def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
         """Return the program, or None where there is no compiler."""
         layout = layout_of(model.nx, model.ny, model.np, point)
-        kernel = load_passes(model, layout, _count_delayed(model, point))
+        kernel = load_passes(model, layout, _count_delayed(model, point), measured=bool(segment.y))
         return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
 
     def _correction(self, point: Point) -> int:

@@ -2,6 +2,7 @@
      NX states, NU inputs, NY outputs, ND drift terms per output,
      NP derivatives that are shared: parameters (NQ), then a free delay, then what only the correction gain depends on;
      NI linear only: forcing terms (inputs in force, and the constant); LINEAR, STEPPED, CORRECT 0 or 1;
+     MEASURED 0 where there are no measured outputs: simulations alone, which make no derivatives;
      DELAYED of a linear plant how many inputs in force are besides u_a; of another 0, or with a free delay 1, or 2 where the
      delay moves the inputs themselves, which are then joined by lines. */
 #include <math.h>

@@ -540,7 +540,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
 EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     const unsigned long mode = flush_denormals();
     for (long i = 0; i < count; i++) {
-        if (ALL == 1 || list[i].gram || list[i].columns || list[i].into) one_pass(list + i, ALL);
+        if (MEASURED && (ALL == 1 || list[i].gram || list[i].columns || list[i].into)) one_pass(list + i, ALL);
         else one_pass(list + i, 1);
     }
     restore_denormals(mode);

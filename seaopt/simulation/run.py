@@ -43,6 +43,7 @@ def run_passes(
         First rows of the shots, and one past the last; the whole segment in one shot if left out.
     sums : bool
         Whether Gram matrices, losses, counts and derivatives are wanted: a simulation alone is several times quicker.
+        Without measured outputs compiled code makes none.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
     output_rows : int, optional

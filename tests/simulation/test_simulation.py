@@ -337,7 +337,7 @@ def test_other_parameter_values_need_no_other_code(swing, thor):
     from seaopt.simulation.compiled import kernel_source
 
     layout = Layout(shared=1, nx=4, ny=2, drift_terms=0, corrected=False)
-    a, b = (kernel_source(make_model(swing, thor.update(I_p=v), ("J",)), layout, False) for v in (0.2, 0.5))
+    a, b = (kernel_source(make_model(swing, thor.update(I_p=v), ("J",)), layout, 0, measured=True) for v in (0.2, 0.5))
     assert a == b
 
 

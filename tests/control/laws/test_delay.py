@@ -34,7 +34,7 @@ def fit(stand, thor):
     log = so.Log.from_arrays(time=1e-3 * np.arange(current.size), I=current, F1=force + rng.normal(size=current.size))
     delay = so.Parameter(name="delay_s", value=1e-3, unit="s", free=True, max=0.01)
     experiment = so.Experiment(plant=stand, log=log, sigma={"F1": 1.0}, initial_state="rest", delay_s=delay)
-    return so.fit([experiment], thor.update(b_r=1.3e-4).free("b_r"))
+    return so.fit([experiment], thor.update(b_r=1.3e-4).free("b_r"), diagnostics=False)
 
 
 def _true_ms(controller, plant, params, samples):

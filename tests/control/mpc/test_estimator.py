@@ -55,7 +55,7 @@ def test_innovations_are_white_on_held_out_data_of_the_stand(stand, thor, stand_
     learn, held, _ = stand_test
     start = thor.update(J=2e-6, b_r=3e-4, eta=0.8).free("J", "b_r", "eta")
     experiment = so.Experiment(plant=stand, log=learn, outputs=("F1",), delay_s=PERIOD)
-    fit = so.fit([experiment], start, method=so.PredictionError())
+    fit = so.fit([experiment], start, method=so.PredictionError(), diagnostics=False)
     noise = estimate_noise(stand, fit, learn, outputs=("F1", "F2"), delay_samples=1)
     found = estimator(stand, fit, noise, outputs=("F1", "F2"), sample_time_s=PERIOD, delay_samples=1)
     run = found.run(held)

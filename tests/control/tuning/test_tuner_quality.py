@@ -13,7 +13,7 @@ import pytest
 import seaopt as so
 
 BENCHMARKS = Path(__file__).resolve().parents[3] / "benchmarks"
-QUICK = (1, 19, 20)
+QUICK = (1, 19)
 FOUND = {1: 1.71841, 5: 0.659755, 12: 2.30130, 16: 2.12125, 19: 20.9570, 20: 10.3486}  # number: the objective
 
 

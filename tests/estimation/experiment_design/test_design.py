@@ -250,7 +250,7 @@ def scatter(plant, truth, excitation, seeds, **log):
     for seed in seeds:
         record = so.virtual_log(plant, truth, excitation, seed=seed, sensors=so.Sensors(noise_std=NOISE), **log)
         experiment = so.Experiment(plant=plant, log=record, outputs=("F1", "F2"), sigma=NOISE)
-        fit = so.fit([experiment], truth, method=so.OutputError(search=False))
+        fit = so.fit([experiment], truth, method=so.OutputError(search=False), diagnostics=False)
         values.append([fit.parameters[name].value for name in truth.free_names])
     return dict(zip(truth.free_names, np.std(values, axis=0, ddof=1), strict=True))
 

@@ -90,7 +90,7 @@ def test_a_fit_of_many_segments_is_that_of_the_whole_matrix(f_c, monkeypatch):
 
     def fit():
         experiment = so.Experiment(plant=plant, log=log, outputs=("F1",))
-        return so.fit([experiment], truth.update(J=2.5e-6, b_r=2e-4).free("J", "b_r"))
+        return so.fit([experiment], truth.update(J=2.5e-6, b_r=2e-4).free("J", "b_r"), diagnostics=False)
 
     monkeypatch.setattr(normal_equations, "FEWEST", 20)
     blocks = fit()

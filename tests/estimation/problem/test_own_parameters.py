@@ -75,7 +75,7 @@ def experiments(records):
 @pytest.fixture(scope="module")
 def fit(experiments):
     start = so.ParameterSet.of(k=(250.0, "N/m"), b=(0.5, "N s/m")).bound(k=(0, 1e5), b=(0, 1e3)).free("k", "b")
-    return so.fit(experiments, start)
+    return so.fit(experiments, start, diagnostics=False)
 
 
 def test_a_known_and_a_free_mass_of_one_log_each(fit):
@@ -137,7 +137,7 @@ def make_derived_cart():
 def test_derived_figures_of_own_parameters_are_their_logs_own(experiments):
     """d log f = (d log k - d log m)/2; the std of f follows from the covariance of k and heavy.m."""
     start = so.ParameterSet.of(k=(250.0, "N/m"), b=(0.5, "N s/m")).bound(k=(0, 1e5), b=(0, 1e3)).free("k", "b")
-    fit = so.fit([replace(e, plant=make_derived_cart()) for e in experiments], start)
+    fit = so.fit([replace(e, plant=make_derived_cart()) for e in experiments], start, diagnostics=False)
     assert set(fit.derived) == {"light.f", "heavy.f", "tau"}
     k, m, names = fit.parameters["k"].value, fit.parameters["heavy.m"].value, list(fit.covariance.names)
     slopes = np.zeros(len(names))

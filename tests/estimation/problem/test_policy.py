@@ -34,7 +34,9 @@ def off(fit, truth):
 
 
 def fitted(stand, log, start, method=None, **options):
-    return so.fit([so.Experiment(plant=stand, log=log, outputs=("F1",), **options)], start, method=method)
+    return so.fit(
+        [so.Experiment(plant=stand, log=log, outputs=("F1",), **options)], start, method=method, diagnostics=False
+    )
 
 
 def test_clipping_ruins_a_fit_that_does_not_mask_it(stand, thor, clipped, start):

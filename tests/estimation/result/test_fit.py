@@ -53,6 +53,7 @@ def test_a_joint_fit_shares_parameters(stand, swing, thor):
     fit = so.fit(
         [experiment(stand, logs[0]), experiment(swing, logs[1], name="swing")],
         start.free("J", "b_r", "eta", "f_c", "I_p", "d"),
+        diagnostics=False,
     )
     so.testing.assert_recovered(fit, truth, sigmas=4.5)
     assert fit.step_error_sigma <= 0.01
@@ -69,7 +70,9 @@ def test_covariance_of_a_static_line_is_the_closed_form():
     y = 2.5 * u + 4 + 0.3 * rng.normal(size=u.size)
     log = so.Log.from_arrays(time=np.arange(u.size) / 100, u=u, y=y)
     params = so.ParameterSet.of(a=(1.0, "N/A")).free("a")
-    fit = so.fit([so.Experiment(plant=plant, log=log, sigma={"y": 0.3}, initial_state="rest")], params)
+    fit = so.fit(
+        [so.Experiment(plant=plant, log=log, sigma={"y": 0.3}, initial_state="rest")], params, diagnostics=False
+    )
     x = np.column_stack([u, np.ones_like(u)])
     expected = np.linalg.lstsq(x, y, rcond=None)[0]
     covariance = np.linalg.inv(x.T @ x) * 0.3**2
@@ -103,7 +106,7 @@ def test_misra1a_values_and_standard_errors_are_nists():
     log = so.Log.from_arrays(time=time, u=np.ones(time.size), y=y)
     start = so.ParameterSet.of(b1=(500.0, "-"), b2=(1e-4, "-")).free("b1", "b2")
     bench = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False)
-    fit = so.fit([bench], start)
+    fit = so.fit([bench], start, diagnostics=False)
     residual_dof = np.sqrt(len(MISRA_X) / (len(MISRA_X) - 2))  # NIST divides by n - p
     for name, (value, error) in MISRA.items():
         assert fit.parameters[name].value == pytest.approx(value, rel=1e-6)
@@ -214,7 +217,7 @@ def test_the_profile_of_a_robust_loss_is_as_wide_as_its_std():
 
 
 def test_what_cannot_be_told_is_named(stand, short_log, thor):
-    fit = so.fit([experiment(stand, short_log)], thor.free("J", "b_r", "eta", "K_tau"))
+    fit = so.fit([experiment(stand, short_log)], thor.free("J", "b_r", "eta", "K_tau"), diagnostics=False)
     assert fit.status == "not_identifiable"
     assert "K_tau and eta enter only together" in fit.message
     (direction,) = fit.identifiability.unidentifiable
@@ -236,7 +239,9 @@ def test_what_a_heavy_link_hides_is_marked_whatever_the_start(J_l, start):
     log = so.virtual_log(plant, truth, (Noise(std=1.0, band_hz=60),), duration_s=10, rate_hz=400, seed=1)
     torque = log["tau_s"] + 0.005 * np.std(log["tau_s"]) * np.random.default_rng(1).normal(size=len(log))
     measured = so.Log.from_arrays(time=log.time, I=log["I"], tau_s=torque)
-    fit = so.fit([experiment(plant, measured, outputs=("tau_s",))], truth.update(**start).free(*free))
+    fit = so.fit(
+        [experiment(plant, measured, outputs=("tau_s",))], truth.update(**start).free(*free), diagnostics=False
+    )
     assert fit.status == "not_identifiable"
     assert set(fit.parameters.unidentified_names) == {"J_m", "b_r", "k_s"}
     assert fit.parameters["K_tau"].value == pytest.approx(0.867, rel=1e-3)
@@ -279,19 +284,21 @@ def test_a_figure_that_the_data_tell_keeps_its_std():
 
 
 def test_a_parameter_without_effect_is_named(stand, short_log, thor):
-    fit = so.fit([experiment(stand, short_log)], thor.free("J", "v_s"))
+    fit = so.fit([experiment(stand, short_log)], thor.free("J", "v_s"), diagnostics=False)
     assert fit.status == "not_identifiable"
     assert "v_s has no effect" in fit.message
 
 
 def test_a_prior_settles_what_the_data_do_not(stand, short_log, thor):
-    fit = so.fit([experiment(stand, short_log)], thor.free("J", "b_r", "eta").prior(K_tau=1e-4))
+    fit = so.fit([experiment(stand, short_log)], thor.free("J", "b_r", "eta").prior(K_tau=1e-4), diagnostics=False)
     assert fit.status == "converged"
     assert fit.parameters["K_tau"].std == pytest.approx(1e-4, rel=0.05)
 
 
 def test_a_bound_is_kept_and_said(stand, short_log, thor):
-    fit = so.fit([experiment(stand, short_log)], thor.update(J=5e-6).free("J", "b_r").bound(J=(3.4e-6, 1e-5)))
+    fit = so.fit(
+        [experiment(stand, short_log)], thor.update(J=5e-6).free("J", "b_r").bound(J=(3.4e-6, 1e-5)), diagnostics=False
+    )
     assert fit.parameters["J"].value == 3.4e-6
     assert fit.parameters["J"].at_bound
     assert json.loads(json.dumps(fit.to_dict()["parameters"]["J"]))["at_bound"] is True
@@ -304,7 +311,7 @@ def test_huber_shrugs_off_outliers(stand, short_log, thor):
     log = so.Log.from_arrays(time=short_log.time, I=short_log["I"], F1=spoiled)
     errors = {}
     for loss in (Squares(), so.Huber()):
-        fit = so.fit([experiment(stand, log, outputs=("F1",))], thor.free("J", "b_r"), loss=loss)
+        fit = so.fit([experiment(stand, log, outputs=("F1",))], thor.free("J", "b_r"), loss=loss, diagnostics=False)
         errors[type(loss)] = abs(fit.parameters["b_r"].value / thor["b_r"].value - 1)
     assert errors[so.Huber] < 0.002
     assert errors[so.Huber] < 0.3 * errors[Squares]
@@ -332,7 +339,7 @@ def test_gaps_missing_samples_and_delay(stand, thor):
         delay_s=so.Parameter(name="d", value=0.001, unit="s", free=True, max=0.01),
         gain={"F1": so.Parameter(name="g", value=1.0, unit="-", free=True)},
     )
-    fit = so.fit([bench], thor.free("J", "b_r"))
+    fit = so.fit([bench], thor.free("J", "b_r"), diagnostics=False)
     so.testing.assert_recovered(fit, thor, sigmas=4.5)
     own = fit.nuisance["chirp"]
     assert own.delay_s == pytest.approx(delay, abs=2e-5)
@@ -408,7 +415,9 @@ def test_a_log_in_which_nothing_moves_is_refused(stand, short_log, thor, still, 
 
 def test_one_constant_output_is_noted_and_the_other_fitted(stand, short_log, thor):
     log = so.Log.from_arrays(**short_log.to_arrays() | {"F2": np.full(len(short_log), 2.0)})
-    fit = so.fit([experiment(stand, log, sigma={"F1": 2.0, "F2": 1e6})], thor.update(J=2e-6).free("J"))
+    fit = so.fit(
+        [experiment(stand, log, sigma={"F1": 2.0, "F2": 1e6})], thor.update(J=2e-6).free("J"), diagnostics=False
+    )
     assert "chirp: F2: is constant at 2" in fit.notes
     so.testing.assert_recovered(fit, thor, sigmas=4)
 
@@ -423,12 +432,12 @@ def test_a_dead_output_of_unknown_noise_is_refused(stand, short_log, thor):
 def test_a_unit_that_a_parameter_can_absorb_is_asked_about(stand, short_log, thor):
     """A current in mA that is taken for A makes an efficiency a thousand times too small."""
     log = so.Log.from_arrays(**short_log.to_arrays() | {"I": 1e3 * short_log["I"]})
-    fit = so.fit([experiment(stand, log)], thor.free("J", "b_r", "eta"))
+    fit = so.fit([experiment(stand, log)], thor.free("J", "b_r", "eta"), diagnostics=False)
     assert any("1000 times below its start of 1: check the units" in note for note in fit.notes)
 
 
 def test_how_far_a_value_is_from_its_start_has_few_digits(stand, short_log, thor):
-    fit = so.fit([experiment(stand, short_log)], thor.update(b_r=1e-134).free("b_r"))
+    fit = so.fit([experiment(stand, short_log)], thor.update(b_r=1e-134).free("b_r"), diagnostics=False)
     (note,) = (note for note in fit.notes if "times above its start of 1e-134" in note)
     assert len(note.split(" is ")[1].split(" times ")[0]) <= len("1.259e+133")
 
@@ -458,7 +467,11 @@ def test_scaling_the_force_scales_eta(seed):
     eta = []
     for scale in (1.0, 2.0):
         scaled = so.Log.from_arrays(time=log.time, I=log["I"], F1=scale * log["F1"])
-        eta.append(so.fit([so.Experiment(plant=stand, log=scaled)], thor.free(*FREE)).parameters["eta"].value)
+        eta.append(
+            so.fit([so.Experiment(plant=stand, log=scaled)], thor.free(*FREE), diagnostics=False)
+            .parameters["eta"]
+            .value
+        )
     assert eta[1] == pytest.approx(2 * eta[0], rel=1e-4)
 
 

@@ -102,12 +102,16 @@ def fitted(name, start):
     log = so.Log.from_arrays(time=np.arange(x.size, dtype=float), x=x, y=y)
     bench = so.Experiment(plant=regression(name, table.names), log=log, hold="zero", initial_state="rest", offset=False)
     given = {b: (value, "-") for b, value in zip(table.names, table.starts[STARTS[start]], strict=True)}
-    return table, so.fit([bench], so.ParameterSet.of(**given).free(*table.names), method=PATIENT)
+    return table, so.fit([bench], so.ParameterSet.of(**given).free(*table.names), method=PATIENT, diagnostics=False)
+
+
+FAR = ("Misra1a", "ENSO", "Eckerle4", "MGH17")  # of each difficulty, and the one that fails: the others are slow tests
 
 
 def sets(*but):
     """Return every set with both starts; `but` are the (name, start, reason) that fail, where MINPACK does not."""
-    marks = {(name, start): [pytest.mark.xfail(reason=reason)] for name, start, reason in but}
+    marks = {(name, "far"): [pytest.mark.slow] for name in MODELS if name not in FAR}
+    marks |= {(name, start): [pytest.mark.xfail(reason=reason)] for name, start, reason in but}
     return [pytest.param(name, start, marks=marks.get((name, start), [])) for name in MODELS for start in STARTS]
 
 

@@ -35,7 +35,7 @@ def make_log(seed, start, offset, noise=1e-4, n=2000):
 @pytest.fixture(scope="module")
 def fitted():
     log, _ = make_log(1, [0.0, 0.0], 0.01)
-    return so.fit([so.Experiment(plant=PLANT, log=log, name="first")], PARAMS.free("m", "b"))
+    return so.fit([so.Experiment(plant=PLANT, log=log, name="first")], PARAMS.free("m", "b"), diagnostics=False)
 
 
 def test_another_log_is_predicted_from_its_own_start_and_offset(fitted):

@@ -48,7 +48,7 @@ def test_a_delay_is_found_across_the_jumps_of_an_output_with_feedthrough(samples
     delay = so.Parameter(name="delay_s", value=start / RATE, unit="s", free=True, min=0.0, max=0.05)
     experiment = so.Experiment(plant=drive(), log=log_of(samples_late, 1), delay_s=delay)
     truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
-    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"))
+    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"), diagnostics=False)
     assert fit.status == "converged"
     assert fit.nuisance["experiment"].delay_s * RATE == pytest.approx(samples_late, abs=5e-3)
     so.testing.assert_recovered(fit, truth, sigmas=4)
@@ -73,7 +73,7 @@ def test_a_delay_of_an_input_of_straight_lines_is_found(samples_late, start):
     delay = so.Parameter(name="delay_s", value=start / RATE, unit="s", free=True, min=0.0, max=0.05)
     experiment = so.Experiment(plant=drive(), log=log_of_lines(samples_late, 1), delay_s=delay, hold="first")
     truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
-    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"))
+    fit = so.fit([experiment], truth.update(M=1.5, b=200.0).free("M", "b"), diagnostics=False)
     assert fit.status == "converged" and not fit.errors
     own = fit.nuisance["experiment"]
     assert own.std["delay_s"] * RATE < 2e-3
@@ -113,7 +113,7 @@ def test_a_delay_that_is_a_period_off_is_carried_on():
     delay = so.Parameter(name="delay_s", value=5.0 / RATE, unit="s", free=True, min=0.0, max=0.1)
     experiment = so.Experiment(plant=drive(), log=log, outputs=("F1",), delay_s=delay)
     truth = so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A"))
-    found = so.fit([experiment], truth.free("G"), method=so.OutputError(search=False))
+    found = so.fit([experiment], truth.free("G"), method=so.OutputError(search=False), diagnostics=False)
     assert found.nuisance["experiment"].delay_s * RATE == pytest.approx(22.0, abs=0.1)
 
 

@@ -53,7 +53,7 @@ def test_each_method_recovers_the_truth(case, method, stand, swing, thor):
     free = {"J": 3.0, "b_r": 0.3, "eta": 0.4} | ({"I_p": 0.4} if plant is swing else {})
     free |= {"f_c": 0.2} if "friction" in case else {}
     start = truth.update(**{name: truth[name].value * factor for name, factor in free.items()}).free(*free)
-    fit = so.fit([experiment(plant, noisy(plant, truth))], start, method=METHODS[method])
+    fit = so.fit([experiment(plant, noisy(plant, truth))], start, method=METHODS[method], diagnostics=False)
     assert fit.status == "converged", fit.message
     so.testing.assert_recovered(fit, truth, sigmas=4.5)
     assert fit.method == method
@@ -64,7 +64,9 @@ def test_multiple_shooting_ends_where_single_shooting_does(swing, thor):
     truth = thor.update(**FRICTION)
     bench = experiment(swing, noisy(swing, truth))
     start = truth.update(J=2e-6, f_c=20.0).free("J", "f_c", "I_p")
-    single, multiple = (so.fit([bench], start, method=METHODS[m]) for m in ("output_error", "multiple_shooting"))
+    single, multiple = (
+        so.fit([bench], start, method=METHODS[m], diagnostics=False) for m in ("output_error", "multiple_shooting")
+    )
     for name in ("J", "f_c", "I_p"):
         assert multiple.parameters[name].value == pytest.approx(single.parameters[name].value, rel=1e-6)
         assert multiple.parameters[name].std == pytest.approx(single.parameters[name].std, rel=1e-3)
@@ -90,7 +92,7 @@ def test_a_plant_that_runs_away_is_fitted_on_shots():
     bench = so.Experiment(plant=plant, log=log, name="log", offset=False)
     start = so.ParameterSet.of(a=(1.0, "1/s")).free("a")
     for method in (so.MultipleShooting(segments=40), so.PredictionError()):
-        fit = so.fit([bench], start, method=method)
+        fit = so.fit([bench], start, method=method, diagnostics=False)
         assert fit.status == "converged", fit.message
         assert abs(fit.parameters["a"].value - a) < 4.5 * fit.parameters["a"].std
         assert fit.parameters["a"].std < 0.05
@@ -177,7 +179,7 @@ def test_a_light_mode_of_free_bodies_is_found(method, thor):
     log = noisy(plant, truth, outputs=("F1", "F2"), noise=0.5)
     factors = {"J": 3.5, "b_r": 8.7, "eta": 3.8, "m_1": 0.1, "m_2": 0.33}
     start = truth.update(**{name: times * truth[name].value for name, times in factors.items()}).free(*factors)
-    fit = so.fit([experiment(plant, log)], start, method=METHODS[method])
+    fit = so.fit([experiment(plant, log)], start, method=METHODS[method], diagnostics=False)
     assert fit.status == "converged"
     so.testing.assert_recovered(fit, truth, sigmas=4)
     assert fit.iterations < 60
@@ -205,7 +207,7 @@ def test_a_mode_that_rings_through_the_log_is_found(method, factor):
     truth = so.ParameterSet.of(k=(k, "1/s^2"), c=(c, "1/s"), gamma=(gamma, "-"))
     start = truth.update(k=factor * k, c=0.05, gamma=1.0).bound(k=(0.0, 1e5)).free("k", "c", "gamma")
     experiment = so.Experiment(plant=plant, log=log, hold="first")
-    fit = so.fit([experiment], start, method=METHODS[method])
+    fit = so.fit([experiment], start, method=METHODS[method], diagnostics=False)
     assert fit.status == "converged"
     so.testing.assert_recovered(fit, truth, sigmas=4)
 
@@ -365,7 +367,7 @@ def test_what_no_log_can_tell_is_said_in_words(case, outputs, free, words, stand
     log = so.Log.from_arrays(
         time=log.time, I=log["I"], **{name: log[name] + rng.normal(size=len(log)) for name in outputs}
     )
-    fit = so.fit([experiment(plant, log, outputs=outputs)], thor.free(*free))
+    fit = so.fit([experiment(plant, log, outputs=outputs)], thor.free(*free), diagnostics=False)
     assert fit.status == "not_identifiable"
     assert words in fit.message
     assert "measure another output" in fit.message
@@ -466,7 +468,7 @@ def test_stretches_of_a_few_samples_count_in_the_covariance():
     time, u, y = lag_log(noise=0.01)
     keep = np.arange(time.size) % 9 < 7
     log = so.Log.from_arrays(time=time[keep], u=u[keep], y=y[keep])
-    fit = so.fit([so.Experiment(plant=lag(), log=log, offset=False)], LAG)
+    fit = so.fit([so.Experiment(plant=lag(), log=log, offset=False)], LAG, diagnostics=False)
     for name in ("a", "b"):
         assert fit.parameters[name].std == pytest.approx(fit.white_covariance.std(name), rel=0.3)
 
@@ -482,7 +484,7 @@ def test_a_band_without_0_hz_leaves_the_level_to_the_rest(stand, thor):
     assert fit.outputs["log"]["F1"].rms_residual < 3
 
 
-@pytest.mark.parametrize("method", ["output_error", "multiple_shooting", pytest.param("prediction_error", marks=SLOW)])
+@pytest.mark.parametrize("method", ["output_error", *SLOW_METHODS])
 def test_noise_alone_is_not_called_a_fit(stand, thor, method):
     rng = np.random.default_rng(3)
     n = 2000

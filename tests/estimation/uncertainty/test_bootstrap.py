@@ -72,7 +72,9 @@ def test_a_step_is_a_refit_where_noise_is_small(noisy):
 def test_percentiles_and_priors_are_the_gaussian_ones(stand, thor, short_log):
     """A prior far tighter than the log's own knowledge is what the draws show."""
     prior = thor.with_parameters(*(so.Parameter(name="eta", value=1.0, unit="-", free=True, prior_std=1e-6),))
-    fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1",))], prior.free("J", "eta"))
+    fit = so.fit(
+        [so.Experiment(plant=stand, log=short_log, outputs=("F1",))], prior.free("J", "eta"), diagnostics=False
+    )
     found = bootstrap(fit, DRAWS)
     assert found.std("eta") == pytest.approx(1e-6, rel=4 / np.sqrt(2 * DRAWS))
     low, high = found.interval("eta")
@@ -84,7 +86,9 @@ def test_missing_samples_and_a_robust_loss_are_allowed_for(stand, thor, short_lo
     force[1000:1400] = np.nan
     force[::50] += 200.0
     log = so.Log.from_arrays(time=short_log.time, I=short_log["I"], F1=force)
-    fit = so.fit([so.Experiment(plant=stand, log=log)], thor.free("J", "b_r"), loss=so.Huber(), holdout=0.1)
+    fit = so.fit(
+        [so.Experiment(plant=stand, log=log)], thor.free("J", "b_r"), loss=so.Huber(), holdout=0.1, diagnostics=False
+    )
     found = bootstrap(fit, DRAWS)
     for name in ("J", "b_r"):
         assert found.std(name) == pytest.approx(fit.covariance.std(name), rel=4 / np.sqrt(2 * DRAWS) + 0.05)

@@ -53,7 +53,7 @@ CASES = {  # plant, standard deviations, ranges, draws
 }
 
 
-QUICK = ("swing, fit and inertia", "swing, delay", "swing, angle")
+QUICK = ("swing, delay", "swing, angle")
 
 
 @pytest.mark.parametrize(
