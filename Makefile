@@ -65,7 +65,7 @@ notebooks: $(READY)
 DOCS := $(VENV)-docs
 SITE := docs/_build/html
 docs: $(DOCS)/.ready
-	rm -rf docs/reference/api  # pages of names that are gone
+	rm -rf $(SITE) docs/reference/api  # pages of what is gone; executed notebooks are kept
 	$(DOCS)/bin/sphinx-build -W --keep-going -q -b html docs $(SITE)
 	SEAOPT_SITE=$(SITE) $(DOCS)/bin/python -m pytest -q tests/test_site.py
 
