@@ -54,13 +54,19 @@ def find_notebooks(_app: Any, page: nodes.document) -> None:
             link["reftarget"] = "notebooks" + link["reftarget"].removeprefix(outside)
 
 
-# What docutils' MathML does not know, and what says the same.
+# What docutils' MathML does not know, and what says the same; 12 is two arguments of a fraction.
 SYNONYMS = (
+    (r"\\([td]?frac)\s*(\d)(\d)", r"\\\1{\2}{\3}"),
     (r"\\[bB]igg?(?![A-Za-z])", ""),
     (r"\\dots", r"\\ldots"),
     (r"\\iff", r"\\Leftrightarrow"),
     ("°", r"{}^\\circ "),
 )
+# It sets the subscript of a letter with an accent right below the letter.
+BELOW = re.compile(
+    r"<munderover>\s*(<mi>[^<]*</mi>)\s*(.*?)\s*(<mo[^>]*>[˙¨ˆ¯˜]</mo>)\s*</munderover>", flags=re.DOTALL
+)
+BESIDE = r"<msub><mover>\1\3</mover>\2</msub>"
 
 
 def write_math(writer: Any, node: nodes.Element) -> None:
@@ -70,7 +76,9 @@ def write_math(writer: Any, node: nodes.Element) -> None:
         formula = re.sub(pattern, known, formula)
     if "&" in formula and "\\begin" not in formula:
         formula = f"\\begin{{aligned}}{formula}\\end{{aligned}}"
-    writer.body.append(tex2mathml(formula, as_block=isinstance(node, nodes.math_block)))
+    mathml = tex2mathml(formula, as_block=isinstance(node, nodes.math_block))
+    # Without a mathematical font, browsers set what is called an accent into the letter.
+    writer.body.append(BELOW.sub(BESIDE, mathml).replace(' accent="true"', ""))
     raise nodes.SkipNode
 
 
