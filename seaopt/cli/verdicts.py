@@ -51,9 +51,8 @@ def judge_fit(fit: Fit, again: str) -> Verdict:
     size = f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}"
     percents = [one.fit_percent for row in fit.outputs.values() for one in row.values()]
     if fit.met:
-        worst = f", outputs fit to {min(percents):.1f} %" if len(percents) == 1 else ""
-        worst = worst or (f", outputs fit to {min(percents):.1f} to {max(percents):.1f} %" if percents else "")
-        return Verdict(met=True, text=f"Fit: converged, {size}{worst}")
+        ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
+        return Verdict(met=True, text=f"Fit: converged, {size}, outputs fit to {' to '.join(ends)} %")
     status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
     errors = [(one.text, one.where) for one in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):

@@ -269,6 +269,7 @@ def test_answers_take_the_place_of_guesses(tmp_path, logs):
     }  # fmt: skip
     assert problem.parameters["k_s"].prior_std == pytest.approx(12.5)
     assert problem.table.controller.robust_to == ["hanging"]
+    assert problem.table.robustness.retune > 0 and "J_l" in problem.table.robustness.parameters
 
 
 def test_wrong_roles_can_be_put_right(tmp_path, logs):

@@ -60,6 +60,7 @@ LEAST_RATE_HZ = 500.0  # of a controller; a slower log was not its clock
 HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
 GEARED = (1.5, 1000.0)  # slopes of motor over link that are a gear's
 BRIDGE = 5.0  # periods that an irregular clock may skip
+RETUNE = 4
 COMMENT_AT = 56  # column of the comments
 
 
@@ -471,6 +472,8 @@ def _describe_robustness(logs: Sequence[_Log], actuator: Proposed) -> list[tuple
     if actuator.ranges:
         ranges = ", ".join(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in actuator.ranges.items())
         rows.append((f"parameters = {{ {ranges} }}", "half to twice what was given"))
+    if actuator.ranges or any("prior_std" in line.value for line in actuator.lines):
+        rows.append((f"retune = {RETUNE}", "rounds of tuning for the worst case that the certificate finds"))
     noise = [
         log.roles.columns[actuator.measured].noise * factor(log.units[actuator.measured], _SI[actuator.measured])
         for log in logs
