@@ -176,7 +176,7 @@ class LawFile(_Strict):
             fractions = [_normalise(source, name, getattr(self, name)) for name in ("reference", "measurement")]
         if self.law is None:
             assert fractions is not None
-            return Law.from_transfer_functions(*fractions, ts)
+            return Law.from_transfer_functions(fractions[0], fractions[1], ts)
         a, b, c, d = (
             _make_matrix(source, name, getattr(self.law, name), len(self.law.A)) for name in ("A", "B", "C", "D")
         )
