@@ -9,6 +9,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.laws.verdict import join_labels
 from seaopt.estimation import Fit
+from seaopt.estimation.result.findings import FitFinding
 from seaopt.formatting import format_count, format_number
 from seaopt.records import record
 from seaopt.robustness import Certificate
@@ -16,6 +17,7 @@ from seaopt.robustness.certificate.certificate import Requirement
 
 STABILITY = "spectral_radius"
 FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
+DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
 REMEDIES = {
     **dict.fromkeys(FROM_DRAWS, "retune = 4 in [robustness] tunes for the worst cases, too"),
@@ -60,8 +62,34 @@ def judge_fit(fit: Fit, again: str) -> Verdict:
     reasons = _group(errors)
     return Verdict(
         met=False, text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met",
-        reasons=tuple(reasons), next=(f"correct the file, then type {again}",),
+        reasons=tuple(reasons), next=(*_list_cures(fit.errors), f"correct the file, then type {again}"),
     )  # fmt: skip
+
+
+def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
+    """Return the lines to write for the likely cause that is named first."""
+    cause = next((one for one in errors if one.kind == "cause" and one.preferred), None)
+    if cause is None:
+        return ()
+    return tuple(filter(None, (spell_cure(name, value) for name, (value, _) in cause.preferred.items())))
+
+
+def spell_cure(name: str, value: float) -> str:
+    """Return the line of a problem file that frees what a log would have otherwise; "" where there is no such line.
+
+    Examples
+    --------
+    >>> spell_cure("chirp.delay_s", 0.004), spell_cure("f_c", 12.0)
+    ('delay_s = { value = 0.004, free = true, max = 0.02 } in the [[experiment]] chirp', 'f_c = { value = 12, free = true } in [parameters]')
+
+    """  # noqa: E501
+    *of, own = name.split(".")
+    if not of:
+        return f"{own} = {{ value = {value:.4g}, free = true }} in [parameters]"
+    if own == "delay_s" and value > 0.0:
+        longest = DELAY_ROOM * value
+        return f"delay_s = {{ value = {value:.4g}, free = true, max = {longest:.2g} }} in the [[experiment]] {of[0]}"
+    return ""
 
 
 def judge_controller(controller: Controller, sweep: str) -> Verdict:
