@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from seaopt.control import Controller, ForceMPC
-from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.laws.verdict import join_labels
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_number
 from seaopt.records import record
-from seaopt.reporting.figures.certificate import usage_of
+from seaopt.reporting.figures.certificate import label_requirement, usage_of
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import Requirement
 from seaopt.robustness.verification.verification import Verification
@@ -38,14 +37,6 @@ class Failure:
         others = "" if not more else f" (the worst of {self.count})"
         size = f"{format_number(row.value)}, {against} {format_number(row.limit)}"
         return f"{self.label} {size}{others}: {row.where}"
-
-
-def label_requirement(row: Requirement) -> str:
-    """Return a requirement's name in words."""
-    if row.name in BY_REQUIREMENT:
-        return BY_REQUIREMENT[row.name].label
-    name = row.name.removesuffix("_s")
-    return name.replace("_", " ") + (" [s]" if name != row.name else "")
 
 
 def group_failures(requirements: Sequence[Requirement]) -> list[Failure]:

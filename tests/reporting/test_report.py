@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import html
+import json
 import re
 from dataclasses import replace
 
@@ -10,6 +11,8 @@ import pytest
 
 import seaopt as so
 from seaopt.reporting import verdict
+from seaopt.reporting.figures.panel import Panel
+from seaopt.reporting.page.chart import make_chart
 
 
 def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
@@ -115,6 +118,27 @@ def test_what_was_done_to_the_data_stands_in_the_report(stand, thor, short_log, 
     fit = so.fit([experiment], thor.free("J", "b_r"))
     page = so.write_report([fit], tmp_path / "report.html").read_text(encoding="utf-8")
     assert "at or beyond its declared range" in page
+
+
+def test_a_drawing_on_the_page_has_the_numbers_of_its_axes():
+    """Coordinates are shortened there; the numbers at ticks, and what a chart says of its sides, must not be."""
+
+    def draw(axes):
+        axes[0].plot([0.0, 1.0, 2.0], [0.00012, 0.00018, 0.00031], label="a")
+        axes[0].set_yticks([0.0001, 0.0002, 0.0003], ["0.0001", "0.0002", "0.0003"])
+
+    chart = make_chart(Panel(name="small", title="1.23456", draw=draw))
+    assert [f">0.000{k}</text>" in chart.svg for k in (1, 2, 3)] == [True] * 3
+    assert 'aria-label="1.23456.' in chart.svg
+    (pane,) = json.loads(chart.axes)
+    (path,) = re.findall(r'<g id="small-curve0-0">\s*<path d="([^"]*)"', chart.svg)
+    points = np.array(re.findall(r"([-\d.]+) ([-\d.]+)", path), dtype=float)
+    left, top, right, bottom = pane["box"]
+    x, y = pane["x"], pane["y"]
+    across = x["low"] + (points[:, 0] - left) / (right - left) * (x["high"] - x["low"])
+    up = y["low"] + (bottom - points[:, 1]) / (bottom - top) * (y["high"] - y["low"])
+    np.testing.assert_allclose(across, [0.0, 1.0, 2.0], atol=1e-5)
+    np.testing.assert_allclose(up, [0.00012, 0.00018, 0.00031], rtol=1e-4)
 
 
 SECTIONS = [

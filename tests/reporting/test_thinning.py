@@ -45,5 +45,5 @@ def test_no_line_joins_what_a_gap_parts():
 
 
 def test_captions_say_how_a_series_was_thinned():
-    assert describe_thinning(1600) == ""
+    assert describe_thinning(1000) == ""
     assert "2001 samples" in describe_thinning(2001) and "min-max" in describe_thinning(2001)

@@ -47,6 +47,14 @@ def usage_of(row: Requirement) -> float | None:
     return row.value / row.limit
 
 
+def label_requirement(row: Requirement) -> str:
+    """Return a requirement's name in words."""
+    if row.name in BY_REQUIREMENT:
+        return BY_REQUIREMENT[row.name].label
+    name = row.name.removesuffix("_s")
+    return name.replace("_", " ") + (" [s]" if name != row.name else "")
+
+
 def requirements_panel(certificate: Certificate) -> Panel:
     """Draw how much of its limit each kind of requirement uses, on the plant that uses most."""
     most: dict[str, tuple[float, Requirement]] = {}
@@ -54,7 +62,7 @@ def requirements_panel(certificate: Certificate) -> Panel:
         used = usage_of(row)
         if used is not None and (row.name not in most or used > most[row.name][0]):
             most[row.name] = (used, row)
-    labels = [BY_REQUIREMENT[name].label if name in BY_REQUIREMENT else name.replace("_", " ") for name in most]
+    labels = [label_requirement(row) for _, row in most.values()]
 
     def draw(axes: Sequence[Axes]) -> None:
         from seaopt.reporting.figures.canvas import BLUE, LIMIT, VERMILION

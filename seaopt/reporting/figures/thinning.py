@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-STRETCHES = 800
+STRETCHES = 500
 METHOD = "least and largest sample of each of {} stretches (min-max)"
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 POINTS_PER_INCH = 72.0  # the units of a drawing
 _COLOUR = re.compile(r"#[0-9a-f]{6}\b")
 _DIGITS = re.compile(r"\b\d+\.\d{4,}\b")  # of a drawing of 350 points: 3e-6 of an axis is left
+_TAG = re.compile(r"<[^>]*>")
 _STYLE = re.compile(r'style="([^"]*)"')
 
 
@@ -166,9 +167,14 @@ def _fit_to_page(svg: str, name: str, alternative: str) -> str:
         if attribute != "xmlns:xlink":
             body = re.sub(rf'(<svg[^>]*?)\s{attribute}="[^"]*"', r"\1", body, count=1)
     body = _STYLE.sub(lambda found: f'style="{_COLOUR.sub(_follow, found.group(1))}"', body)
-    body = _DIGITS.sub(lambda found: f"{float(found.group(0)):.3f}".rstrip("0").rstrip("."), body)
+    body = _TAG.sub(lambda found: _DIGITS.sub(_shorten, found.group(0)), body)  # not the numbers at ticks
     body = re.sub(r"\s*\n\s*", "\n", body).replace("\nL ", "L")
     return body.replace("<svg", f'<svg role="img" aria-label="{escape(printable(alternative))}"', 1).strip()
+
+
+def _shorten(found: re.Match[str]) -> str:
+    """Return a coordinate with three decimals."""
+    return f"{float(found.group(0)):.3f}".rstrip("0").rstrip(".")
 
 
 def _follow(found: re.Match[str]) -> str:

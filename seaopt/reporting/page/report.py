@@ -30,7 +30,7 @@ from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.reporting.page.chart import Chart, make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_template
-from seaopt.reporting.verdict import group_failures, label_requirement, verdict
+from seaopt.reporting.verdict import group_failures, verdict
 from seaopt.robustness import Certificate
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.judgement import Outcome
@@ -378,7 +378,7 @@ def group_requirements(certificate: Certificate) -> list[RequirementRow]:
     groups += [(row, 1) for row in certificate.requirements if row.met]
     return [
         RequirementRow(
-            label=label_requirement(row), value=row.value, limit=row.limit, sense=row.sense, met=row.met,
+            label=certificates.label_requirement(row), value=row.value, limit=row.limit, sense=row.sense, met=row.met,
             where=row.where, count=count,
         )
         for row, count in groups
