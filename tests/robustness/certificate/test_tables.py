@@ -20,8 +20,9 @@ def certificate():
 
 
 def rows(shown):
-    """Return the tables' cells, a list a row; what is no XML is refused."""
-    page = ElementTree.fromstring(f"<div>{shown}</div>")
+    """Return the tables' cells, a list a row; what is no XML is refused, but for images, which HTML leaves open."""
+    closed = re.sub(r"(<img\b[^>]*[^/>])>", r"\1/>", shown)
+    page = ElementTree.fromstring(f"<div>{closed}</div>")
     return [["".join(cell.itertext()) for cell in row] for row in page.iter("tr")]
 
 
