@@ -65,7 +65,7 @@ def show_fit(console: Terminal, fit: Fit, scores: Iterable[ModelledOutputs] = ()
     ]
     for name, figure in fit.derived.items():
         rows.append((name, f"{figure.value:.5g}", _spread(figure.std), unit_after(figure.unit).strip(), "derived"))
-    heading(console, "Fit", f"{fit.samples} samples, {fit.wall_s:.1f} s")
+    heading(console, "Fit", f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}, {fit.wall_s:.1f} s")
     _tabulate(console, rows, ("parameter", "value", "std", "unit", ""), "<>><<")
     outputs = [
         (f"{name}.{output}", f"{one.fit_percent:.2f}", format_number(one.holdout_fit_percent, 4),

@@ -50,7 +50,7 @@ class Verdict:
 
 def judge_fit(fit: Fit, again: str) -> Verdict:
     """Return the verdict on a fit; `again` is the command that fits."""
-    size = f"{fit.samples} samples, {format_count(fit.iterations, 'iteration')}"
+    size = f"{fit.samples} samples"
     percents = [one.fit_percent for row in fit.outputs.values() for one in row.values()]
     if fit.met:
         ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
