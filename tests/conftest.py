@@ -37,7 +37,7 @@ CHOICES = (
     ("zero", "first"),
     ("split", "error"),
     ("auto", "declared", "none"),
-    ("pd", "pid", "pid_dob"),
+    ("pd", "pid", "pid_dob", "custom"),
     ("error", "measurement"),
     ("disturbance", "noise"),
 )

@@ -211,7 +211,7 @@ def read_law(path: Path | str) -> GivenLaw:
     --------
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "law.toml"
-    >>> _ = path.write_text('sample_rate_hz = 1000.0\\ndelay_samples = 1\\n[pid]\\nk_p = 2.0\\nk_i = 30.0\\n')
+    >>> _ = path.write_text('sample_rate_hz = 1000.0\ndelay_samples = 1\n[pid]\nk_p = 2.0\nk_i = 30.0\n')
     >>> read_law(path).law.integrators
     1
 

@@ -167,7 +167,7 @@ def test_it_names_fits_and_can_be_written(stand, thor, short_log):
     assert set(ranking.fits) == {stand.name, f"{stand.name} 2"}
     written = json.loads(to_json(ranking.to_dict()))
     assert [row["name"] for row in written["ranking"]] == list(ranking.fits)
-    assert ranking._repr_html_().startswith("<pre>Ranking")
+    assert f"{stand.name} is preferred" in ranking._repr_html_()
 
 
 def test_a_two_mass_drive_prefers_a_soft_coupling_at_its_resonance(recorded):
