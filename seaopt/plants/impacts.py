@@ -114,8 +114,8 @@ def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -
     others = [k for k in range(len(places)) if k != link]
     before, after = state[rates], state[rates].copy()
     after[link] = 0.0
-    coupling = inertia[np.ix_(others, [link])].ravel()
-    after[others] += np.linalg.solve(inertia[np.ix_(others, others)], coupling * before[link])
+    coupling = inertia[others][:, [link]].ravel()
+    after[others] += np.linalg.solve(inertia[others][:, others], coupling * before[link])
     impulse = float(inertia[link] @ (after - before))
     loss = 0.5 * float(before @ inertia @ before - after @ inertia @ after)
     moved = state.copy()

@@ -106,7 +106,7 @@ class PortModel:
         moving = np.arange(n) != self.speed
         while np.any(still := moving & ~np.any(a[:, moving], axis=1) & (b == 0.0)):
             moving &= ~still
-        return a[np.ix_(moving, moving)], b[moving], c[moving], float(d)
+        return a[moving][:, moving], b[moving], c[moving], float(d)
 
     def _poles(self) -> Complex[np.ndarray, " n"]:
         """Return the poles with link 2 at rest."""

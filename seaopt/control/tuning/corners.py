@@ -82,7 +82,7 @@ def draw(
     used = [i for i, name in enumerate(names) if name in values and name not in uniform and np.isfinite(matrix[i, i])]
     if not used and not uniform:
         raise ControlError("parameters has no covariance and no prior_std, and there are no ranges: nothing to draw")
-    names, matrix = [names[i] for i in used], matrix[np.ix_(used, used)]
+    names, matrix = [names[i] for i in used], matrix[used][:, used]
     out: list[dict[str, float]] = []
     for _ in range(count):
         normal = rng.multivariate_normal([values[name].value for name in names], matrix) if names else []

@@ -161,7 +161,7 @@ class Bench:
             if self.offset:
                 rows.append(1 + p + nx)
                 place.append(p + nx * self.initial + o)
-            total[np.ix_(place, place)] += result.gram[0, o][np.ix_(rows, rows)] / sigma**2
+            total[np.array(place)[:, None], place] += result.gram[0, o][rows][:, rows] / sigma**2
         if not np.all(np.isfinite(total)):
             return np.full((p, p), np.inf)
         total[np.arange(p), np.arange(p)] += self.prior

@@ -146,9 +146,9 @@ def _compute_scores(
     hessian = here.hessian
     if not trial.loss.quadratic:
         hessian = compute_bread(trial, z) + np.diag(unknowns.precision)
-    across = solve_seen(hessian[np.ix_(rest, rest)], hessian[np.ix_(rest, places)], 1e-12)
+    across = solve_seen(hessian[rest][:, rest], hessian[rest][:, places], 1e-12)
     score = here.gradient[places] - across.T @ here.gradient[rest]
-    information = np.diag(hessian)[places] - np.sum(hessian[np.ix_(rest, places)] * across, axis=0)
+    information = np.diag(hessian)[places] - np.sum(hessian[rest][:, places] * across, axis=0)
     along = np.zeros((z.size, places.size))
     along[rest], along[places, np.arange(places.size)] = -across, 1.0
     meat = compute_meat(trial, z, along, compute_statistics(trial, z))

@@ -195,7 +195,7 @@ class FitProblem:
             gradient = gradient + bent
         if finite and np.any(linear):
             best = np.zeros(n)
-            best[linear] = -solve_seen(hessian[np.ix_(linear, linear)], gradient[linear], 1e-13)
+            best[linear] = -solve_seen(hessian[linear][:, linear], gradient[linear], 1e-13)
             cost += 0.5 * float(best @ gradient)
             finite = finite and cost > -LOST
             gradient = np.where(linear, 0.0, gradient + hessian @ best)

@@ -41,7 +41,7 @@ class QuadraticModel:
 
     def distance_squared(self, free: Bool[np.ndarray, " n"]) -> float:
         """Return the squared distance to the minimum over the free unknowns, in standard deviations."""
-        return measure_decrement(self.hessian[np.ix_(free, free)], self.gradient[free], 1e-12)
+        return measure_decrement(self.hessian[free][:, free], self.gradient[free], 1e-12)
 
     def predict_fall(self, step: Float[np.ndarray, " n"]) -> float:
         """Return by how much a step lowers the cost."""
@@ -181,7 +181,7 @@ def find_arrow(matrix: Float[np.ndarray, "n n"]) -> ArrowShape | None:
     counts = np.count_nonzero(meet, axis=1)
     shaft = counts > 2.0 * np.median(counts)
     rest = np.flatnonzero(~shaft)
-    _, labels = connected_components(csr_array(meet[np.ix_(rest, rest)]), directed=False)
+    _, labels = connected_components(csr_array(meet[rest][:, rest]), directed=False)
     sizes = np.bincount(labels)
     if np.max(sizes) > LARGEST_BLOCK or np.count_nonzero(shaft) > len(matrix) // 2:
         return None
@@ -204,7 +204,7 @@ class _Arrow:
 
     @classmethod
     def of(cls, matrix: Float[np.ndarray, "n n"], shape: ArrowShape, cut: float) -> _Arrow:
-        shaft = matrix[np.ix_(shape.shaft, shape.shaft)]
+        shaft = matrix[shape.shaft][:, shape.shaft]
         reduced = shaft.copy()
         blocks: list[_Spectrum] = []
         across: list[Float[np.ndarray, "..."]] = []

@@ -130,7 +130,7 @@ def compute_structural_rank(problem: FitProblem, z: Float[np.ndarray, " n"]) -> 
         passes = run_passes(model, piece, point, np.zeros((1, model.nx)))
         for o in range(model.ny):
             gram = passes.gram[0, o, 1 : 1 + index.size, 1 : 1 + index.size] / experiment.sigma[o] ** 2
-            information[np.ix_(index, index)] += gram
+            information[index[:, None], index] += gram
     if not np.all(np.isfinite(information)):
         return -1
     size = np.sqrt(np.where(np.diag(information) > 0.0, np.diag(information), 1.0))

@@ -85,7 +85,7 @@ class StoredCovariance(ResultTable):
             raise FileError(f"fit.json: {place}.matrix is not {n} by {n}, as names is long; {FIT_AGAIN}")
         matrix = np.array(self.matrix, dtype=float).reshape(n, n)
         finite = np.isfinite(np.diag(matrix))
-        least = np.linalg.eigvalsh(matrix[np.ix_(finite, finite)])
+        least = np.linalg.eigvalsh(matrix[finite][:, finite])
         if np.any(least < -1e-9 * np.max(np.diag(matrix)[finite], initial=0.0)):
             raise FileError(f"fit.json: {place} has a negative variance; {FIT_AGAIN}")
         return Covariance(names=tuple(self.names), matrix=matrix)

@@ -170,7 +170,7 @@ def _compute_covariances(
         return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), variance
     columns = inverse[:, stated]
     known = (columns.T * prior) @ columns
-    white = inverse[np.ix_(stated, stated)]
+    white = inverse[stated][:, stated]
     if not problem.loss.quadratic:
         sums = statistics if statistics is not None else compute_statistics(problem, z)
         white = columns.T @ compute_white_meat(problem, z, sums) @ columns + known
@@ -273,7 +273,7 @@ def _derive_figures(
         names = [own.get(name, "" if name in experiment.parameters else name) for name in plant.parameters]
         free = [name for name in seen.names if name in names]
         rows = [seen.names.index(name) for name in free]
-        matrix = seen.matrix[np.ix_(rows, rows)]
+        matrix = seen.matrix[rows][:, rows]
         alone = [name in experiment.parameters for name in plant.parameters]
         for i, (figure, unit) in enumerate(units.items()):
             name = f"{experiment.name}.{figure}" if np.any(slopes[i, alone]) else figure

@@ -201,7 +201,8 @@ def _misfit(
             slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
             j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
             gradient[target.index] += (j.conj().T @ r.ravel()).real
-            hessian[np.ix_(target.index, target.index)] += (j.conj().T @ j).real
+            place = np.array(target.index)
+            hessian[place[:, None], place] += (j.conj().T @ j).real
     return cost, gradient, hessian
 
 

@@ -192,12 +192,12 @@ def _step(
     """Return the step within the radius and its lambda; the linear unknowns follow the others."""
     bound, follow = ~blocked & ~here.linear, ~blocked & here.linear
     h, g = here.hessian, here.gradient
-    matrix, gradient, response = h[np.ix_(bound, bound)], g[bound], np.zeros((0, 0))
+    matrix, gradient, response = h[bound][:, bound], g[bound], np.zeros((0, 0))
     if np.any(follow):
-        right = np.column_stack([g[follow], h[np.ix_(follow, bound)]])
-        response = solve_seen(h[np.ix_(follow, follow)], right, 1e-13)
-        matrix = matrix - h[np.ix_(bound, follow)] @ response[:, 1:]
-        gradient = gradient - h[np.ix_(bound, follow)] @ response[:, 0]
+        right = np.column_stack([g[follow], h[follow][:, bound]])
+        response = solve_seen(h[follow][:, follow], right, 1e-13)
+        matrix = matrix - h[bound][:, follow] @ response[:, 1:]
+        gradient = gradient - h[bound][:, follow] @ response[:, 0]
     step = np.zeros(blocked.size)
     d = scale[bound]
     solve, largest = _make_damped_solver(matrix / np.outer(d, d))

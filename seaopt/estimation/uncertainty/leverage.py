@@ -58,4 +58,4 @@ def _compute_information(minimum: Minimum, experiment: FitExperiment) -> Float[n
     rest = touched[touched >= unknowns.shared]
     hessian[rest, rest] += unknowns.precision[rest]
     kept = np.concatenate([np.arange(unknowns.shared), rest])
-    return eliminate(hessian[np.ix_(kept, kept)], unknowns.shared)
+    return eliminate(hessian[kept][:, kept], unknowns.shared)

@@ -270,7 +270,7 @@ def _find_direction(hessian: Float[np.ndarray, "n n"], index: int) -> Float[np.n
     """Return how the others follow when one unknown moves by one: to first order, their best values."""
     others = np.arange(len(hessian)) != index
     step = np.ones(len(hessian))
-    step[others] = -solve_seen(hessian[np.ix_(others, others)], hessian[others, index], 1e-12)
+    step[others] = -solve_seen(hessian[others][:, others], hessian[others, index], 1e-12)
     return step
 
 

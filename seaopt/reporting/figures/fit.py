@@ -254,7 +254,7 @@ def correlation_panel(fit: Fit) -> Panel:
     if np.count_nonzero(known) < 2:
         raise EstimationError("fewer than two parameters have a standard deviation: there is no correlation to draw")
     names = [name for name, used in zip(fit.covariance.names, known, strict=True) if used]
-    matrix = fit.covariance.matrix[np.ix_(known, known)] / np.outer(std[known], std[known])
+    matrix = fit.covariance.matrix[known][:, known] / np.outer(std[known], std[known])
 
     def draw(axes: Sequence[Axes]) -> None:
         (axis,) = axes

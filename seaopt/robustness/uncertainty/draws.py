@@ -270,7 +270,7 @@ def combine_uncertainty(
     ranged = {name: plant for name, plant in find_modes(plants).items() if name in ranges}
     modes = {name: _tabulate_mode(plant, nominal, ranges[name]) for name, plant in ranged.items()}
     return Uncertainty(
-        nominal=nominal, names=tuple(uncertain[i] for i in used), covariance=whole[np.ix_(used, used)],
+        nominal=nominal, names=tuple(uncertain[i] for i in used), covariance=whole[used][:, used],
         ranges={name: (float(low), float(high)) for name, (low, high) in ranges.items()}, modes=modes,
         absent={name: default for plant in plants.values() for name, default in plant.defaults.items()}
         | conditions(tuple(plants.values())),
