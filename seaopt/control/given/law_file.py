@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from seaopt.control.given.pid_forms import Integral, ideal_pid, parallel_pid
 from seaopt.control.laws.stored import Finite, StoredTransferFunction
+from seaopt.control.laws.structures import AGREES, COMPARED
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Whole, check_table
@@ -20,8 +21,7 @@ from seaopt.files import check_regular
 from seaopt.records import record
 
 Positive = Annotated[Finite, Field(gt=0.0)]
-AGREES = 1e-6  # share by which a law and its transfer functions may differ in one file
-PID_TIMES = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
+PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
 
 
 @record(eq=False)
@@ -85,18 +85,18 @@ class _Pid(_Strict):
 
     @model_validator(mode="after")
     def _check_names(self) -> _Pid:
-        for form, names in PID_TIMES.items():
+        for form, names in PID_GAINS.items():
             wrong = [name for name in names if form != self.form and getattr(self, name) is not None]
             if wrong:
                 raise ValueError(
-                    f"should have {', '.join(PID_TIMES[self.form])} in the {self.form} form, not {wrong[0]}"
+                    f"should have {', '.join(PID_GAINS[self.form])} in the {self.form} form, not {wrong[0]}"
                 )
-        if getattr(self, PID_TIMES[self.form][0]) is None:
-            raise ValueError(f"should have {PID_TIMES[self.form][0]} in the {self.form} form")
+        if getattr(self, PID_GAINS[self.form][0]) is None:
+            raise ValueError(f"should have {PID_GAINS[self.form][0]} in the {self.form} form")
         return self
 
     def build(self, sample_time_s: float) -> Law:
-        names = PID_TIMES[self.form]
+        names = PID_GAINS[self.form]
         gains = {name: value for name in names if (value := getattr(self, name)) is not None}
         make: Any = parallel_pid if self.form == "parallel" else ideal_pid
         return make(
@@ -181,7 +181,7 @@ class LawFile(_Strict):
             _make_matrix(source, name, getattr(self.law, name), len(self.law.A)) for name in ("A", "B", "C", "D")
         )
         law = Law.from_state_space(a, b, c[0], d[0], ts)
-        f = np.geomspace(1e-4, 0.49, 60) / ts
+        f = COMPARED / ts
         for name, fraction, response in zip(
             ("reference", "measurement"), fractions or (), (law.reference_response(f), law.measurement_response(f)),
             strict=False,

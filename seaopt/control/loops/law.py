@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.loops.minimal import (
+    RESPONSE_TOLERANCE,
     balance,
     build_chain,
     check_same_response,
@@ -40,7 +41,6 @@ from seaopt.records import record
 if TYPE_CHECKING:
     import control
 
-SAME_RESPONSE = 1e-6  # by which taking integrators apart may change a response
 TINY = 1e-300
 EQUAL_GAINS = 1e-9  # integrals of reference and measurement that differ by less are one of the error
 NEAREST_TO_ONE = 1e-17  # abs(z - 1) at least: an integrator's response at 0 Hz is large instead of infinite
@@ -208,7 +208,7 @@ class Law:
         for chain, *rest in split_integrators(a, b, c):
             given = build_chain(_equalise(chain), rest[0], rest[1], rest[2])
             law = cls(**given, d=d, sample_time_s=sample_time_s).balanced()
-            if np.all(np.abs(law.responses(f) - wanted) <= SAME_RESPONSE * np.abs(wanted) + TINY):
+            if np.all(np.abs(law.responses(f) - wanted) <= RESPONSE_TOLERANCE * np.abs(wanted) + TINY):
                 return law
         return as_given
 

@@ -391,14 +391,13 @@ class Task:
         if not self.asks_margin:
             return self
         names = [multiplier] * len(self.frictions) if multiplier else [
-            margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(x)
+            margin.multiplier if margin.factor else SIMPLEST for margin in self.find_margins(self.law_of(x))
         ]  # fmt: skip
         aimed = (replace(one, multiplier=name) for one, name in zip(self.frictions, names, strict=True))
         return replace(self, frictions=tuple(aimed))
 
-    def find_margins(self, x: LawNumbers) -> list[FrictionMargin]:
+    def find_margins(self, law: Law) -> list[FrictionMargin]:
         """Return the margin of every plant with friction."""
-        law = self.law_of(x)
         return [friction_margin(replace(one.loop, law=law)) for one in self.frictions]
 
     def measure(self, x: LawNumbers) -> list[MeasuredLoop]:
@@ -416,7 +415,8 @@ class Task:
             port = measure_port(self.port, law, spec.sample_time_s, spec.loop_delay_samples, band)
         slopes: dict[int, float] = {}
         if self.asks_margin:
-            slopes = {one.plant: friction_margin(replace(one.loop, law=law)).least_slope for one in self.frictions}
+            margins = zip(self.frictions, self.find_margins(law), strict=True)
+            slopes = {one.plant: margin.least_slope for one, margin in margins}
         return [
             MeasuredLoop(
                 name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,
