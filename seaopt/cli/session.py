@@ -23,7 +23,7 @@ from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_cont
 from seaopt.cli.responses import estimate_responses
 from seaopt.cli.show import show_certificate, show_controller, show_fit, show_verdicts
 from seaopt.cli.terminal import Terminal
-from seaopt.cli.verdicts import Verdict, judge_certificate, judge_controller, judge_fit
+from seaopt.cli.verdicts import StageVerdict, judge_certificate, judge_controller, judge_fit
 from seaopt.control import Controller, ControllerSpec, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
@@ -515,23 +515,23 @@ class Session:
         )  # fmt: skip
         return [expectation.check(results) for expectation in list_expectations(self.problem)]
 
-    def _verdicts(self, stage: str) -> list[Verdict]:
+    def _verdicts(self, stage: str) -> list[StageVerdict]:
         """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
         if stage == "expect":
             outcomes = self._expected()
-            unmet = [Verdict(met=False, text=text) for met, text in outcomes if not met]
+            unmet = [StageVerdict(met=False, text=text) for met, text in outcomes if not met]
             text = f"Expectations: {len(outcomes) - len(unmet)} of {len(outcomes)} met"
-            return [Verdict(met=True, text=text), *unmet] if len(unmet) < len(outcomes) else unmet
+            return [StageVerdict(met=True, text=text), *unmet] if len(unmet) < len(outcomes) else unmet
         result = self.results.get(stage)
         if stage == "frf" and result is not None:
-            return [Verdict(met=good, text=text) for good, text in result.verdict()]
-        verdicts: list[Verdict] = []
+            return [StageVerdict(met=good, text=text) for good, text in result.verdict()]
+        verdicts: list[StageVerdict] = []
         if stage == "fit" and result is not None:
             return [judge_fit(result, self._spell("fit"))]
         if stage == "tune" and result is not None:
             joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
             if joint is not None:
-                verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
+                verdicts.append(StageVerdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
             verdicts.append(judge_controller(result, sweep))
         if stage == "certify" and result is not None:
             again = self._spell("run" if self.problem.table.experiment else "tune")
@@ -539,7 +539,7 @@ class Session:
         if stage not in ("tune", "certify", "sweep") or self.fit_met():
             return verdicts
         unmet = [replace(one, met=False, text=f"{one.text}, {UNMET}") for one in verdicts]
-        return unmet or [Verdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
+        return unmet or [StageVerdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
 
     def _spell(self, command: str) -> str:
         """Return a command on this problem as it is typed."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from seaopt.cli.terminal import Terminal
-from seaopt.cli.verdicts import Reason, Verdict
+from seaopt.cli.verdicts import Reason, StageVerdict
 from seaopt.control import Controller
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.estimation import Fit, ModelledOutputs
@@ -21,7 +21,7 @@ MOST_CHARACTERS = 240  # of a reason
 MET, UNMET = ("met    ", "green"), ("not met", "red")
 
 
-def show_verdicts(console: Terminal, verdicts: Sequence[Verdict], *, verbose: bool = False) -> None:
+def show_verdicts(console: Terminal, verdicts: Sequence[StageVerdict], *, verbose: bool = False) -> None:
     """Print a line per stage, below it what is not met, and at the end what to type next."""
     for verdict in verdicts:
         word, colour = MET if verdict.met else UNMET

@@ -39,7 +39,7 @@ class Reason:
 
 
 @record
-class Verdict:
+class StageVerdict:
     """Whether a stage is met, in one line; why not; and the commands, or lines of the file, that come next."""
 
     met: bool
@@ -48,19 +48,19 @@ class Verdict:
     next: tuple[str, ...] = ()
 
 
-def judge_fit(fit: Fit, again: str) -> Verdict:
+def judge_fit(fit: Fit, again: str) -> StageVerdict:
     """Return the verdict on a fit; `again` is the command that fits."""
     size = f"{fit.samples} samples"
     percents = [one.fit_percent for row in fit.outputs.values() for one in row.values()]
     if fit.met:
         ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
-        return Verdict(met=True, text=f"Fit: converged, {size}, outputs fit to {' to '.join(ends)} %")
+        return StageVerdict(met=True, text=f"Fit: converged, {size}, outputs fit to {' to '.join(ends)} %")
     status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
     errors = [(one.text, one.where) for one in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
         errors.insert(0, (fit.message, ""))
     reasons = _group(errors)
-    return Verdict(
+    return StageVerdict(
         met=False, text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met",
         reasons=tuple(reasons), next=(*_list_cures(fit.errors), f"correct the file, then type {again}"),
     )  # fmt: skip
@@ -92,15 +92,15 @@ def spell_cure(name: str, value: float) -> str:
     return ""
 
 
-def judge_controller(controller: Controller, sweep: str) -> Verdict:
+def judge_controller(controller: Controller, sweep: str) -> StageVerdict:
     """Return the verdict on a tuned controller; `sweep` is the command that tunes at a range of bandwidths."""
     spec = controller.spec
     name = f"Controller: {controller.structure} on {spec.measured}, {spec.bandwidth_hz:g} Hz"
     if controller.feasible:
-        return Verdict(met=True, text=f"{name}, every limit met")
+        return StageVerdict(met=True, text=f"{name}, every limit met")
     blocked = controller.blocked_by or (join_labels(controller.active_constraints),)
     reasons = [Reason(what=text, where="") for text in blocked]
-    return Verdict(
+    return StageVerdict(
         met=False, text=f"{name}, {format_count(len(reasons), 'limit')} not met", reasons=tuple(reasons),
         next=_advise_bandwidth(controller, sweep),
     )  # fmt: skip
@@ -125,20 +125,20 @@ def _range_about(asked: float) -> str:
     return f"{step * math.floor(low / step):.4g}:{step * math.ceil(high / step):.4g}:{step:.4g}"
 
 
-def judge_certificate(certificate: Certificate, again: str, sweep: str) -> Verdict:
+def judge_certificate(certificate: Certificate, again: str, sweep: str) -> StageVerdict:
     """Return the verdict on a certificate; the commands are those that run it again, and tune at other bandwidths."""
     draws = certificate.monte_carlo
     if certificate.passed:
         runs = "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulated runs passed"
         bound = f", failure probability below {draws.failure_probability_bound:.2g}" if draws.samples else ""
         text = f"Certificate: passed, {draws.failures} failures in {draws.samples} draws{bound}{runs}"
-        return Verdict(met=True, text=text)
+        return StageVerdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
     reasons = group_requirements(broken)
     remedies = [_advise(row.name) for row in broken]
     first = next((text for text in remedies if text), "")
     command = f"type {again}" if not first else f"{first}; then type {again}"
-    return Verdict(
+    return StageVerdict(
         met=False, text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
         reasons=tuple(reasons),
         next=(command, f"to see what other bandwidths cost type {sweep} "
