@@ -31,6 +31,8 @@ FEWEST, MOST = 6, 256  # stretches that are averaged
 INDEPENDENT = 0.947  # averages per overlapping stretch (Welch 1967, Hann)
 OUTLIER = 4.0  # robust standard deviations beyond which a residual tells nothing of its spectrum
 OCTAVES = 24  # below the Nyquist frequency, at most
+SILENT = 1e-9  # of an input's largest line
+ALIKE = 1e-10  # of the power of inputs that differ by less there is nothing left to rounding
 
 
 @record(eq=False)
@@ -66,7 +68,7 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
         return {}
     shares: dict[str, CoherentShare] = {}
     total = sum(len(rows) for rows in inputs)
-    lengths = sorted({2 * (min(max(2 * total // count, SHORTEST), total) // 2) for count in STRETCHES})
+    lengths = sorted({_make_even(min(max(2 * total // count, SHORTEST), total)) for count in STRETCHES})
     spectra = [one for length in lengths if (one := _make_spectra(inputs, outputs, length, experiment)) is not None]
     for o, name in enumerate(experiment.data.outputs):
         rows = [one.compare(o, len(lengths)) for one in spectra]
@@ -78,6 +80,18 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
             band_hz=best.band_hz, power=max(row.power for row in rows),
         )  # fmt: skip
     return shares
+
+
+def _make_even(samples: int) -> int:
+    """Return the next even number below that has no prime factor above 5, of which transforms are quick."""
+    for even in range(samples - samples % 2, 0, -2):
+        rest = even
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return even
+    return samples
 
 
 def _gather(
@@ -184,7 +198,10 @@ def _make_spectra(
     inputs: Sequence[Float[np.ndarray, "_ m"]], outputs: Sequence[Float[np.ndarray, "_ s"]], length: int,
     experiment: FitExperiment,
 ) -> _Spectra | None:  # fmt: skip
-    """Return the spectra over stretches of one length; None where there are too few of them."""
+    """Return the spectra over stretches of one length; None where there are too few of them.
+
+    Stretches are summed as they come: the memory is that of one, however long the logs are.
+    """
     starts = [
         (i, row) for i, rows in enumerate(inputs) for row in range(0, len(rows) - length + 1, max(length // 2, 1))
     ]
@@ -193,32 +210,39 @@ def _make_spectra(
     averages, m = INDEPENDENT * len(starts), inputs[0].shape[1]
     if len(starts) < FEWEST or averages < 2.0 * m + 1.0:
         return None
-    window = np.hanning(length + 1)[:length]
-    u, y = (
-        np.stack([_transform(rows[i][a : a + length], window) for i, a in starts], axis=1) for rows in (inputs, outputs)
-    )
     frequency = np.fft.rfftfreq(length, experiment.period)
     low, high = experiment.band_hz or (0.0, np.inf)
     kept = (frequency > 0.0) & (frequency >= low) & (frequency <= high)
     if np.count_nonzero(kept) < 3:
         return None
-    u, y = u[kept], y[kept]
-    coherent = _project(u, y)
-    return _Spectra(
-        frequency_hz=frequency[kept], power=np.sum(np.abs(y) ** 2, axis=1), coherent=coherent, averages=averages,
-        inputs=m,
-    )  # fmt: skip
+    window = np.hanning(length + 1)[:length]
+    lines, s = np.count_nonzero(kept), outputs[0].shape[1]
+    of_inputs, across = np.zeros((m, m, lines), dtype=complex), np.zeros((m, s, lines), dtype=complex)
+    power = np.zeros((s, lines))
+    for i, a in starts:
+        u, y = (_transform(rows[i][a : a + length], window)[:, kept] for rows in (inputs, outputs))
+        conjugate = np.conj(u)[:, None]
+        of_inputs += conjugate * u
+        across += conjugate * y
+        power += np.real(y) ** 2 + np.imag(y) ** 2
+    coherent = _project(np.moveaxis(of_inputs, 2, 0), np.moveaxis(across, 2, 0))
+    return _Spectra(frequency_hz=frequency[kept], power=power.T, coherent=coherent, averages=averages, inputs=m)
 
 
-def _transform(cut: Float[np.ndarray, "n s"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "f s"]:
+def _transform(cut: Float[np.ndarray, "n s"], window: Float[np.ndarray, " n"]) -> Complex[np.ndarray, "s f"]:
     """Return the spectra of a stretch without its means."""
-    return np.asarray(load_transforms()[2]((cut - np.mean(cut, axis=0)) * window[:, None], axis=0))
+    rows = np.ascontiguousarray(cut.T)
+    return np.asarray(load_transforms()[2]((rows - np.mean(rows, axis=1, keepdims=True)) * window))
 
 
-def _project(u: Complex[np.ndarray, "f k m"], y: Complex[np.ndarray, "f k s"]) -> Float[np.ndarray, "f s"]:
-    """Return the power of the projections of y on the columns of u, line by line."""
-    basis, triangle = np.linalg.qr(u)
-    size = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
-    seen = size > 1e-9 * np.max(size, axis=(0, 1))  # an input that is silent at a line accounts for nothing there
-    inside = np.einsum("fkm,fks->fms", np.conj(basis), y)
-    return np.sum(np.abs(inside) ** 2 * seen[:, :, None], axis=1)
+def _project(of_inputs: Complex[np.ndarray, "f m m"], across: Complex[np.ndarray, "f m s"]) -> Float[np.ndarray, "f s"]:
+    """Return the power of the projections of the outputs on the inputs, line by line, from U^H U and U^H Y.
+
+    An input that is silent at a line, or says there what others say, accounts for nothing more.
+    """
+    size = np.sqrt(np.einsum("fmm->fm", np.real(of_inputs)))
+    size = np.where(size > SILENT * np.max(size, axis=0), size, np.inf)
+    values, vectors = np.linalg.eigh(of_inputs / (size[:, :, None] * size[:, None, :]))
+    inside = np.conj(np.swapaxes(vectors, 1, 2)) @ (across / size[:, :, None])
+    values = np.where(values > ALIKE, values, np.inf)
+    return np.sum(np.abs(inside) ** 2 / values[:, :, None], axis=1)

@@ -235,7 +235,7 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
             remedy = "widen the bound, or fix it there and say why"
         yield FitFinding(
             severity="error" if bad else "note", kind="bound", where=name,
-            text=f"{name} = {z[i]:.4g} lies on its bound{',' if away else ';'} {remedy}",
+            text=f"{z[i]:.4g} lies on its bound{',' if away else ';'} {remedy}",
         )  # fmt: skip
 
 
