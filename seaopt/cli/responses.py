@@ -16,6 +16,7 @@ from seaopt.formatting import MISSING, format_number, format_table
 from seaopt.frequency import DriveEstimate, Pair, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
+from seaopt.progress import Progress, count_off
 from seaopt.records import record
 from seaopt.reporting import experiment_survey, write_frequency_figure
 
@@ -97,7 +98,7 @@ class Responses:
 
 
 def estimate_responses(
-    experiments: tuple[Experiment, ...], problem: Problem, fit: Fit | None, stretch_s: float | None
+    experiments: tuple[Experiment, ...], problem: Problem, fit: Fit | None, stretch_s: float | None, progress: Progress
 ) -> Responses:
     """Estimate the frequency responses of every experiment.
 
@@ -109,13 +110,14 @@ def estimate_responses(
     """
     surveys: dict[str, Survey] = {}
     fitted: dict[str, tuple[Survey, Fit]] = {}
-    for experiment in experiments:
+    for experiment in count_off(experiments, "experiment", progress):
         try:
             surveys[experiment.name] = experiment_survey(experiment, stretch_s=stretch_s)
             if fit is not None and experiment.name in fit.nuisance:
                 fitted[experiment.name] = (_adopt_fit(surveys[experiment.name], fit.nuisance[experiment.name]), fit)
         except LogError as error:
             raise LogError(f"{problem.source}: experiment {experiment.name}: {error}") from error
+    progress(", ".join(surveys), 1.0)
     return Responses(surveys=surveys, guess=problem.parameters, fitted=fitted)
 
 

@@ -12,10 +12,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread, Timer
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
 
 from seaopt import __version__
 from seaopt.cli.frontier import print_frontier
@@ -43,6 +44,7 @@ from seaopt.problem.stages import (
     score_problem,
     tune_problem,
 )
+from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
@@ -66,17 +68,9 @@ LABELS = {
     "report": "writing the report",
 }
 SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
+READING, SIMULATING = 0.1, 0.3  # of the time of a fit, and of a report of earlier results
 LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
 MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
-
-
-@runtime_checkable
-class Tell(Protocol):
-    """What a stage reports while it runs: what it does, and which share of it is done, where it knows."""
-
-    def __call__(self, note: str, share: float | None = None, /) -> None:
-        """Report."""
-        ...
 
 
 Amount = Literal["quiet", "usual", "verbose"]
@@ -91,16 +85,16 @@ SIMULATED = (
 )
 
 
-def format_left(spent_s: float, share: float | None) -> str:
-    """Return how long a stage still takes, of the share that is done; "" where that cannot be told.
+def format_left(spent_s: float, share: float) -> str:
+    """Return how long a stage still takes, of the share that is done; "" where that cannot be told yet.
 
     Examples
     --------
-    >>> format_left(10.0, 0.25), format_left(300.0, 0.5), format_left(1.0, None)
+    >>> format_left(10.0, 0.25), format_left(300.0, 0.5), format_left(1.0, 0.0)
     ('30 s left', '5 min left', '')
 
     """
-    if share is None or share < LEAST_SHARE:
+    if share < LEAST_SHARE:
         return ""
     left = spent_s * (1.0 - share) / share
     return f"{left:.0f} s left" if left < 100.0 else f"{left / 60.0:.0f} min left"
@@ -165,7 +159,7 @@ class Session:
 
     def run(self, stage: str) -> None:
         """Run one stage and write its result."""
-        stages: dict[str, Callable[[Tell], None]] = {
+        stages: dict[str, Callable[[Progress], None]] = {
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
@@ -176,8 +170,8 @@ class Session:
             raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
 
     @contextmanager
-    def _progress(self, label: str) -> Generator[Tell]:
-        """Show a stage's progress on a terminal, with the time left where its share is known; elsewhere write lines.
+    def _progress(self, label: str) -> Generator[Progress]:
+        """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks stay.
 
         A stage that ends in an error is not done.
         """
@@ -190,16 +184,17 @@ class Session:
             TextColumn("{task.fields[left]}"), TextColumn("{task.fields[note]}", style="dim"),
         )  # fmt: skip
         started = time.monotonic()
-        with Progress(*columns, console=self._console, transient=True) as progress:
-            task = progress.add_task(label, total=None, note="", left="", visible=False)
+        with Bar(*columns, console=self._console, transient=True) as bar:
+            task = bar.add_task(label, total=1.0, note="", left="", visible=False)
 
-            def show(note: str, share: float | None = None) -> None:
-                spent = time.monotonic() - started
-                total = None if share is None else 1.0
-                left = format_left(spent, share)
-                progress.update(task, total=total, completed=share, note=shorten_note(printable(note)), left=left)
+            def show(note: str, share: float | None = None, /) -> None:
+                if share is None:
+                    self._note(note)
+                    return
+                left = format_left(time.monotonic() - started, share)
+                bar.update(task, completed=share, note=shorten_note(printable(note)), left=left)
 
-            timer = Timer(SHOWN_AFTER_S, lambda: progress.update(task, visible=True))
+            timer = Timer(SHOWN_AFTER_S, lambda: bar.update(task, visible=True))
             timer.daemon = True
             timer.start()
             try:
@@ -208,13 +203,16 @@ class Session:
                 timer.cancel()
 
     @contextmanager
-    def _write_progress(self, label: str) -> Generator[Tell]:
+    def _write_progress(self, label: str) -> Generator[Progress]:
         """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
-        note, done, ended, started = "", None, Event(), time.monotonic()
+        note, done, ended, started = "", 0.0, Event(), time.monotonic()
 
-        def tell(text: str, share: float | None = None) -> None:
+        def tell(text: str, share: float | None = None, /) -> None:
             nonlocal note, done
-            note, done = text, share
+            if share is None:
+                self._note(text)
+            else:
+                note, done = text, share
 
         def write_lines() -> None:
             with suppress(OSError):  # a stderr that cannot be written is the stage's to find
@@ -342,17 +340,18 @@ class Session:
             self._note(f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one")
         return content
 
-    def _simulate(self, tell: Tell) -> None:
+    def _simulate(self, tell: Progress) -> None:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to simulate; add one")
         runs: dict[str, Log] = {}
-        for experiment, table in zip(self.experiments(), self.problem.table.experiment, strict=True):
-            name = experiment.name
-            tell(name)
+        tables = {table.name: table for table in self.problem.table.experiment}
+        for experiment in count_off(self.experiments(), "experiment", tell):
+            name, table = experiment.name, tables[experiment.name]
             runs[name] = self._simulate_stretches(experiment)
             self.written.append(write_log(runs[name], self.folder / f"simulation_{name}.csv"))
             if table.virtual is not None:
                 self.written.append(write_log(experiment.log, self.folder / f"virtual_{name}.csv"))
+        tell(", ".join(runs), 1.0)
         self.results["simulate"] = runs
 
     def _simulate_stretches(self, experiment: Experiment) -> Log:
@@ -373,15 +372,10 @@ class Session:
         }
         return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
 
-    def _fit(self, tell: Tell) -> None:
-        tell("reading logs")
-        result = fit_problem(
-            self.problem,
-            self.experiments(),
-            callback=lambda iteration, cost: tell(f"iteration {iteration}, cost {cost:.6g}"),
-            progress=lambda kind, text: self._note(text) if kind == "advice" else tell(text),
-        )
-        tell(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}")
+    def _fit(self, tell: Progress) -> None:
+        reading, fitting = divide(tell, READING, 1.0 - READING)
+        reading("reading logs", 0.0)
+        result = fit_problem(self.problem, self.experiments(), progress=fitting)
         self.results["fit"] = result
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {one.name: one.to_dict() for one in scores}})
@@ -405,13 +399,12 @@ class Session:
             self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         Terminal(soft_wrap=True).print(repr(score), highlight=False, markup=False)
 
-    def _frf(self, tell: Tell) -> None:
+    def _frf(self, tell: Progress) -> None:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; add one")
         experiments = self.experiments()
         fitted = self._read_fit_if_any()
-        responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s)
-        tell(", ".join(responses.surveys))
+        responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s, tell)
         self.results["frf"] = responses
         self._write("frf", {"schema": SCHEMAS["frf"], **responses.to_dict()})
         self.written += responses.draw(self.folder / "frf")
@@ -426,50 +419,37 @@ class Session:
             self.say(f"left out: {error}")
             return None
 
-    def _tune(self, tell: Tell) -> None:
+    def _tune(self, tell: Progress) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        spec = self._spec()
-        asked = f"{spec.structure}, {spec.bandwidth_hz:g} Hz"
-        tell(asked)
-        result = tune_problem(self.problem, self.parameters(), lambda done: tell(f"{asked}, round {done.number}"))
+        self._spec()
+        result = tune_problem(self.problem, self.parameters(), tell)
         if isinstance(result, JointTuning):
             self.results["joint"], result = result, result.controller
         self.results["tune"] = result
         self._write("tune", result.to_dict())
 
-    def _sweep(self, tell: Tell) -> None:
+    def _sweep(self, tell: Progress) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
-        spec = self._spec()
-        tell(f"{spec.structure}, {len(self.bandwidths_hz)} bandwidths")
-        result = sweep(
-            design, values, spec, self.bandwidths_hz, robust_to,
-            draws=self.problem.draws(self.parameters()),
-        )  # fmt: skip
+        draws = self.problem.draws(self.parameters())
+        result = sweep(design, values, self._spec(), self.bandwidths_hz, robust_to, draws=draws, progress=tell)
         self.results["sweep"] = result
         self._write("sweep", result.to_dict())
         self.written += write_frontier_figure(result, self.folder / "frontier")
 
-    def _certify(self, tell: Tell) -> None:
+    def _certify(self, tell: Progress) -> None:
         plants = self.problem.certified_plants()
         controller, source = self.controller(), self.parameters()
-        table = self.problem.robustness
-        tell(f"{table.samples} draws")
         self._design_values(*plants.values())
-
-        def count(done: int, of: int) -> None:
-            # How long the simulations take that follow is not known before they are done.
-            tell(f"{table.samples} draws, {100 * done // of} %" if done < of else "simulating scenarios")
-
-        result = certify_problem(self.problem, controller, source, count)
-        tell(f"{table.samples} draws, {result.monte_carlo.failures} failures")
+        result = certify_problem(self.problem, controller, source, tell)
         for remark in self.problem.remarks(self.values()):
             self._note(remark)
         self.results["certify"] = result
         self._write("certify", result.to_dict())
 
-    def _report(self, tell: Tell) -> None:
+    def _report(self, tell: Progress) -> None:
+        simulating, drawing = divide(tell, SIMULATING, 1.0 - SIMULATING)
         results: list[Any] = []
         if self.problem.table.experiment:
             fitted = self.parameters()
@@ -482,20 +462,15 @@ class Session:
             results.append(self.controller())
             if "certify" not in self.results and (self.folder / FILES["certify"]).exists():
                 plants = self.problem.certified_plants()
-                tell("simulating again")
+                simulating("simulating again", 0.0)
                 self.results["certify"] = Certificate.from_dict(
                     self._read("certify"), self.controller(), plants, self.values()
                 )
             results += [self.results["certify"]] if "certify" in self.results else []
-
-        def drawing(name: str, place: int, count: int) -> None:
-            tell(f"figure {place} of {count}, {name}", (place - 1) / count)
-
         page = write_report(
             results, self.folder / "report.html", title=self.problem.title, progress=drawing,
             files=[self.problem.source], command=shlex.join(["seaopt", *sys.argv[1:]]),
         )  # fmt: skip
-        tell("done")
         self.results["report"] = page
         self.written.append(page)
 

@@ -14,15 +14,15 @@ from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.parameters import ParameterSet
 from seaopt.problem.problem import Problem
-from seaopt.robustness import Budget, Certificate, JointTuning, Round, certify, tune_certified
+from seaopt.progress import Progress, ignore
+from seaopt.robustness import Budget, Certificate, JointTuning, certify, tune_certified
 
 
 def fit_problem(
     problem: Problem,
     experiments: Sequence[Experiment] | None = None,
     *,
-    callback: Callable[[int, float], None] | None = None,
-    progress: Callable[[str, str], None] | None = None,
+    progress: Progress = ignore,
 ) -> Fit:
     """Fit the problem's logs, as `seaopt fit` does.
 
@@ -32,7 +32,7 @@ def fit_problem(
         What `read_problem` returned.
     experiments : sequence of Experiment, optional
         All of the problem's, where they are read already; read here if left out.
-    callback, progress : callable, optional
+    progress : callable, optional
         As in `seaopt.fit`.
 
     Raises
@@ -47,7 +47,7 @@ def fit_problem(
     if not fitted:
         raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them')
     return fit(
-        fitted, problem.parameters, callback=callback, progress=progress, alternatives=tuple(problem.plants.values()),
+        fitted, problem.parameters, progress=progress, alternatives=tuple(problem.plants.values()),
         **problem.fit_options,
     )  # fmt: skip
 
@@ -66,9 +66,7 @@ def can_design(problem: Problem, result: Fit) -> bool:
     return all(np.isfinite(covariance.std(name)) or name in problem.ranges for name in covariance.names)
 
 
-def tune_problem(
-    problem: Problem, source: Fit | ParameterSet, progress: Callable[[Round], None] | None = None
-) -> Controller | JointTuning:
+def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progress = ignore) -> Controller | JointTuning:
     """Tune the problem's controller, as `seaopt tune` does; with `retune`, until it is certified.
 
     Parameters
@@ -78,14 +76,14 @@ def tune_problem(
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
     progress : callable, optional
-        Called after each round, with `retune`.
+        As in `seaopt.tune`.
 
     """
     design, robust_to = problem.design_plant, problem.robust_to(problem.values(source))
     assert problem.spec is not None
     spec, draws, table = settle_delay(problem.spec, design, source), problem.draws(source), problem.robustness
     if not table.retune:
-        return tune(design, problem.values(source), spec, robust_to, draws=draws)
+        return tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
     return tune_certified(
         design, source, spec, problem.certified_plants(), ranges=problem.ranges, robust_to=robust_to, draws=draws,
         others=problem.parameters, samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
@@ -127,7 +125,7 @@ def certify_problem(
     problem: Problem,
     controller: Controller,
     source: Fit | ParameterSet,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = ignore,
 ) -> Certificate:
     """Certify a controller on the problem's plants, simulations included, as `seaopt certify` does.
 

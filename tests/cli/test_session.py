@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import time
+from io import StringIO
 from threading import enumerate as enumerate_threads
 
 import numpy as np
@@ -15,6 +17,7 @@ from seaopt.cli.export import export_controller
 from seaopt.cli.main import run
 from seaopt.cli.provenance import digest_sources
 from seaopt.cli.session import Session
+from seaopt.cli.terminal import Terminal
 from seaopt.logs import write_log
 
 BENCH = """
@@ -50,7 +53,7 @@ def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsy
     path = write(BENCH + "[robustness]\nparameters = { f_c = [0.0, 0.01] }\n")
     run(path, tmp_path / "out")
     told = " ".join(capsys.readouterr().err.split())
-    assert "writing the report: done" in told
+    assert "writing the report: 5 figures" in told
     assert f"left out: tuning and certifying: {path} has [robustness] but no [controller]; add one" in told
     for stage in ("tune", "certify"):
         with pytest.raises(so.SeaoptError, match=r"has no \[controller\]; add one to tune or certify"):
@@ -289,7 +292,7 @@ def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch
     monkeypatch.setattr("seaopt.cli.session.REPORT_S", 0.2)
 
     def take_long(session, tell):
-        tell("iteration 3, cost 12.5")
+        tell("iteration 3, cost 12.5", 0.5)
         time.sleep(0.7)
 
     monkeypatch.setattr(Session, "_fit", take_long)
@@ -298,7 +301,7 @@ def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch
     *lines, last = capsys.readouterr().err.splitlines()
     assert 1 <= len(lines) <= 3 and last == "fitting the logs: iteration 3, cost 12.5"
     assert all(line.startswith("fitting the logs, ") and "iteration 3, cost 12.5" in line for line in lines)
-    monkeypatch.setattr(Session, "_fit", lambda session, tell: tell("reading logs"))
+    monkeypatch.setattr(Session, "_fit", lambda session, tell: tell("reading logs", 0.0))
     session.run("fit")
     assert capsys.readouterr().err == "fitting the logs: reading logs\n"
 
@@ -309,6 +312,23 @@ def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch
     with pytest.raises(so.SeaoptError):
         session.run("fit")
     assert not capsys.readouterr().err and "write_lines" not in " ".join(thread.name for thread in enumerate_threads())
+
+
+def test_a_terminal_is_told_the_time_that_is_left(write, tmp_path, monkeypatch):
+    """Of real stages, which take longer than a short while; a remark stays below the bar."""
+    monkeypatch.setattr("seaopt.cli.session.SHOWN_AFTER_S", 0.0)
+    text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
+    session = Session(write(text), tmp_path / "out")
+    for stage, word in (("tune", "start"), ("certify", "scenario")):
+        shown = StringIO()
+        session._console = Terminal(file=shown, force_terminal=True, width=100)
+        session.run(stage)
+        frames = [frame for frame in re.split(r"[\r\n]", shown.getvalue()) if word in frame]
+        assert frames and any(re.search(r"\d+ (s|min) left", frame) for frame in frames), shown.getvalue()
+    with session._progress("certifying") as tell:
+        tell("worth keeping")
+        tell("running", 0.5)
+    assert "note: worth keeping" in shown.getvalue()
 
 
 def test_a_law_of_ones_own_is_certified_as_the_tuned_one(write, tmp_path):

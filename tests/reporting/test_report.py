@@ -17,10 +17,10 @@ from seaopt.reporting.page.chart import make_chart
 
 def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
     controller = so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=30))
-    told: list[tuple[str, int, int]] = []
+    told: list[tuple[str, float]] = []
     title = "<script>alert(1)</script>"
     page = so.write_report([controller], tmp_path / "r.html", title=title, progress=lambda *each: told.append(each))
-    assert told == [("loop", 1, 1)]
+    assert told == [("figure 1 of 1", 0.0), ("1 figure", 1.0)]
     text = page.read_text(encoding="utf-8")
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(1)" in text

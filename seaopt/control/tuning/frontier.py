@@ -21,6 +21,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import require_plant
+from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import PlotAccessor, record
 from seaopt.units import LINEAR, Mechanics
 
@@ -135,6 +136,7 @@ def sweep(
     robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
     *,
     draws: Sequence[Mapping[str, float]] = (),
+    progress: Progress = ignore,
 ) -> Frontier:
     """Tune at each of several bandwidths, also starting from the one before; an infeasible row is a result.
 
@@ -144,6 +146,8 @@ def sweep(
         As `tune`; the specification's own bandwidth is not used.
     bandwidths_hz : sequence of float
         In the specification's range.
+    progress : callable, optional
+        Called with the bandwidth that is tuned and the share of all that is done (`seaopt.progress.Progress`).
 
     Raises
     ------
@@ -176,14 +180,16 @@ def sweep(
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
     warm: tuple[LawNumbers, ...] = ()
-    for one in specs:
+    for one, part in zip(specs, divide(progress, *(1.0 for _ in specs)), strict=True):
+        whole, sliding_alone = divide(prefix(part, f"{one.bandwidth_hz:g} Hz"), 1.0, float(sticks))
         present = replace(task, spec=one)
-        x, loops = solve(present, warm)
+        x, loops = solve(present, warm, whole)
         controller = make_controller(present, x, loops, (plant, params))
-        alone = _tune_sliding(replace(sliding, spec=one), x) if sticks else None
+        alone = _tune_sliding(replace(sliding, spec=one), x, sliding_alone) if sticks else None
         rows.append(replace(_row(present, x, loops, controller), without_sticking=alone))
         controllers.append(controller)
         warm = (x,)
+    progress(f"{spec.structure}, {len(rows)} bandwidths", 1.0)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
 
 
@@ -197,8 +203,8 @@ def _make_sliding_task(
     return make_task(take_sliding(plant, plant.complete(params)), params, spec, sliding, draws)
 
 
-def _tune_sliding(task: Task, start: LawNumbers) -> SlidingAlone:
-    x, loops = solve(task, (start,))
+def _tune_sliding(task: Task, start: LawNumbers, progress: Progress) -> SlidingAlone:
+    x, loops = solve(task, (start,), progress)
     return SlidingAlone(
         feasible=not list_broken(judge_all(task.spec, loops)), noise_gain=loops[0].figures.noise_gain,
         disturbance=_worst_disturbance(task, x),

@@ -7,6 +7,7 @@ what is possible next to it are found by bisection, and the largest of all from 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -18,9 +19,11 @@ from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, LawNumbers, Task, place_frequencies
 from seaopt.control.tuning.solution import recheck
 from seaopt.control.tuning.starts import find_starts
+from seaopt.progress import Progress, ignore
 
 PROBE_RATIO = 7.0 / 6.0  # of a probe to the next
 RESOLUTION = 0.01  # to which the end of what is possible is found
+BISECTIONS = math.ceil(math.log2(math.log(PROBE_RATIO) / RESOLUTION))  # that find such an end
 STARTS_TRIED = 2
 PROMISING_USAGE = 1.5  # after the quadratic programs; what misses by more is not refined
 REFINEMENTS = 3  # solutions of the interior-point method
@@ -29,7 +32,9 @@ FAR = 1e3  # how much further away a law counts that does not keep the limits
 HOPELESS_USAGE = 1.03  # near a bandwidth that is possible, what misses by more is not looked for elsewhere
 
 
-def find_possible_bandwidths(task: Task, x: LawNumbers) -> tuple[PossibleBandwidths, list[LawNumbers]]:
+def find_possible_bandwidths(
+    task: Task, x: LawNumbers, progress: Progress = ignore
+) -> tuple[PossibleBandwidths, list[LawNumbers]]:
     """Return the bandwidths in range that keep the limits, and the numbers of the laws at those next to the one asked.
 
     Parameters
@@ -38,9 +43,11 @@ def find_possible_bandwidths(task: Task, x: LawNumbers) -> tuple[PossibleBandwid
         Of a bandwidth that does not keep them.
     x : array, shape (10,)
         The numbers that miss them least there.
+    progress : callable, optional
+        Called before each bandwidth that is tried.
 
     """
-    return _Probes(task, x).find()
+    return _Probes(task, x, progress).find()
 
 
 def list_steps(asked: float, end: float) -> list[float]:
@@ -69,7 +76,8 @@ class _Probes:
     The usage is 0 where all limits are kept, and infinite where no law was stable.
     """
 
-    def __init__(self, task: Task, x: LawNumbers) -> None:
+    def __init__(self, task: Task, x: LawNumbers, progress: Progress) -> None:
+        self.progress, self.expected = progress, 1
         self.task, self.asked = task.aim_multipliers(x), task.spec.bandwidth_hz
         self.tried: dict[float, tuple[float, LawNumbers]] = {self.asked: (np.inf, x)}
 
@@ -79,6 +87,7 @@ class _Probes:
         lowest = max(spec.bandwidth_range_hz[0], 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
         highest = min(spec.bandwidth_range_hz[1], HIGHEST_BANDWIDTH * spec.sample_rate_hz)
         down, up = (list_steps(self.asked, end) for end in (lowest, highest))
+        self.expected = len(down) + len(up) + BISECTIONS
         below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
         largest = below if above is None else find_end(self._keeps, [*reversed(up), above], None)
         nearest = tuple(f for f in (below, above) if f is not None)
@@ -91,6 +100,8 @@ class _Probes:
     def _keeps(self, bandwidth_hz: float) -> bool:
         """Tell whether a law was found that keeps the limits, as measured."""
         if bandwidth_hz not in self.tried:
+            done = len(self.tried) - 1
+            self.progress(f"trying {bandwidth_hz:.3g} Hz instead", done / max(self.expected, done + 1))
             usage, x = self._tune(bandwidth_hz)
             self.tried[bandwidth_hz] = (usage, x) if usage else self._measure(bandwidth_hz, x)
         return self.tried[bandwidth_hz][0] == 0.0

@@ -11,6 +11,7 @@ A friction margin is asked for afterwards, of the law that is best without, and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -24,16 +25,19 @@ from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.optimisation_problem import FRICTION, Grid, LawNumbers, Task, place_frequencies
 from seaopt.control.tuning.starts import find_starts
+from seaopt.progress import Progress, count_off, divide, ignore
 
 STARTS_TRIED = 3  # two more where an observer or a notch makes more valleys
 STARTS_REFINED = 2  # one more with an observer, all with a notch
 RECHECKS = 3
 MARGIN_RESOLUTION = 1.03  # ratio to which the largest friction margin is found
 LEAST_MARGIN = 1e-3  # of the one asked: less is not looked for
+SCAN, IMPROVEMENT, REFINEMENT, RECHECK = 1.0, 1.0, 3.0, 0.5  # of the time of a solution
+ONCE, RAISING = 1.0, 4.0  # of that of one with a friction margin: each of four solutions, and a bisection
 Solution = tuple[LawNumbers, list[MeasuredLoop]]  # with the loop of every plant
 
 
-def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> Solution:
+def solve(task: Task, warm: Sequence[LawNumbers] = (), progress: Progress = ignore) -> Solution:
     """Find the best numbers, and return them with every plant's loop.
 
     Parameters
@@ -42,33 +46,39 @@ def solve(task: Task, warm: Sequence[LawNumbers] = ()) -> Solution:
         What is to be tuned.
     warm : sequence of arrays, shape (10,)
         Numbers to start from besides those of the scan, which then tries one less.
+    progress : callable, optional
+        Called as starts are refined.
 
     """
-    x, loops = _solve_once(task, warm)
-    return _meet_friction_margin(task, x, loops) if task.asks_margin else (x, loops)
+    once, raising = divide(progress, ONCE, (3.0 * ONCE + RAISING) * task.asks_margin)
+    x, loops = _solve_once(task, warm, once)
+    return _meet_friction_margin(task, x, loops, raising) if task.asks_margin else (x, loops)
 
 
-def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
+def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], progress: Progress) -> Solution:
     """Return the best law with the friction margin asked for, from the best without.
 
     The multiplier that shows most of a law is made a limit, and the best law with that looked for, as another may then
     show more. Where none has the margin, it is the law with the largest that keeps all other limits.
     """
     best = (x, loops)
+    *parts, raising = divide(progress, ONCE, ONCE, ONCE, RAISING)
     for multiplier in ("", "", SIMPLEST):
         broken = list_broken_limits(task.spec, best[1], task.design_states)
         if not broken:
             return best
-        tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],))
+        tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],), parts.pop(0))
         missed = list_broken_limits(task.spec, tried[1], task.design_states)
         if not missed or broken - {FRICTION}:  # what cannot be kept without a margin cannot be kept with it
             return tried
         if missed == {FRICTION} and _least_slope(tried[1]) > _least_slope(best[1]):
             best = tried
-    return _raise_friction_margin(task, *best, tried[0])
+    return _raise_friction_margin(task, *best, tried[0], raising)
 
 
-def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], other: LawNumbers) -> Solution:
+def _raise_friction_margin(
+    task: Task, x: LawNumbers, loops: list[MeasuredLoop], other: LawNumbers, progress: Progress
+) -> Solution:
     """Return the law with the largest friction margin below the one asked, by bisection, all other limits kept.
 
     At every slope two laws are tried: from the best so far, with the multiplier that shows most of it; and from the
@@ -77,7 +87,10 @@ def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop],
     high = task.spec.level(FRICTION)
     assert high is not None
     low, f = max(_least_slope(loops), LEAST_MARGIN * high), place_frequencies(task)
+    least, asked = low, high
     while high / low > MARGIN_RESOLUTION:
+        left = _count_halvings(low, high) / _count_halvings(least, asked)
+        progress(f"friction margin {low:.3g} of {asked:.3g}", 1.0 - left)
         middle = float(np.sqrt(low * high))
         easier = replace(task, spec=replace(task.spec, min_friction_margin=middle))
         for start, multiplier in ((x, ""), (other, SIMPLEST)):
@@ -93,14 +106,22 @@ def _raise_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop],
     return x, loops
 
 
+def _count_halvings(low: float, high: float) -> float:
+    """Return how many bisections take a range to the resolution."""
+    return math.log2(math.log(high / low) / math.log(MARGIN_RESOLUTION))
+
+
 def _least_slope(loops: Sequence[MeasuredLoop]) -> float:
     return min(loop.friction_slope for loop in loops)
 
 
-def _solve_once(task: Task, warm: Sequence[LawNumbers]) -> Solution:
+def _solve_once(task: Task, warm: Sequence[LawNumbers], progress: Progress) -> Solution:
     """Find the best numbers with the multipliers that are aimed at, if any."""
+    finding, checking = divide(progress, SCAN + IMPROVEMENT + REFINEMENT, RECHECK)
     grid = task.grid(place_frequencies(task))
-    x = recheck(task, grid, find_best(task, grid, warm))
+    x = find_best(task, grid, warm, finding)
+    checking("checking between the frequencies", 0.0)
+    x = recheck(task, grid, x)
     return x, task.measure(x)
 
 
@@ -115,18 +136,21 @@ def recheck(task: Task, grid: Grid, x: LawNumbers) -> LawNumbers:
     return x
 
 
-def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = ()) -> LawNumbers:
+def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress: Progress = ignore) -> LawNumbers:
     """Find the best numbers on a grid."""
+    scanning, improving, refining = divide(progress, SCAN, IMPROVEMENT, REFINEMENT)
+    scanning("scanning gains", 0.0)
     more = task.nominal is not None or task.spec.notch is not None
     warm = [task.tidy(x) for x in warm]
     first = [x for x in warm if task.is_stable(x)] + find_starts(task, grid, STARTS_TRIED + 2 * more - bool(warm))
-    ranked = sorted((improve(task, grid, x) for x in first), key=lambda pair: pair[0])
+    ranked = sorted((improve(task, grid, x) for x in count_off(first, "start", improving)), key=lambda pair: pair[0])
     count = len(ranked) if task.spec.notch is not None else STARTS_REFINED + more
     chosen: list[LawNumbers] = []
     for _, x in ranked:
         if len(chosen) < count and not any(np.allclose(x, other, rtol=0.1, atol=1e-6) for other in chosen):
             chosen.append(x)
-    return min((refine(task, grid, x) for x in chosen), key=lambda x: task.rank(grid, x))
+    refined = (refine(task, grid, x) for x in count_off(chosen, "refining start", refining))
+    return min(refined, key=lambda x: task.rank(grid, x))
 
 
 def _find_missed(task: Task, x: LawNumbers, grid: Grid) -> np.ndarray:

@@ -65,6 +65,9 @@ from seaopt.plants.friction import (
 )
 from seaopt.plants.motor.thermal import rate_motor
 from seaopt.plants.plant import require_plant
+from seaopt.progress import Progress, divide, ignore
+
+SOLUTION, BANDWIDTHS = 1.0, 2.0  # of the time of a tune that is not possible as asked
 
 
 def tune(
@@ -74,6 +77,7 @@ def tune(
     robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
     *,
     draws: Sequence[Mapping[str, float]] = (),
+    progress: Progress = ignore,
 ) -> Controller:
     """Tune a digital force controller.
 
@@ -89,6 +93,8 @@ def tune(
         Plants that must be stable and meet Ms, Mt and disk margin too, driven by the same current.
     draws : sequence of mappings of parameter to value, optional
         Values at which the design plant and every plant of robust_to must meet them too; see `corners` and `draw`.
+    progress : callable, optional
+        Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
     Returns
     -------
@@ -126,22 +132,27 @@ def tune(
     check_delay(spec, task.plants[0])
     command = command_of(plant, values, spec.measured)
     check_current(spec, task.k_ff, command, find_dry_friction(plant, values))
-    x, loops = solve(task)
+    solving, seeking, again = divide(progress, SOLUTION * (8.0 if task.asks_margin else 1.0), BANDWIDTHS, SOLUTION)
+    x, loops = solve(task, progress=solving)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
     if broken - {FRICTION}:  # of a margin alone it is known what can be had
-        possible, near = _find_possible(task, x, stable="stability" not in broken)
+        possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
         # From there another answer may be in reach: a better compromise, or none needed.
         if near:
-            x, loops = solve(task, (x, *near))
-    return make_controller(task, x, loops, (plant, params), possible)
+            x, loops = solve(task, (x, *near), again)
+    controller = make_controller(task, x, loops, (plant, params), possible)
+    progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
+    return controller
 
 
-def _find_possible(task: Task, x: LawNumbers, *, stable: bool) -> tuple[PossibleBandwidths, list[LawNumbers]]:
+def _find_possible(
+    task: Task, x: LawNumbers, progress: Progress, *, stable: bool
+) -> tuple[PossibleBandwidths, list[LawNumbers]]:
     """Return what is possible instead, and laws near it: at other bandwidths, or with friction that falls less.
 
     The fall is what to ask about where no law is `stable` at this bandwidth, or none keeps the limits at any.
     """
-    possible, near = find_possible_bandwidths(task, x)
+    possible, near = find_possible_bandwidths(task, x, progress)
     if (stable and possible.nearest_hz) or not any(map(count_growing, task.plants)):
         return possible, near
     eased = find_largest_fall(task)

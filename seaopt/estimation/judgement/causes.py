@@ -30,6 +30,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import list_smoothing
 from seaopt.plants.parts import wrapped
 from seaopt.plants.plant import name_symbols
+from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
 from seaopt.units import ROTARY, mechanics_of, unit_after
 
@@ -51,7 +52,6 @@ CLIPPED_SAMPLES = 20  # that have to be beyond a level
 CLIPPED_POWER = 0.2  # of a residual's
 
 V = TypeVar("V")
-Progress = Callable[[str, str], None]  # what it is about, "advice" or "causes", and a text
 
 
 @record(eq=False)
@@ -111,7 +111,7 @@ class _Candidate:
 
 def find_causes(
     fit: Fit, residuals: ResidualsByExperiment, suspects: Mapping[str, ScoreTest], alternatives: Sequence[Plant], *,
-    poor: bool, progress: Progress | None = None,
+    poor: bool, progress: Progress = ignore,
 ) -> list[Cause]:  # fmt: skip
     """Return what explains the logs better than the fit, the best first.
 
@@ -128,17 +128,15 @@ def find_causes(
     poor : bool
         Whether the fit explains so little that its estimates are no start: what searches does so from its own.
     progress : callable, optional
-        Called with ("causes", text) before each that is tried.
+        Called before each that is tried.
 
     """
     minimum = fit.require_minimum("find_causes")
     whole = _measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
     colour = _measure_colour(fit)
     causes: list[Cause] = []
-    candidates = _list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor)
-    for number, candidate in enumerate(candidates, 1):
-        if progress is not None:
-            progress("causes", f"fitted; looking for causes of what it does not explain: trying number {number}")
+    candidates = list(_list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor))
+    for candidate in count_off(candidates, "trying cause", progress):
         try:
             solved = _refit(minimum, candidate)
         except SeaoptError:  # what does not make a problem explains nothing

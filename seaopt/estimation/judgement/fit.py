@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import EstimationError, require_type
-from seaopt.estimation.judgement.causes import Progress
 from seaopt.estimation.judgement.judge import judge
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS
@@ -26,9 +25,12 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, list_smoothing
 from seaopt.plants.plant import require_plant
+from seaopt.progress import Progress, divide, ignore
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
 
+SEARCH, JUDGEMENT = 0.6, 0.4  # of the time of a fit
+USUAL_ITERATIONS = 10  # of a whole fit
 SLOW_STEPS, SLOW = 2.0, 1e5  # steps in a sample, and in a pass, from which smoothed friction is said to be slow
 
 
@@ -42,8 +44,7 @@ def fit(
     holdout: float = 0.0,
     diagnostics: bool = True,
     alternatives: Sequence[Plant] = (),
-    callback: Callback | None = None,
-    progress: Progress | None = None,
+    progress: Progress = ignore,
 ) -> Fit:
     """Fit the free parameters of `params` to one or several experiments that share them.
 
@@ -67,11 +68,9 @@ def fit(
         outputs' figures are missing, and the fit is not judged.
     alternatives : sequence of Plant
         Other plants that may have been on the bench: where a log is not explained, they are tried.
-    callback : callable, optional
-        Called with (iteration, cost).
     progress : callable, optional
-        Called with ("advice", text) where the search could be quicker, and with ("causes", text) as causes of what is
-        not explained are tried.
+        Called with what is done and the share of it that is done (`seaopt.progress.Progress`): each iteration, each
+        cause that is tried; and without a share where the search could be quicker.
 
     Returns
     -------
@@ -111,12 +110,28 @@ def fit(
     )  # fmt: skip
     _check_samples(problem)
     _check_stiffness(problem)
-    if progress is not None:
-        for advice in _advise_sticking(problem):
-            progress("advice", advice)
+    for advice in _advise_sticking(problem):
+        progress(advice)
+    searching, judging = divide(progress, SEARCH, JUDGEMENT if diagnostics else 0.0)
+    searching("looking for a start", 0.0)
+    callback = _count_iterations(searching)
     solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
     result = summarise(solved, chosen, diagnostics, started)
-    return judge(result, alternatives, progress) if diagnostics else result
+    result = judge(result, alternatives, judging) if diagnostics else result
+    progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)
+    return result
+
+
+def _count_iterations(progress: Progress) -> Callback:
+    """Return what counts the iterations of all searches of a fit; as many as usual are expected to follow."""
+    count = 0
+
+    def tell(_: int, cost: float) -> None:
+        nonlocal count
+        count += 1
+        progress(f"iteration {count}, cost {cost:.6g}", count / (count + USUAL_ITERATIONS))
+
+    return tell
 
 
 def check_choices(method: Any, loss: Any, band_hz: Any) -> None:

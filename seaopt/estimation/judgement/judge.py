@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.estimation.judgement.causes import Cause, Progress, find_causes, free_delay
+from seaopt.estimation.judgement.causes import Cause, find_causes, free_delay
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.problem.fit_experiment import FitExperiment
@@ -28,9 +28,11 @@ from seaopt.estimation.result.findings import SEVERITIES, FitFinding, OutputFit
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
+from seaopt.progress import Progress, divide, ignore
 from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
+TESTS, CAUSES = 1.0, 3.0  # of the time of a judgement that tries causes
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
 WORSE = -1.0  # fit percent below which a constant explains more, beyond rounding and an offset that is fixed
 RUNS_AWAY = -1e3  # fit percent below which a free run is ten times as large as what was measured
@@ -51,7 +53,7 @@ RIVAL_SHARE = 0.9  # of what the best cause gains: no reason to prefer one
 FAR = 3.0  # times beyond a plausible range
 
 
-def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress | None = None) -> Fit:
+def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ignore) -> Fit:
     """Return the fit with what its outputs explain, and what is wrong with it.
 
     Parameters
@@ -65,6 +67,8 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress | Non
 
     """
     minimum = fit.require_minimum("judge")
+    testing, trying = divide(progress, TESTS, CAUSES)
+    testing("fitted; testing the residuals", 0.0)
     residuals = minimum.residuals()
     shares = {
         experiment.name: measure_coherence(experiment, residuals[experiment.name])
@@ -85,7 +89,7 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress | Non
     )
     if wrong:
         poor = any(finding.kind == "explained" for finding in findings) or fit.status == "not_identifiable"
-        causes = find_causes(fit, residuals, suspects, alternatives, poor=poor, progress=progress)
+        causes = find_causes(fit, residuals, suspects, alternatives, poor=poor, progress=trying)
         findings += _name_causes(fit, causes, suspects)
     return _conclude(fit, findings)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +17,7 @@ from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import write_text
 from seaopt.formatting import format_count, format_figure, format_number
 from seaopt.frequency import Survey
+from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
 from seaopt.reporting.comparison import fit_surveys, response_panels, sentence
 from seaopt.reporting.drawing import write_figure
@@ -85,7 +86,7 @@ def write_report(
     path: Path | str,
     *,
     title: str = "Series elastic actuator",
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress = ignore,
     files: Sequence[Path | str] = (),
     command: str = "",
 ) -> Path:
@@ -101,8 +102,7 @@ def write_report(
     title : str
         Heading of the page.
     progress : callable, optional
-        Called before each group of figures is drawn, which takes the most time, with its name, its number from 1 and
-        how many there are.
+        Called before each group of figures is drawn, which takes the most time (`seaopt.progress.Progress`).
     files : sequence of path
         What the results were made of, besides the logs: named with their hashes.
     command : str
@@ -133,16 +133,16 @@ def write_report(
     material, target = _sort_results(results), Path(path)
     plates = list_plates(material)
     drawn: dict[str, list[DrawnPlate]] = {}
-    for place, plate in enumerate(plates, start=1):
-        if progress is not None:
-            progress(plate.name, place, len(plates))
+    for plate in count_off(plates, "figure", progress):
         if plate.part in FILED:
             write_figure(compose_sheet(plate.panels), target.parent / "figures" / plate.name)
         charts = tuple(make_chart(panel) for panel in plate.panels)
         drawn.setdefault(plate.part, []).append(
             DrawnPlate(name=plate.name, heading=plate.heading, charts=charts, text=plate.text)
         )
-    return write_text(target, _render(material, drawn, title, files, command))
+    page = write_text(target, _render(material, drawn, title, files, command))
+    progress(format_count(len(plates), "figure"), 1.0)
+    return page
 
 
 def _sort_results(results: Sequence[Result]) -> Material:

@@ -29,6 +29,7 @@ from seaopt.formatting import (
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, remembers, split_friction
+from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
@@ -240,8 +241,9 @@ class Certificate:
         return split_friction(self.models, self.parameters, [varied.name for varied in self.varied])
 
     def with_simulation(
-        self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1
-    ) -> Certificate:
+        self, *, sensors: Sensors | None = None, current_step_A: float = 0.0, seed: int = 1,
+        progress: Progress = ignore,
+    ) -> Certificate:  # fmt: skip
         """Return the certificate with its controller simulated on the nonlinear plants, at their worst draws too.
 
         `certify` does this unless it is told not to; here it is done again, with other sensors, say. Each scenario
@@ -256,6 +258,8 @@ class Certificate:
             What the current is rounded to; 0 for not at all.
         seed : int
             Of noise and random excitations.
+        progress : callable, optional
+            Called with what is simulated and the share of it that is done (`seaopt.progress.Progress`).
 
         Examples
         --------
@@ -268,20 +272,20 @@ class Certificate:
         (True, 7)
 
         """
-        simulations = self._simulate(sensors, current_step_A, seed)
+        simulations = self._simulate(sensors, current_step_A, seed, progress)
         runs = simulations.verification or simulations.left_out["simulation"]
         others = (row for row in self.requirements if row.name not in (SIMULATION_FAILURES, *NAMED_FAULTS.values()))
         requirements = (*others, *_require_runs(runs))
         passed = all(row.met for row in requirements)
         return replace(self, simulated=simulations, requirements=requirements, passed=passed)
 
-    def with_steps(self) -> Certificate:
+    def with_steps(self, progress: Progress = ignore) -> Certificate:
         """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
 
         Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
         reference; nothing may oscillate. `certify` always does this; `with_simulation` plays all other scenarios too.
         """
-        played = self.play_steps()
+        played = self.play_steps(progress)
         requirements = (*self.requirements, *played._require_cycles(), *_require_runs(played.steps or ""))
         return replace(played, requirements=requirements, passed=all(row.met for row in requirements))
 
@@ -292,9 +296,9 @@ class Certificate:
             return self.simulated.verification
         return self.steps if isinstance(self.steps, Verification) else None
 
-    def play_steps(self) -> Certificate:
+    def play_steps(self, progress: Progress = ignore) -> Certificate:
         """Return the certificate with steps and limit cycles simulated, but nothing required of them."""
-        steps = simulate_steps(self.controller, self.models, self.parameters, self._draws())
+        steps = simulate_steps(self.controller, self.models, self.parameters, self._draws(), progress)
         cycles: dict[str, tuple[FoundCycle, ...]] = {}
         for name, model in self.models.items():
             shown = name not in self.friction or self.friction[name].shown
@@ -324,11 +328,13 @@ class Certificate:
             draws[name] += [case[1] for case in worst if case.parameters]
         return draws
 
-    def _simulate(self, sensors: Sensors | None, current_step_A: float, seed: int) -> Simulated:
+    def _simulate(
+        self, sensors: Sensors | None, current_step_A: float, seed: int, progress: Progress = ignore
+    ) -> Simulated:
         return run_simulations(
             self.controller, self.models, self.parameters, draws=self._draws(), sensors=sensors,
             current_step_A=current_step_A, seed=seed,
-            steps=self.steps if isinstance(self.steps, Verification) else None,
+            steps=self.steps if isinstance(self.steps, Verification) else None, progress=progress,
         )  # fmt: skip
 
     @classmethod

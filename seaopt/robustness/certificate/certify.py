@@ -7,7 +7,7 @@ and with failures the bound is Clopper's and Pearson's. Draws are made and measu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from types import NoneType
@@ -23,11 +23,13 @@ from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.plants.plant import require_plant
+from seaopt.progress import Progress, count_off, divide, ignore, prefix
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.certificate.certificate import (
@@ -58,9 +60,9 @@ DRAWS_PER_BLOCK = 50_000
 DRAWS_KEPT = 5000  # of which Ms is kept, to be drawn
 MOST_DELAY_SAMPLES = 20  # samples
 WORST_KEPT = 64  # worst draws kept of each plant
+# Seconds that a part takes as a rule: of each draw and plant, or of each plant.
+DRAW, SEARCH, BOUND, FRICTION, STEPS, SIMULATIONS = 1.5e-4, 0.3, 0.4, 0.3, 1.0, 3.5
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
-
-DrawProgress = Callable[[int, int], None]
 
 
 @record(eq=False)
@@ -113,7 +115,7 @@ def certify(
     simulations: bool = True,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
-    progress: DrawProgress | None = None,
+    progress: Progress = ignore,
 ) -> Certificate:
     """Check a controller against plants: at the nominal parameters, over draws, and simulated on the nonlinear plants.
 
@@ -157,7 +159,7 @@ def certify(
     sensors, current_step_A
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     progress : callable, optional
-        Called with the number of draws done and their total, now and then.
+        Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
     Returns
     -------
@@ -204,11 +206,21 @@ def certify(
     figures = {name: controller.close(plant, nominal).figures() for name, plant in plants.items()}
     samples = samples if unknown.size else 0  # nothing is uncertain: there is nothing to draw
     rng = np.random.default_rng([seed, CERTIFICATE_STREAM, _digest(controller)])
-    failures, drawn, drawn_ms = _measure_draws(controller, plants, unknown, samples, rng, progress)
-    worst = {name: find_worst(controller, plant, unknown, drawn[name]) for name, plant in plants.items()}
+    drawing, searching, bounding, rubbing, stepping, simulating = divide(
+        progress, DRAW * samples * len(plants), SEARCH * len(plants), BOUND * len(plants) * (bounds is not None),
+        FRICTION * len(plants), STEPS * len(models), SIMULATIONS * len(models) * simulations,
+    )  # fmt: skip
+    failures, drawn, drawn_ms = _measure_draws(controller, plants, unknown, samples, rng, drawing)
+    worst = {
+        name: find_worst(controller, plants[name], unknown, drawn[name])
+        for name in count_off(list(plants), "worst case, plant", searching)
+    }
     brackets: dict[str, Bracket] = {}
     if bounds is not None:
-        brackets = {name: bracket(controller, plant, unknown, worst[name], bounds) for name, plant in plants.items()}
+        brackets = {
+            name: bracket(controller, plants[name], unknown, worst[name], bounds)
+            for name in count_off(list(plants), "bounds, plant", bounding)
+        }
     for name, bounded in brackets.items():
         if bounded.parameters:
             case = measure_worst(controller, plants[name], nominal, bounded.parameters)
@@ -218,6 +230,7 @@ def certify(
         failure_probability_bound=failure_bound(samples, failures.count, confidence),
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
+    rubbing("friction at the draws", 0.0)
     friction = find_nominal_margins(controller, models, nominal)
     friction_draws = find_margins_at_draws(
         controller, models, unknown, friction, samples, rng, required=min_friction_margin
@@ -235,10 +248,13 @@ def certify(
         brackets=brackets, friction=friction, friction_draws=friction_draws, drawn_ms=drawn_ms,
         remarks=(*_remark_delay(controller, parameters), *_remark_amplitude(controller, models, nominal)),
     )  # fmt: skip
-    certificate = certificate.with_steps()
-    if not simulations:
-        return certificate
-    return certificate.with_simulation(sensors=sensors, current_step_A=current_step_A, seed=seed)
+    certificate = certificate.with_steps(stepping)
+    if simulations:
+        certificate = certificate.with_simulation(
+            sensors=sensors, current_step_A=current_step_A, seed=seed, progress=simulating
+        )
+    progress(f"{samples} draws, {format_count(failures.count, 'failure')}", 1.0)
+    return certificate
 
 
 def _add_warm_winding(
@@ -356,27 +372,27 @@ def _digest(controller: Controller) -> int:
 
 def _measure_draws(
     controller: Controller, plants: Mapping[str, Plant], unknown: Uncertainty, samples: int, rng: np.random.Generator,
-    progress: DrawProgress | None,
+    progress: Progress,
 ) -> tuple[_Failures, dict[str, Float[np.ndarray, "n k"]], dict[str, Float[np.ndarray, " m"]]]:  # fmt: skip
     """Draw and measure in blocks: the draws that fail on some plant, the worst of each plant, and Ms of the first."""
     none = _Tally(points=np.empty((0, unknown.size)), severity=np.empty(0))
     tallies = {name: [none, none] for name in plants}  # by Ms, and by Mt
     ms, mt = (limit * (1.0 + LIMIT_ROUNDING) for limit in limits(controller))
-    failures, steps = _Failures(), samples * len(plants)
+    failures = _Failures()
+    sizes = [min(DRAWS_PER_BLOCK, samples - start) for start in range(0, samples, DRAWS_PER_BLOCK)]
+    hooks = iter(divide(progress, *(float(size) for size in sizes for _ in plants)))
     first: dict[str, list[Float[np.ndarray, " m"]]] = {name: [] for name in plants}
-    for start in range(0, samples, DRAWS_PER_BLOCK):
-        points = unknown.draw(min(DRAWS_PER_BLOCK, samples - start), rng)
+    for number, size in enumerate(sizes):
+        points = unknown.draw(size, rng)
         values = unknown.values(points)
         unstable, over_ms, over_mt = (np.zeros(len(points), dtype=bool) for _ in range(3))
-        for number, (name, plant) in enumerate(plants.items()):
-            before = start * len(plants) + number * len(points)
-            tell = None if progress is None else (lambda done, before=before: progress(before + done, steps))
-            batch = batch_figures(controller, plant, unknown.nominal, values, tell)
+        for name, plant in plants.items():
+            batch = batch_figures(controller, plant, unknown.nominal, values, prefix(next(hooks), name))
             unstable |= batch.spectral_radius >= STABLE
             over_ms |= batch.ms > ms
             over_mt |= batch.mt > mt
-            if start < DRAWS_KEPT:
-                first[name].append(batch.ms[: DRAWS_KEPT - start])
+            if number == 0:
+                first[name].append(batch.ms[:DRAWS_KEPT])
             tallies[name] = [
                 tally.add(points, severities(controller, batch, by))
                 for tally, by in zip(tallies[name], (LARGEST_MS, LARGEST_MT), strict=True)

@@ -12,7 +12,7 @@ that the one which passes holds at `confidence`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Literal
 
@@ -25,6 +25,7 @@ from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import record
 from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, Certificate
 from seaopt.robustness.certificate.certify import CONFIDENCE, certify
@@ -32,6 +33,7 @@ from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst, place_values
 
 MOST_ROUNDS = 6
+TUNING, CERTIFYING = 1.0, 2.0  # of the time of a round
 SAME_WITNESS = 1e-6  # witnesses that differ by less than this share in every parameter are one
 Pairs = Mapping[str, tuple[Plant, ParameterSet]]
 
@@ -128,7 +130,7 @@ def tune_certified(
     seed: int = 1,
     confidence: float = CONFIDENCE,
     rounds: int = MOST_ROUNDS,
-    progress: Callable[[Round], None] | None = None,
+    progress: Progress = ignore,
 ) -> JointTuning:
     """Tune, certify, and tune again with the worst cases found, until the certificate passes.
 
@@ -155,7 +157,7 @@ def tune_certified(
     rounds : int
         Largest number of rounds.
     progress : callable, optional
-        Called with each round when it is done.
+        Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
     Returns
     -------
@@ -187,13 +189,14 @@ def tune_certified(
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share = 1.0 - (1.0 - confidence) / rounds
     done: list[Round] = []
-    for number in range(1, rounds + 1):
-        controller = tune(plant, values, spec, witnesses, draws=draws)
+    for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
+        tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
+        controller = tune(plant, values, spec, witnesses, draws=draws, progress=tuning)
         certificate = None
         if controller.feasible:
             certificate = certify(
                 controller, plants, parameters, ranges=ranges, others=others, samples=samples, seed=seed + number - 1,
-                confidence=share, simulations=False,
+                confidence=share, simulations=False, progress=certifying,
             )  # fmt: skip
         added = _list_new_witnesses(certificate, [(plant, values), *witnesses.values()], number)
         done.append(
@@ -205,10 +208,9 @@ def tune_certified(
                 added=(*added,),
             )
         )
-        if progress is not None:
-            progress(done[-1])
         status = _end_of_round(certificate, added, last=number == rounds)
         if status is not None:
+            progress(f"{status} after {format_count(number, 'round')}", 1.0)
             return JointTuning(
                 status=status, controller=controller, certificate=certificate, rounds=tuple(done), robust_to=witnesses
             )

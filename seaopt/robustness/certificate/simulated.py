@@ -17,6 +17,7 @@ from seaopt.formatting import format_band, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
+from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
@@ -26,6 +27,7 @@ from seaopt.robustness.verification.verification import Verification, check_plan
 
 Result = TypeVar("Result")
 SIMULATION_FAILURES = "simulation_failures"
+SWEEP, SCENARIOS, PORT = 1.5, 2.0, 0.7  # of the time of simulations: of each plant, and of the design plant's port
 STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
 # Kinds of fault that have a figure of their own are requirements by these names; all others are counted.
 NAMED_FAULTS = {
@@ -126,6 +128,7 @@ def run_simulations(
     current_step_A: float = 0.0,
     seed: int = 1,
     steps: Verification | None = None,
+    progress: Progress = ignore,
 ) -> Simulated:
     """Run scenarios, large signals, passivity and environments, as far as plants and controller allow.
 
@@ -135,6 +138,8 @@ def run_simulations(
         As in `verify`; the controller knows its design plant.
     steps : Verification, optional
         What `simulate_steps` played: on the same devices it is not played again.
+    progress : callable, optional
+        Called before each of them.
 
     Returns
     -------
@@ -165,16 +170,22 @@ def run_simulations(
             left_out[what] = f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
         return None
 
+    swept = _list_sweeps(controller, plants, parameters)
+    sweeping, playing, coupling = divide(progress, SWEEP * len(swept), SCENARIOS * len(plants), PORT)
     sweeps = [
         attempt(what, partial(_sweep, controller, name, *on))
-        for name, on, what in _list_sweeps(controller, plants, parameters)
+        for name, on, what in count_off(swept, "large signals, plant", sweeping)
     ]
-    return Simulated(
-        verification=attempt("simulation", lambda: verify(
+    verification = attempt(
+        "simulation",
+        lambda: verify(
             controller, plants, parameters, draws=draws, sensors=device, current_step_A=current_step_A, seed=seed,
-            known=steps,
-        )),
-        large_signal=tuple(sweep for sweep in sweeps if sweep is not None),
+            known=steps, progress=playing,
+        ),
+    )  # fmt: skip
+    coupling("port and environments", 0.0)
+    return Simulated(
+        verification=verification, large_signal=tuple(sweep for sweep in sweeps if sweep is not None),
         passivity=attempt("passivity", lambda: passivity(controller, plant, values)),
         environments=attempt("environments", lambda: coupled_stability(controller, plant, values)),
         left_out=left_out, sensors=device, current_step_A=current_step_A, seed=seed,
@@ -186,10 +197,11 @@ def simulate_steps(
     plants: Mapping[str, Plant],
     parameters: ParameterSet,
     draws: Mapping[str, Sequence[ParameterSet]],
+    progress: Progress = ignore,
 ) -> Verification | str:
     """Play the steps of `step_scenarios` on every plant, on ideal devices; return why not where that cannot be done."""
     try:
-        return verify(controller, plants, parameters, scenarios=step_scenarios, draws=draws)
+        return verify(controller, plants, parameters, scenarios=step_scenarios, draws=draws, progress=progress)
     except SeaoptError as error:
         return str(error)
 

@@ -11,7 +11,7 @@ parabola in the angle: Newton's method on its derivative, kept between the neigh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -23,6 +23,7 @@ from seaopt.control.loops.response import LARGEST_ENTRY
 from seaopt.control.loops.sampled_plant import DELAY, LinearPlants, conditions, hold, linearise, read_conditions
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
+from seaopt.progress import Progress, ignore
 from seaopt.records import record
 
 DRAW_BLOCK = 8192  # draws linearised at once: bounds the memory
@@ -34,7 +35,6 @@ SPEED_NEWTON_STEPS = 40
 
 NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
 
-CountProgress = Callable[[int], None]
 Peaks = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 
 
@@ -52,7 +52,7 @@ class BatchFigures:
 
 def batch_figures(
     controller: Controller, plant: Plant, nominal: ParameterSet, draws: Mapping[str, Float[np.ndarray, " n"]],
-    progress: CountProgress | None = None, threads: int = 2, peaks: bool = True,
+    progress: Progress = ignore, threads: int = 2, peaks: bool = True,
 ) -> BatchFigures:  # fmt: skip
     """Close `controller` around `plant` at every draw.
 
@@ -65,7 +65,7 @@ def batch_figures(
     draws : mapping of name to array, shape (n,)
         Parameters of the plant and conditions (`seaopt.control.loops.sampled_plant`); other names are ignored.
     progress : callable, optional
-        Called with the number of draws done, after each block.
+        Called after each block of draws.
     threads : int
         Blocks of draws computed at once.
     peaks : bool
@@ -78,9 +78,8 @@ def batch_figures(
     if count > 1 and np.array_equal(columns, np.repeat(columns[:, :1], count, axis=1)):
         # Nothing that is drawn concerns this plant: all draws are one loop.
         one = {name: column[:1] for name, column in draws.items()}
-        single = batch_figures(controller, plant, nominal, one, None, threads, peaks)
-        if progress is not None:
-            progress(count)
+        single = batch_figures(controller, plant, nominal, one, ignore, threads, peaks)
+        progress(f"{count} of {count} draws", 1.0)
         return BatchFigures(
             spectral_radius=np.repeat(single.spectral_radius, count), ms=np.repeat(single.ms, count),
             mt=np.repeat(single.mt, count),
@@ -101,8 +100,7 @@ def batch_figures(
                 ),
                 pieces,
             )
-            if progress is not None:
-                progress(block.stop)
+            progress(f"{block.stop} of {count} draws", block.stop / count)
     radius, ms, mt = (np.concatenate(column) for column in zip(*parts, strict=True))
     return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
 

@@ -16,6 +16,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.impacts import check_held
+from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Stage, play
@@ -200,6 +201,7 @@ def verify(
     partners: Mapping[str, Plant] | None = None,
     seed: int = 1,
     known: Verification | None = None,
+    progress: Progress = ignore,
 ) -> Verification:
     """Simulate a controller, as exported, on nonlinear plants.
 
@@ -227,6 +229,8 @@ def verify(
         Seed of noise and random excitations.
     known : Verification, optional
         What was played before: a scenario that it has, on the same stage at the same draws, is not played again.
+    progress : callable, optional
+        Called before each scenario (`seaopt.progress.Progress`).
 
     Returns
     -------
@@ -266,7 +270,7 @@ def verify(
     rows: list[Outcome] = []
     speeds: dict[str, float] = {}
     error = 0.0
-    for name, stage in stages.items():
+    for (name, stage), part in zip(stages.items(), divide(progress, *(1.0 for _ in stages)), strict=True):
         chosen = tuple(scenarios if isinstance(scenarios, Sequence) else choose(controller, stage.plant, sets[name]))
         obstacles = [(scenario, scenario.obstacle(stage.plant, stage.partner)) for scenario in chosen]
         possible = [scenario for scenario, obstacle in obstacles if obstacle is None]
@@ -276,7 +280,7 @@ def verify(
             skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
         skipped += [(scenario.name, name, obstacle) for scenario, obstacle in obstacles if obstacle is not None]
         simulated = wall = 0.0
-        for scenario in possible:
+        for scenario in count_off(possible, f"{name}, scenario", part):
             before = [] if known is None else known.recall(stage, name, scenario, sets[name], seed)
             if before:
                 rows, error = rows + before, max(error, known.error if known is not None else 0.0)

@@ -30,14 +30,22 @@ def seen():
 @pytest.fixture(scope="module")
 def done(stand, swing, thor, seen):
     return tune_certified(
-        stand, thor, SPEC, {"stand": stand, "swing": swing}, ranges=RANGES, samples=300, seed=5, progress=seen.append
+        stand,
+        thor,
+        SPEC,
+        {"stand": stand, "swing": swing},
+        ranges=RANGES,
+        samples=300,
+        seed=5,
+        progress=lambda *each: seen.append(each),
     )
 
 
 def test_few_rounds_are_enough(done, seen):
     assert done.status == "certified"
     assert 2 <= len(done.rounds) <= 4
-    assert seen == list(done.rounds)
+    assert seen[-1] == (f"certified after {len(done.rounds)} rounds", 1.0)
+    assert {note.split(",")[0] for note, _ in seen[:-1]} == {f"round {one.number}" for one in done.rounds}
     first = done.rounds[0].certificate
     assert not first.passed
     assert first.monte_carlo.failures > 0

@@ -35,7 +35,7 @@ def progress():
 def certificate(controller, swing, thor, progress):
     return so.certify(
         controller, {"swing": swing}, thor, ranges={"I_p": (0.15, 0.6)}, samples=50, seed=1,
-        progress=lambda done, total: progress.append((done, total)),
+        progress=lambda *each: progress.append(each),
         simulations=False,
     )  # fmt: skip
 
@@ -195,7 +195,12 @@ def test_draws_are_not_the_callers_stream(certificate):
 
 @pytest.mark.usefixtures("certificate")
 def test_progress_runs_to_the_end(progress):
-    assert progress[-1] == (100, 100)  # on both plants: the design plant is one
+    """Both plants are drawn on: the design plant is one."""
+    assert [note for note, _ in progress if note.endswith("50 draws")] == [
+        "design, 50 of 50 draws",
+        "swing, 50 of 50 draws",
+    ]
+    assert progress[-1][0].startswith("50 draws, ") and progress[-1][1] == 1.0
 
 
 @pytest.mark.parametrize(

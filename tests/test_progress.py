@@ -1,0 +1,113 @@
+"""How far the stages are while they run: real ones, on small problems."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import sweep
+from seaopt.progress import divide
+from seaopt.robustness import Budget, tune_certified
+
+STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
+RANGES = {"I_p": (0.3, 0.5)}
+
+
+class Heard:
+    """A hook that keeps what it is told."""
+
+    def __init__(self):
+        self.notes, self.shares = [], []
+
+    def __call__(self, note, share=None, /):
+        if share is not None:
+            self.notes.append(note)
+            self.shares.append(share)
+
+    def check(self, *words):
+        assert self.shares[0] >= 0.0 and self.shares[-1] == 1.0
+        assert np.all(np.diff(self.shares) >= 0.0)
+        for word in words:
+            assert any(word in note for note in self.notes), (word, self.notes)
+
+
+@pytest.fixture
+def heard():
+    return Heard()
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return so.tune(STAND, THOR, SPEC, {"swing": SWING})
+
+
+def make_experiment(truth):
+    time = np.arange(1200) / 400.0
+    rng = np.random.default_rng(1)
+    current = np.convolve(rng.normal(0.0, 2.0, time.size), np.ones(4) / 4.0, "same")
+    run = so.simulate(STAND, truth, so.Log.from_arrays(time=time, I=current))
+    force = run["F1"] + rng.normal(0.0, 0.5, time.size)
+    return so.Experiment(plant=STAND, log=so.Log.from_arrays(time=time, I=current, F1=force))
+
+
+def test_parts_of_a_call_follow_each_other(heard):
+    for part in divide(heard, 1.0, 0.0, 3.0, 0.1, 0.7):
+        for share in (0.0, 0.3, 1.0):
+            part("running", share)
+    heard.check()
+    assert heard.shares[5] == heard.shares[2] == pytest.approx(1.0 / 4.8)
+
+
+def test_a_fit_that_is_met_tells_its_iterations(heard):
+    so.fit([make_experiment(THOR)], THOR.update(J=2e-6).free("J"), progress=heard)
+    heard.check("looking for a start", "iteration 1, cost", "testing the residuals", "converged")
+
+
+def test_a_fit_that_is_not_met_tells_the_causes_that_it_tries(heard):
+    wrong = THOR.update(k=2.0 * THOR["k"].value)
+    assert not so.fit([make_experiment(THOR)], wrong.free("J"), progress=heard).met
+    heard.check("trying cause 1 of", "trying cause 2 of")
+
+
+def test_a_tune_tells_its_starts(heard):
+    so.tune(STAND, THOR, SPEC, progress=heard)
+    heard.check("start 2 of 3", "refining start 1 of")
+
+
+def test_a_tune_that_is_not_possible_tells_the_bandwidths_that_it_tries(heard):
+    spec = so.ControllerSpec(bandwidth_hz=30, max_noise_gain=3, bandwidth_range_hz=(28, 32))
+    assert not so.tune(STAND, THOR, spec, progress=heard).feasible
+    heard.check("Hz instead", "refining start")
+
+
+def test_a_friction_margin_that_cannot_be_had_is_told_as_it_is_raised(heard):
+    plant = so.plants.rotary(link="locked")
+    params = plant.defaults.update(f_c=0.005, v_s=1.0)
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, min_friction_margin=10.0)
+    assert not so.tune(plant, params, spec, progress=heard).feasible
+    heard.check("friction margin")
+
+
+def test_a_sweep_tells_its_bandwidths(heard):
+    sweep(STAND, THOR, SPEC, [20, 30, 40], progress=heard)
+    heard.check("20 Hz, start 1 of", "30 Hz, ", "40 Hz, ", "3 bandwidths")
+    first = next(number for number, note in enumerate(heard.notes) if note.startswith("30 Hz"))
+    assert heard.shares[first] == pytest.approx(1 / 3)
+
+
+def test_a_certificate_tells_draws_searches_and_scenarios(heard, controller):
+    so.certify(
+        controller, {"swing": SWING}, THOR, ranges=RANGES, samples=40, bounds=Budget(boxes=1), progress=heard
+    )  # fmt: skip
+    heard.check(
+        "swing, 40 of 40 draws", "worst case, plant 2 of 2", "bounds, plant 1 of 2", "friction at the draws",
+        "design, scenario 1 of 4", "swing, scenario 4 of 4", "large signals, plant 1 of", "port and environments",
+    )  # fmt: skip
+    assert sum("scenario" in note for note in heard.notes) > 16
+
+
+def test_rounds_of_tuning_are_told(heard):
+    tune_certified(STAND, THOR, SPEC, {"swing": SWING}, ranges=RANGES, samples=40, rounds=3, progress=heard)
+    heard.check("round 1, start 1 of", "round 1, swing, 40 of 40 draws", "certified after")
