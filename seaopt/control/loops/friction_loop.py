@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from seaopt.control.loops.drift import leave_out_drift
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant, find_rest, linearise_sets, sample_linear
 from seaopt.parameters import ParameterSet
@@ -190,7 +191,7 @@ def make_friction_loops(
         None where there is no friction.
 
     """
-    plant = freeze_heat(plant)
+    plant = leave_out_drift(freeze_heat(plant), measured)
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
     held = [np.array(find_bristle_stiffness(plant, each)) for each in values]

@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
+from seaopt.control.loops.drift import leave_out_drift
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant
@@ -226,7 +227,7 @@ def linearise(
 
     """
     refuse_samples(plant)
-    plant = freeze_heat(plant)
+    plant = leave_out_drift(freeze_heat(plant), measured)
     if measured not in plant.outputs:
         raise ControlError(
             f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
@@ -302,7 +303,7 @@ def differentiate_linearisation(
     dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
-    plant = freeze_heat(plant)
+    plant = leave_out_drift(freeze_heat(plant), measured)
     sliding = _let_slide(plant)
     row, names = list(plant.outputs).index(measured), list(plant.states)
     x, u = _solve_rest(sliding, p, at)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control import Controller
+from seaopt.control.loops.drift import leave_out_drift
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.plants import Plant, jacobians
 from seaopt.plants.motor.thermal import freeze_heat
@@ -56,7 +57,7 @@ def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: B
         The plant's equations have an instruction without an enclosure, or cannot rest at a box's centre.
 
     """
-    plant = freeze_heat(plant)
+    plant = leave_out_drift(freeze_heat(plant), controller.spec.measured)
     degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
     uncertain = within.enclose(boxes, degree)
     count, over = boxes.centre.shape[0], build_basis(within.size, degree)

@@ -52,12 +52,12 @@ class FrictionDraws:
 
     def __str__(self) -> str:
         head = f"over draws, it is shown for {self.shown} of {self.samples}"
-        where = f"at {format_values(self.parameters)}"
+        where = f" at {format_values(self.parameters)}" if self.parameters else ""
         if not self.least_slope:
-            return f"{head}; the first for which it is not is {where}"
+            return f"{head}; the first for which it is not is{where or ' the plant as it is'}"
         if np.isinf(self.least_slope):
             return f"{head}, however steep"
-        return f"{head}, the least up to {self.factor:.3g} times its own {where}"
+        return f"{head}, the least up to {self.factor:.3g} times its own{where}"
 
 
 def find_nominal_margins(
