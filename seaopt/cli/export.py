@@ -8,7 +8,7 @@ from typing import Any
 
 from seaopt.cli.provenance import FILES, check_unedited, digest
 from seaopt.cli.session import SCHEMAS, UNMET
-from seaopt.cli.terminal import Terminal
+from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ProblemError
@@ -16,8 +16,9 @@ from seaopt.files import read_json, to_json
 
 
 def export_controller(
-    results: Path, target: Path, json: bool, derate_margin_K: float | None = None, **options: Any
-) -> bool:
+    results: Path, target: Path, json: bool, derate_margin_K: float | None = None, amount: Amount = "usual",
+    **options: Any,
+) -> bool:  # fmt: skip
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used.
 
     It may where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail.
@@ -57,7 +58,10 @@ def export_controller(
             console.wrap(f"not met: {join_labels(content['active_constraints'])}")
         if broken:
             console.wrap(f"not met: the certificate of this controller FAILED: {', '.join(broken)}")
-        console.wrap(f"wrote {', '.join(written)}")
+        if amount != "quiet" or (met and content["feasible"] and not broken):
+            console.wrap(f"wrote {', '.join(written)}")
+        for note in content.get("notes") or () if amount == "verbose" else ():
+            console.wrap(f"note: {note}", indent=2)
     return content["feasible"] and met and not broken
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from seaopt.cli.terminal import Terminal
+from seaopt.cli.terminal import Amount, Terminal
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import check_folder, to_json, write_json
 from seaopt.formatting import format_count, join_words
@@ -28,7 +28,7 @@ STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 def inspect_log(
     path: Path, *, time: str | None = None, channels: Sequence[str] = (), inputs: Sequence[str] = (),
     units: Sequence[str] = (), align: str | None = None, counter: str | None = None, rate_hz: float | None = None,
-    folder: Path | None = None, json: bool = False,
+    folder: Path | None = None, json: bool = False, amount: Amount = "usual",
 ) -> None:  # fmt: skip
     """Read a log as it is, print what is wrong with it, and write quality.json and the figure if asked.
 
@@ -61,7 +61,7 @@ def inspect_log(
     if json:
         sys.stdout.write(to_json(quality.to_dict()))
         return
-    _print_report(quality, written)
+    _print_report(quality, written, amount)
 
 
 def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
@@ -130,20 +130,22 @@ def _parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-def _print_report(quality: Quality, written: list[Path]) -> None:
-    console = Terminal()
+def _print_report(quality: Quality, written: list[Path], amount: Amount) -> None:
+    console, most = Terminal(), None if amount == "verbose" else MOST_LINES
     console.wrap(f"{quality.source}: {_describe_verdict(quality)}", style="bold")
+    if amount == "quiet":
+        return
     console.wrap(quality.summary)
-    for finding in quality.findings[:MOST_LINES]:
+    for finding in quality.findings[:most]:
         first, *rest = console.break_lines(finding.sentence, indent=9)
         console.say(f"{finding.severity:<8}", style=STYLES[finding.severity], end=" ")
         console.say("\n".join([first, *(" " * 9 + line for line in rest)]), soft_wrap=True)
-    if len(quality.findings) > MOST_LINES:
-        console.say(f"... and {len(quality.findings) - MOST_LINES} more findings")
+    if most is not None and len(quality.findings) > most:
+        console.say(f"... and {len(quality.findings) - most} more findings: --verbose prints them")
     rows = [format_channel(channel) for channel in quality.channels.values()]
-    console.tabulate(rows[:MOST_LINES], CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2), indent=0, gap=1)
-    if len(rows) > MOST_LINES:
-        console.say(f"... and {len(rows) - MOST_LINES} more channels: --json and -o list all of them")
+    console.tabulate(rows[:most], CHANNEL_HEAD, "<<" + ">" * (len(CHANNEL_HEAD) - 2), indent=0, gap=1)
+    if most is not None and len(rows) > most:
+        console.say(f"... and {len(rows) - most} more channels: --verbose prints them")
     for note in quality.notes:
         console.wrap(note, style="dim")
     if written:

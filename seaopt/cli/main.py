@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from seaopt.cli.terminal import prepare_streams
+from seaopt.cli.terminal import Amount, prepare_streams
 from seaopt.errors import SeaoptError
 from seaopt.formatting import printable
 
@@ -55,7 +55,7 @@ app = typer.Typer(
 ProblemFile = Annotated[Path, typer.Argument(metavar="PROBLEM", help="Problem file (TOML).", show_default=False)]
 Folder = Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the results.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON and nothing else.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the verdict only.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the verdict only, or the files written.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print all figures, notes and failures.")]
 
 
@@ -80,9 +80,13 @@ def _add_options(
     """
 
 
+def _choose_amount(quiet: bool, verbose: bool) -> Amount:
+    return "quiet" if quiet else "verbose" if verbose else "usual"
+
+
 def _finish(session: Any, json: bool, stages: list[str], quiet: bool = False, verbose: bool = False) -> None:
     """Print what was asked for on stdout and leave with the exit code of the verdict."""
-    session.show(json, stages, "quiet" if quiet else "verbose" if verbose else "usual")
+    session.show(json, stages, _choose_amount(quiet, verbose))
     if not session.met(stages):
         raise typer.Exit(1)
 
@@ -117,13 +121,16 @@ def run(
 
 
 @app.command()
-def simulate(problem: ProblemFile, output: Folder = Path("out"), json: Json = False) -> None:
+def simulate(
+    problem: ProblemFile, output: Folder = Path("out"), json: Json = False, quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:  # fmt: skip
     """Simulate every experiment with the file's values; write one CSV each, and the logs of virtual ones."""
     from seaopt.cli.session import Session
 
     session = Session(problem, output)
     session.run("simulate")
-    _finish(session, json, ["simulate"])
+    _finish(session, json, ["simulate"], quiet, verbose)
 
 
 @app.command()
@@ -131,6 +138,8 @@ def frf(
     problem: ProblemFile,
     output: Folder = Path("out"),
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     stretch: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", min=0.0, help="Length of a stretch, one over the resolution in Hz."),
@@ -141,7 +150,7 @@ def frf(
 
     session = Session(problem, output, stretch_s=stretch)
     session.run("frf")
-    _finish(session, json, ["frf"])
+    _finish(session, json, ["frf"], quiet, verbose)
 
 
 @app.command()
@@ -174,6 +183,8 @@ def inspect(
     ] = None,
     listed: Annotated[bool, typer.Option("--list", help="Only list the columns, their units and clocks.")] = False,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Look for every fault in a log, and say what it excites."""
     from seaopt.cli.inspect import inspect_log
@@ -186,6 +197,7 @@ def inspect(
     inspect_log(
         log, time=time, channels=channel or (), inputs=driven_by or (), units=unit or (), align=align,
         counter=counter, rate_hz=rate_hz, folder=output, json=json,
+        amount=_choose_amount(quiet, verbose),
     )  # fmt: skip
 
 
@@ -240,11 +252,13 @@ def validate(
         typer.Option(metavar="EXPERIMENT", help="Whose columns and sensors it has; the first's, if left out."),
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Score the fit in DIR on another log, from its own initial state and offsets."""
     from seaopt.cli.session import Session
 
-    Session(problem, output).validate(log, like, json)
+    Session(problem, output).validate(log, like, json, _choose_amount(quiet, verbose))
 
 
 def _make_command(name: str, text: str) -> Callable[..., None]:
@@ -314,6 +328,8 @@ def export(
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
     ] = False,
     json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Write the controller in DIR as C99, with its gains as a C header and a MATLAB script."""
     from seaopt.cli.export import export_controller
@@ -322,7 +338,16 @@ def export(
         "current_limit_A": current_limit, "command_limit": command_limit, "tracking_time_s": tracking_time,
         "derate": derate, "allow_infeasible": allow_infeasible,
     }  # fmt: skip
-    if not export_controller(results, c, json, derate_margin, precision=precision, name=name, **options):
+    if not export_controller(
+        results,
+        c,
+        json,
+        derate_margin,
+        amount=_choose_amount(quiet, verbose),
+        precision=precision,
+        name=name,
+        **options,
+    ):
         raise typer.Exit(1)
 
 

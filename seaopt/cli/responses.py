@@ -7,25 +7,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from seaopt.cli.terminal import Terminal
 from seaopt.errors import LogError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.fit_result import Nuisance
-from seaopt.formatting import MISSING, format_number, format_table
-from seaopt.frequency import DriveEstimate, Pair, Survey
+from seaopt.formatting import MISSING, format_number
+from seaopt.frequency import DriveEstimate, Pair, SecondOrder, Survey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
 from seaopt.progress import Progress, count_off
 from seaopt.records import record
 from seaopt.reporting import experiment_survey, write_frequency_figure
 
-TITLES = ("experiment", "response", "coherent", "peak", "gain", "natural", "damping", "2nd order", "file")
+TITLES = ("response", "coherent", "peak", "gain", "f_n", "zeta", "(16)", "file")
 
 RESPONSES_NOTE = (
-    "coherent: band of coherence above 0.8, peak and natural frequency in Hz; gain, natural and damping: of the "
-    "second-order fit; 2nd order, file, fit: how far the second-order fit and the model with the file's and the fitted "
-    "values lie from H1, in its standard deviations"
+    "coherent: band of coherence above 0.8; peak and natural frequency f_n in Hz; gain, f_n and damping ratio zeta: "
+    "of the second-order fit (16); (16), file, fit: how far that and the model with the file's and the fitted values "
+    "lie from H1, in its standard deviations"
 )
 
 
@@ -59,22 +58,23 @@ class Responses:
             lines.append((not poor, f"{name}: {what}"))
         return lines
 
-    def show(self, console: Console) -> None:
-        """Print a row per response, and what those of the form (16) say of the actuator."""
+    def list_forms(self) -> list[SecondOrder]:
+        """Return the second-order fits."""
+        pairs = (pair for survey in self.surveys.values() for pair in survey.pairs)
+        return [pair.second_order for pair in pairs if pair.second_order is not None]
+
+    def show(self, console: Terminal) -> None:
+        """Print a row per response of each experiment, and what those of the form (16) say of the actuator."""
         titles = (*TITLES, "fit") if self.fitted else TITLES
-        rows = [
-            (name, *self._format_cells(name, survey, pair))
-            for name, survey in self.surveys.items()
-            for pair in survey.pairs
-        ]
-        for line in format_table(rows, titles, "<<".ljust(len(titles), ">")):
-            console.print(line, highlight=False, markup=False)
-        console.print(RESPONSES_NOTE, style="dim", highlight=False, markup=False)
         for name, survey in self.surveys.items():
+            console.say(f"\n{name}", style="bold")
+            rows = [self._format_cells(name, survey, pair) for pair in survey.pairs]
+            console.tabulate(rows, titles, "<<".ljust(len(titles), ">"))
             for pair in survey.pairs:
                 drive = survey.drive(pair, self.guess)
-                if drive is not None:
-                    console.print(f"{name}: {_describe_drive(survey, pair, drive)}", highlight=False, markup=False)
+                for line in _describe_drive(survey, pair, drive) if drive is not None else ():
+                    console.wrap(line, indent=2)
+        console.wrap(RESPONSES_NOTE, indent=2, style="dim")
 
     def _format_cells(self, name: str, survey: Survey, pair: Pair) -> list[str]:
         band, peak, form = pair.good_band_hz, pair.peak, pair.second_order
@@ -126,13 +126,13 @@ def _adopt_fit(survey: Survey, nuisance: Nuisance) -> Survey:
     return replace(survey, clock=replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False), gain=nuisance.gain)
 
 
-def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> str:
+def _describe_drive(survey: Survey, pair: Pair, drive: DriveEstimate) -> tuple[str, ...]:
     form, spring = pair.second_order, survey.plant.spring
     assert form is not None and spring is not None
     m_k, b_m = spring.mass, spring.damping
     return (
         f"{pair.name} as (16), per unit of what the motor gives: {drive.K.value:.5g}/(s² + {form.a.value:.4g} s + "
-        f"{form.b.value:.5g})\n"
-        f"  with k known: {m_k} = {drive.m_k}, {b_m} = {drive.b_m}, efficiency {drive.efficiency}\n"
-        f"  K and b averaged, as the paper does: {m_k} = {drive.m_k_averaged}, {b_m} = {drive.b_m_averaged}"
+        f"{form.b.value:.5g})",
+        f"with k known: {m_k} = {drive.m_k}, {b_m} = {drive.b_m}, efficiency {drive.efficiency}",
+        f"K and b averaged, as the paper does: {m_k} = {drive.m_k_averaged}, {b_m} = {drive.b_m_averaged}",
     )

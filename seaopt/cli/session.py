@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread, Timer
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -23,13 +23,13 @@ from seaopt.cli.frontier import print_frontier
 from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_content, digest_sources
 from seaopt.cli.responses import estimate_responses
 from seaopt.cli.show import show_certificate, show_controller, show_fit, show_verdicts
-from seaopt.cli.terminal import Terminal
+from seaopt.cli.terminal import Amount, Terminal
 from seaopt.cli.verdicts import StageVerdict, judge_certificate, judge_controller, judge_fit
 from seaopt.control import Controller, ControllerSpec, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
-from seaopt.estimation import Experiment, Fit, warn_unidentified
+from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.formatting import printable
 from seaopt.logs import Log, write_log
@@ -73,8 +73,6 @@ LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
 MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 
 
-Amount = Literal["quiet", "usual", "verbose"]
-
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 OF_THE_LAW = ("structure", "notch", "reference_weights", "sample_rate_hz", "delay_samples")
@@ -98,6 +96,11 @@ def format_left(spent_s: float, share: float) -> str:
         return ""
     left = spent_s * (1.0 - share) / share
     return f"{left:.0f} s left" if left < 100.0 else f"{left / 60.0:.0f} min left"
+
+
+def _format_percents(score: ModelledOutputs) -> str:
+    """Return how well each output is predicted, on one line."""
+    return ", ".join(f"{name} {row['fit_percent']:.2f} %" for name, row in score.to_dict().items())
 
 
 def shorten_note(text: str) -> str:
@@ -380,8 +383,8 @@ class Session:
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {one.name: one.to_dict() for one in scores}})
 
-    def validate(self, log: Path, like: str | None, as_json: bool) -> None:
-        """Score the folder's fit on another log, and print that."""
+    def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> None:
+        """Score the folder's fit on another log, and print that; all of what the log has to say, if `verbose`."""
         fitted = self.parameters()
         if isinstance(fitted, ParameterSet):
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] that is fitted; nothing to validate")
@@ -397,7 +400,12 @@ class Session:
             return
         if not fitted.met:
             self.say(f"warning: scored {UNMET}: {fitted.verdict}")
-        Terminal(soft_wrap=True).print(repr(score), highlight=False, markup=False)
+        console = Terminal()
+        console.wrap(f"{log}: {_format_percents(score)}")
+        if amount != "quiet":
+            console.say(repr(score))
+        if amount == "verbose":
+            console.say(repr(fitted))
 
     def _frf(self, tell: Progress) -> None:
         if not self.problem.table.experiment:
@@ -532,10 +540,10 @@ class Session:
         console = Terminal()
         judged = [one for stage in self._judged(stages) for one in self._verdicts(stage)]
         show_verdicts(console, judged, verbose=amount == "verbose")
-        if amount == "quiet":
+        if amount == "quiet" and judged:
             return
-        for stage in stages:
-            if amount == "verbose" and stage in ("fit", "tune", "certify"):
+        for stage in stages if amount != "quiet" else ():
+            if amount == "verbose" and stage not in ("report", "expect"):
                 self._show_all(console, stage)
             else:
                 self._show_figures(console, stage)
@@ -563,6 +571,11 @@ class Session:
 
     def _show_all(self, console: Terminal, stage: str) -> None:
         """Print all that a result has to say."""
+        if stage in ("frf", "simulate"):
+            self._show_figures(console, stage)
+            for part in self.results[stage].values() if stage == "simulate" else self.results[stage].list_forms():
+                console.say(repr(part))
+            return
         console.say("")
         if stage == "tune" and "joint" in self.results:
             console.say(repr(self.results["joint"]))

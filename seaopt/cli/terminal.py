@@ -6,7 +6,7 @@ import io
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.padding import Padding
@@ -14,6 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from seaopt.formatting import printable
+
+Amount = Literal["quiet", "usual", "verbose"]  # of what is printed
 
 LEAST_WIDTH = 20  # of a wrapped text, in characters
 NARROW = 16  # characters of a cell that is never broken

@@ -262,6 +262,9 @@ def test_logs_that_are_not_fitted_are_scored(write, tmp_path, capsys):
     scored = stored["validation"]["second"]["F1"]
     assert scored["rms_residual"] == pytest.approx(20.0, rel=0.05)
     capsys.readouterr()
+    Session(path, tmp_path / "out").validate(tmp_path / "second.csv", None, as_json=False, amount="quiet")
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.endswith(f"second.csv: F1 {scored['fit_percent']:.2f} %")
     Session(path, tmp_path / "out").validate(tmp_path / "second.csv", None, as_json=True)
     again = json.loads(capsys.readouterr().out)
     assert again["outputs"]["F1"]["fit_percent"] == pytest.approx(scored["fit_percent"], abs=1e-6)

@@ -80,6 +80,37 @@ def test_a_limit_that_cannot_be_met_ends_with_the_line_to_write(copied, narrow, 
     assert max(map(len, out.stdout.splitlines())) <= 90  # a command to copy is on one line
 
 
+def test_tables_of_responses_and_of_sweeps_fit_eighty_columns(copied, narrow):
+    """A long name, here of a plant at a corner of a range, is broken in its cell."""
+    for arguments, verdict in (
+        (("frf", "short.toml"), "met      chirp: every response is coherent"),
+        (("tune", "short.toml", "--sweep", "25:45:20"), ""),
+    ):
+        out = narrow(*arguments, "-o", "all")
+        lines = out.stdout.splitlines()
+        assert lines[0].startswith(verdict) and max(map(len, lines)) <= 80 and len(lines) <= 40, out.stdout
+    rows = [line.split() for line in lines]
+    assert ["25", "yes"] in [row[:2] for row in rows] and any("not met at 45 Hz" in line for line in lines)
+    assert {"worst", "limit"} <= {word for row in rows for word in row}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "quiet"),
+    [
+        (("frf", "short.toml", "-o", "all"), "met  "),
+        (("simulate", "short.toml", "-o", "all"), "wrote "),
+        (("inspect", "log.csv"), "log.csv: "),
+        (("export", "all", "--c", "firmware"), "wrote "),
+    ],
+)
+def test_every_command_says_less_or_more(copied, narrow, arguments, quiet):
+    rows = [f"{t / 400},{t % 7},{t % 11}" for t in range(400)]
+    (copied / "log.csv").write_text("\n".join(["time [s],I [A],F1 [N]", *rows]), encoding="utf-8")
+    little, usual, much = (narrow(*arguments, *option).stdout for option in (["--quiet"], [], ["--verbose"]))
+    assert all(line.startswith((quiet, "all/", "firmware/")) for line in little.splitlines())
+    assert 0 < len(little) <= len(usual) <= len(much)
+
+
 def test_help_is_what_the_bare_command_prints(seaopt):
     out = seaopt()
     assert out.returncode == 0

@@ -80,6 +80,13 @@ class FrontierRow:
     blocked_by: tuple[str, ...]
     without_sticking: SlidingAlone | None = None
 
+    def describe_friction_cost(self) -> str:
+        """Return by how much friction raises the disturbance, or that it alone makes a bandwidth impossible."""
+        alone = self.without_sticking
+        if alone is None or not alone.feasible:
+            return MISSING
+        return f"{100.0 * (self.disturbance / alone.disturbance - 1.0):+.0f} %" if self.feasible else "all of it"
+
 
 @record(eq=False)
 class Frontier:
@@ -112,7 +119,7 @@ class Frontier:
         cells = [
             [
                 *_cells(row, called.unit),
-                *([_friction_cost(row)] if sticks else []),
+                *([row.describe_friction_cost()] if sticks else []),
                 shorten_blocked(row.blocked_by) if row.blocked_by else "",
             ]
             for row in self.rows
@@ -227,14 +234,6 @@ def _cells(row: FrontierRow, unit: str) -> list[str]:
         MISSING if row.phase_margin_deg is None else f"{row.phase_margin_deg:.1f} deg",
         format_figure(row.force_limit_N, unit),
     ]
-
-
-def _friction_cost(row: FrontierRow) -> str:
-    """Return by how much friction raises the disturbance, or that it alone makes a bandwidth impossible."""
-    alone = row.without_sticking
-    if alone is None or not alone.feasible:
-        return MISSING
-    return f"{100.0 * (row.disturbance / alone.disturbance - 1.0):+.0f} %" if row.feasible else "all of it"
 
 
 def _row(task: Task, x: LawNumbers, loops: list[MeasuredLoop], controller: Controller) -> FrontierRow:
