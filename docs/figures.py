@@ -16,6 +16,7 @@ from seaopt.bench import PAPER_STAND
 from seaopt.control import (
     Frontier,
     Gains,
+    Impedance,
     MPCSpec,
     NoiseModel,
     Notch,
@@ -23,12 +24,14 @@ from seaopt.control import (
     command_of,
     estimator,
     force_mpc,
+    passive_region,
     sample,
     sweep,
 )
 from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.loops.port import hold_response, port_of
 from seaopt.estimation import Limits, design_experiment
+from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import compose_sheet
 from seaopt.reporting.figures.simulation import amplitude_panel, environment_panels, saturation_panel
 from seaopt.robustness.verification.environments import coupled_stability
@@ -218,6 +221,18 @@ def passivity() -> None:
     save(figure, "passivity")
 
 
+def impedance() -> None:
+    knee = so.plants.rotary("pendulum")
+    values = knee.defaults.update(
+        N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3, m=4.0, L=0.2
+    )
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6, max_noise_gain=45)
+    force = so.tune(so.plants.rotary("locked"), values, spec)
+    region = passive_region(force, knee, values, velocity_filter_s=0.005)
+    asked = Impedance(stiffness=50.0, damping=1.5, velocity_filter_s=0.005)
+    save(compose_sheet([region_panel(region, asked)]), "impedance")
+
+
 def disturbed(duration_s: float, seed: int):
     """Return a log of the stand moved by 0.1 A of unknown current noise a sample, and what really happened."""
     plant, truth, rng = so.plants.high_impedance(), so.plants.thor(), np.random.default_rng(seed)
@@ -332,6 +347,7 @@ if __name__ == "__main__":
     parts()
     anti_windup()
     passivity()
+    impedance()
     experiment_design()
     state_estimator()
     predictive_control()

@@ -4,6 +4,9 @@ from seaopt.control.deploy.export import export
 from seaopt.control.given.assessment import assess
 from seaopt.control.given.law_file import GivenLaw, read_law
 from seaopt.control.given.pid_forms import drive_pid, ideal_pid, parallel_pid
+from seaopt.control.impedance.critical_damping import critical_impedance
+from seaopt.control.impedance.region import ImpedanceRegion, passive_region
+from seaopt.control.impedance.rendering import Rendering, render
 from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
@@ -14,6 +17,7 @@ from seaopt.control.laws.structures import DisturbanceObserver, Gains, Notch
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.margins import DiskMargin, Margins, margins, nu_gap
+from seaopt.control.loops.outer_loop import Impedance, OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import Estimator, EstimatorRun, EstimatorState, estimator
@@ -31,10 +35,11 @@ from seaopt.control.tuning.tuner import tune
 
 __all__ = [
     "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "GateState", "GivenLaw", "Law",
-    "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep", "Margins", "NoiseModel", "Notch",
-    "Passivity", "PlausibilityGate", "RunnableLaw", "SampledLoop", "TransferFunction", "assess", "close_loop",
-    "command_of", "corners", "draw", "drive_pid", "estimate_noise", "estimator", "export", "export_mpc",
-    "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid", "passivity", "passivity_rows", "read_law",
-    "realise", "run_loop", "runnable", "sample", "sweep", "tune",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "GateState", "GivenLaw",
+    "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep",
+    "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate", "Rendering", "RunnableLaw",
+    "SampledLoop", "TransferFunction", "assess", "close_loop", "command_of", "corners", "critical_impedance", "draw",
+    "drive_pid", "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap",
+    "parallel_pid", "passive_region", "passivity", "passivity_rows", "read_law", "realise", "render", "run_loop",
+    "runnable", "sample", "sweep", "tune",
 ]  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from seaopt.control import Controller, Frontier
+from seaopt.control import Controller, Frontier, Impedance, ImpedanceRegion
 from seaopt.errors import ControlError, LogError, SeaoptError, suggestion
 from seaopt.estimation import Diagnostics, Experiment, Fit, ModelledOutputs, Ranking, diagnose
 from seaopt.logs import Log
@@ -23,6 +23,7 @@ from seaopt.reporting.figures import log as logs
 from seaopt.reporting.figures import loop as loops
 from seaopt.reporting.figures import simulation as simulations
 from seaopt.reporting.figures.frontier import frontier_panel, frontier_panels
+from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import Panel, compose_sheet, draw_panel
 from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.robustness import Certificate
@@ -524,6 +525,20 @@ class StabilityPlots(Plots):
     def environments(self, *, ax: Axes | None = None) -> Axes | PlainFigure:
         """Draw where the loop is stable, a figure per damper."""
         return _draw(simulations.environment_panels(self._stability), ax)
+
+
+class ImpedancePlots(Plots):
+    """Figures of what may be rendered at the link."""
+
+    def __init__(self, region: ImpedanceRegion) -> None:
+        self._region = region
+
+    def _main(self) -> Iterable[Make]:
+        yield lambda: region_panel(self._region)
+
+    def region(self, asked: Impedance | None = None, *, ax: Axes | None = None) -> Axes:
+        """Draw where stiffness and damping are passive, and what is asked for."""
+        return _draw(region_panel(self._region, asked), ax)
 
 
 class FrontierPlots(Plots):

@@ -48,8 +48,8 @@ class PortModel:
         x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,).
     feedback : array, shape (n + 2,)
         The fed-back force of x, F_m and F_e.
-    speed : int
-        Which state is the port's speed.
+    speed, place : int
+        Which states are the port's speed and its position.
     mass : float
         The inertia on the port (kg or kg m^2), which is taken off again.
     delay_s : float
@@ -64,6 +64,7 @@ class PortModel:
     force: Float[np.ndarray, " n"]
     feedback: Float[np.ndarray, " n+2"]
     speed: int
+    place: int
     mass: float
     delay_s: float = 0.0
     place_unit: str = LINEAR.place
@@ -169,6 +170,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
         force=b[:, external].copy(),
         feedback=np.concatenate([c[row], [per_effort * d[row, 0], d[row, external]]]),
         speed=list(probe.states).index(port.rate),
+        place=list(probe.states).index(port.coordinate),
         mass=values[port.inertia].value,
         delay_s=read_conditions(plant, params).get(DELAY, 0.0),
         place_unit=probe.states[port.coordinate],

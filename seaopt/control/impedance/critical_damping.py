@@ -1,0 +1,174 @@
+r"""Critically damped impedances in closed form, for the sampled loop as it is.
+
+With X(z) from the force law's reference to the link's position, the force loop closed, the outer loop's poles are the
+zeros of :math:`N(z) - K_v - D_v D(z)`. N = -1/X, in the direction of the link, is the dynamic stiffness of the link
+under force control: of a rigid link with nothing but a delay :math:`\tau`, :math:`N = -(m s^2 + d s) e^{s \tau}`. A
+double pole at a real :math:`z = e^{-pT}` is where value and slope vanish, two linear equations:
+
+.. math:: D_v = \frac{N'(z)}{D'(z)}, \qquad K_v = N(z) - D_v D(z) .
+
+They are exact for the sampled loop: force loop, hold, delay and filter are in X and D. For the rigid link with its
+delay they are :math:`K_v = m p^2 e^{-p\tau}(1 - p\tau)` and :math:`D_v = m p e^{-p\tau} (2 - p\tau)`, so that the
+stiffest critically damped link has :math:`p\tau = 2 - \sqrt 2` and :math:`K_v = 0.079\, m/\tau^2`. Paine and Sentis
+(ASME J. Dyn. Syst. Meas. Control 137(4), 2015) fit closed expressions for a rigid link with delay and filter to an
+exhaustive search, to 2 to 4 %.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control.impedance.link import Link, find_link
+from seaopt.control.impedance.moving_loop import MovingLoop, close_link
+from seaopt.control.laws.controller import Controller
+from seaopt.control.loops.outer_loop import Impedance
+from seaopt.errors import ControlError, require_number
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.units import mechanics_of
+
+SLOWEST_POLE, FASTEST_POLE = 1e-4, 1.2  # p T of the double pole, looked at
+POLES = 800
+SAME_POLE = 1e-6  # to which the two poles of a double one are computed
+NEWTON_STEPS, SMALL_STEP = 4, 1e-6
+
+
+@record(eq=False)
+class CriticalImpedances:
+    """Stiffness and damping of links whose slowest poles are one double real pole, from soft to stiff.
+
+    Parameters
+    ----------
+    stiffness, damping : arrays, shape (n,)
+    rate : array, shape (n,)
+        The double pole, rad/s.
+
+    """
+
+    stiffness: Float[np.ndarray, " n"]
+    damping: Float[np.ndarray, " n"]
+    rate: Float[np.ndarray, " n"]
+
+
+def critical_impedance(
+    controller: Controller, plant: Plant, parameters: ParameterSet, stiffness: float, *,
+    velocity_filter_s: float | None = None,
+) -> Impedance:  # fmt: skip
+    """Return the damping that makes a stiffness at the link critically damped: its slowest poles are one double one.
+
+    Parameters
+    ----------
+    controller : Controller
+        Tuned, or a law of one's own (`seaopt.assess`).
+    plant, parameters
+        The actuator with its link, which moves; linearised at rest, sliding where it has friction.
+    stiffness : float
+        K_v, N/m or N m/rad.
+    velocity_filter_s : float, optional
+        T_v of the speed; one sample if left out.
+
+    Returns
+    -------
+    Impedance
+
+    Raises
+    ------
+    ControlError
+        The link does not move, or there is no such impedance; the error names the stiffnesses that have one.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> knee, values = so.plants.rotary(), so.plants.rotary().defaults.update(N=50.0, k_s=300.0, d_l=1.0)
+    >>> force = so.tune(so.plants.rotary("locked"), values, so.ControllerSpec(measured="tau_s", bandwidth_hz=20))
+    >>> critical_impedance(force, knee, values, 20.0).damping > 0
+    True
+
+    """
+    require_number(stiffness, "stiffness", ControlError)
+    link = find_link(controller, plant, parameters)
+    asked = Impedance(stiffness=stiffness, damping=0.0, velocity_filter_s=velocity_filter_s)
+    return find_critical(link, asked.filter_for(link.sample_time_s), stiffness)
+
+
+def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
+    """Return critically damped impedances up to the stiffest, beyond which another pole is slower.
+
+    Parameters
+    ----------
+    link : Link
+        Actuator, law and link.
+    velocity_filter_s : float
+        T_v.
+
+    """
+    p = np.geomspace(SLOWEST_POLE, FASTEST_POLE, POLES)
+    loop = close_link(link, velocity_filter_s)
+    k, d = _place(loop, link, velocity_filter_s, p)
+    good = np.isfinite(k) & np.isfinite(d) & (k > 0.0)
+    poles = np.sort(np.abs(loop.eigenvalues(np.where(good, k, 0.0), np.where(good, d, 0.0))), axis=-1)
+    good &= poles[:, -1] <= np.exp(-p) * (1.0 + SAME_POLE)
+    kept = np.flatnonzero(good)
+    if kept.size:  # without gaps, and while it gets stiffer
+        first = kept[0]
+        run = good[first:] & np.concatenate([[True], np.diff(k[first:]) > 0.0])
+        kept = first + np.arange(run.size if np.all(run) else int(np.argmin(run)))
+    return CriticalImpedances(stiffness=k[kept], damping=d[kept], rate=p[kept] / link.sample_time_s)
+
+
+def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Impedance:
+    """Return the critically damped impedance of a stiffness.
+
+    Parameters
+    ----------
+    link : Link
+        Actuator, law and link.
+    velocity_filter_s : float
+        T_v.
+    stiffness : float
+        K_v.
+
+    Raises
+    ------
+    ControlError
+        There is none of this stiffness; the error names those that there are.
+
+    """
+    scan = scan_critical(link, velocity_filter_s)
+    known = scan.stiffness
+    unit = mechanics_of(link.port.place_unit).stiffness
+    if not known.size:
+        raise ControlError(
+            f"stiffness = {stiffness:g} {unit}: the link is critically damped at no stiffness, its force loop having a "
+            "slower pole; give damping a number, or tune a faster force loop"
+        )
+    if not known[0] <= stiffness <= known[-1]:
+        raise ControlError(
+            f"stiffness = {stiffness:g} {unit} has no critically damped impedance; under this force law there is one "
+            f"from {known[0]:.4g} to {known[-1]:.4g} {unit}"
+        )
+    loop = close_link(link, velocity_filter_s)
+    p = float(np.interp(stiffness, known, scan.rate)) * link.sample_time_s
+    for _ in range(NEWTON_STEPS):  # the table is fine enough for Newton's method on K_v(p)
+        k, _ = _place(loop, link, velocity_filter_s, np.array([p, p * (1.0 + SMALL_STEP)]))
+        p += (stiffness - float(k[0])) * SMALL_STEP * p / float(k[1] - k[0])
+    damping = float(_place(loop, link, velocity_filter_s, np.array([p]))[1][0])
+    return Impedance(stiffness=stiffness, damping=damping, velocity_filter_s=velocity_filter_s)
+
+
+def _place(
+    loop: MovingLoop, link: Link, velocity_filter_s: float, p: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return K_v and D_v of double poles at z = exp(-p)."""
+    outer = link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
+    z = np.exp(-p)
+    inner = z[:, None, None] * np.eye(loop.position.size) - loop.fixed
+    once = np.linalg.solve(inner, np.broadcast_to(loop.reference[:, None], (z.size, loop.position.size, 1)))
+    twice = np.linalg.solve(inner, once)[:, :, 0]
+    x, slope = once[:, :, 0] @ loop.position, -(twice @ loop.position)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        n, n_slope = -1.0 / (loop.direction * x), slope / (loop.direction * x**2)
+        d = n_slope / outer.difference_slope(z)
+        return n - d * np.real(outer.difference(z.astype(complex))), d

@@ -1,0 +1,148 @@
+r"""The sampled loop of an impedance controller on a link that moves, against an environment.
+
+The link with its environment is an inertia on a spring and a damper, :math:`F_e = -(m \dot v + d v + k x)`, sampled
+exactly behind the hold. The closed loop's matrix is affine in the gains, :math:`M = M_0 + K_v M_K + D_v M_D`, so that
+maps of them are batches of eigenvalues.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.impedance.link import Link, Load
+from seaopt.control.loops.outer_loop import Impedance
+from seaopt.control.loops.sampled_plant import hold
+from seaopt.records import record
+
+Matrix = Float[np.ndarray, "n n"]
+
+
+@record(eq=False)
+class MovingLoop:
+    """x+ = (m_0 + K_v m_stiffness + D_v m_damping) x + b x_0 K_v, link position = c x.
+
+    Parameters
+    ----------
+    fixed, by_stiffness, by_damping : arrays, shape (n, n)
+    reference : array, shape (n,)
+        The effect of the force law's reference.
+    position : array, shape (n,)
+        The link's position.
+    direction, sample_time_s : float
+
+    """
+
+    fixed: Matrix
+    by_stiffness: Matrix
+    by_damping: Matrix
+    reference: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, " n"]
+    direction: float
+    sample_time_s: float
+
+    def matrix(self, stiffness: Any, damping: Any) -> Float[np.ndarray, "... n n"]:
+        """Return the closed loop's matrix, of arrays of gains as a stack."""
+        k, d = np.asarray(stiffness, dtype=float), np.asarray(damping, dtype=float)
+        return self.fixed + k[..., None, None] * self.by_stiffness + d[..., None, None] * self.by_damping
+
+    def eigenvalues(self, stiffness: Any, damping: Any) -> Complex[np.ndarray, "... n"]:
+        """Return the closed loop's eigenvalues."""
+        return np.linalg.eigvals(self.matrix(stiffness, damping)).astype(complex)
+
+    def radius(self, stiffness: Any, damping: Any) -> Any:
+        """Return the largest magnitude of the closed loop's eigenvalues."""
+        return np.max(np.abs(self.eigenvalues(stiffness, damping)), axis=-1)
+
+    def step(self, impedance: Impedance, samples: int) -> Float[np.ndarray, " samples"]:
+        """Return the link's position, sample by sample, after a unit step of x_0."""
+        a = self.matrix(impedance.stiffness, impedance.damping)
+        drive = self.reference * (self.direction * impedance.stiffness)
+        x, out = np.zeros(drive.size), np.empty(samples)
+        for k in range(samples):
+            out[k] = self.position @ x
+            x = a @ x + drive
+        return out
+
+
+def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
+    """Return the loop of a link, with an outer loop of any gains, against an environment.
+
+    Parameters
+    ----------
+    link : Link
+        Actuator, law and link.
+    velocity_filter_s : float
+        T_v.
+    load : Load, optional
+        What is on the port, the link's own inertia included; the link alone if left out.
+
+    """
+    load = link.load if load is None else load
+    port, law, period = link.port, link.law, link.sample_time_s
+    n = port.motor.size
+    share = port.mass / load.inertia  # F_e of the load acts on the probe's inertia, which is part of the load's
+    taken = -share * ((load.inertia - port.mass) * port.a[port.speed])
+    taken[port.speed] -= share * load.damping
+    taken[port.place] -= share * load.stiffness
+    pushed = -share * (load.inertia - port.mass) * port.motor[port.speed]
+    a, b = port.a + np.outer(port.force, taken), port.motor + port.force * pushed
+    c = port.feedback[:n] + port.feedback[n + 1] * taken
+    d = port.feedback[n] + port.feedback[n + 1] * pushed
+    place = np.zeros(n)
+    place[port.place] = 1.0
+    delay = np.array([port.delay_s])
+    big, late, read, through = (part[0] for part in hold(a[None], b[None], c[None], np.array([d]), period, delay))
+    seen = hold(a[None], b[None], place[None], np.zeros(1), period, delay)[2][0]
+    return _assemble(link, velocity_filter_s, (big, late, read, float(through), seen), law.c.size)
+
+
+def _assemble(link: Link, velocity_filter_s: float, plant: Any, order: int) -> MovingLoop:
+    """Return the loop of a sampled plant (a, b, force row, its feedthrough, position row)."""
+    big, late, read, through, seen = plant
+    law, wait = link.law, link.delay_samples
+    outer = link.outer(Impedance(stiffness=0.0, damping=0.0, velocity_filter_s=velocity_filter_s))
+    n = late.size
+    size = n + wait + order + 1
+    inner, speed = slice(n + wait, n + wait + order), size - 1
+    # Rows over the states (plant, commands under way, law, filter): the command that acts now, force, effort, position.
+    acts, force, place = np.zeros(size), np.zeros(size), np.zeros(size)
+    force[:n], place[:n] = read, seen
+    effort = np.zeros(size)
+    effort[inner] = law.c
+    if wait:
+        acts[n + wait - 1] = 1.0
+        force = force + through * acts
+        gain = 1.0
+    else:
+        gain = 1.0 / (1.0 - law.d[1] * through)
+    effort = gain * (effort + law.d[1] * force)
+    per_reference = gain * law.d[0]  # of the effort
+    if not wait:
+        acts = effort
+        force = force + through * effort
+    matrix, drive = np.zeros((size, size)), np.zeros(size)
+    matrix[:n, :n] = big
+    matrix[:n] += np.outer(late, acts)
+    if wait:
+        matrix[n] = effort
+        drive[n] = per_reference
+        for i in range(1, wait):
+            matrix[n + i, n + i - 1] = 1.0
+        force_per_reference = 0.0
+    else:
+        drive[:n] = late * per_reference
+        force_per_reference = through * per_reference
+    matrix[inner, inner] = law.a
+    matrix[inner] += np.outer(law.b[:, 1], force)
+    drive[inner] = law.b[:, 0] + law.b[:, 1] * force_per_reference
+    filtered = outer.rate * place
+    filtered[speed] += 1.0
+    matrix[speed] = outer.pole * filtered - outer.rate * place
+    return MovingLoop(
+        fixed=matrix, by_stiffness=-link.direction * np.outer(drive, place),
+        by_damping=-link.direction * np.outer(drive, filtered), reference=drive, position=place,
+        direction=link.direction, sample_time_s=link.sample_time_s,
+    )  # fmt: skip

@@ -1,0 +1,134 @@
+r"""The outer loop of an impedance: stiffness and damping at the link, as a reference for the force loop.
+
+.. math:: F_\mathrm{ref} = \sigma \left( K_v (x_0 - x) - D_v D(q) x \right), \qquad
+          D(q) = \frac{1}{T_v + T_s}\, \frac{1 - q}{1 - q\, T_v/(T_v + T_s)}, \qquad q = z^{-1}
+
+x is the link's position as sampled, m or rad, and D(q) its filtered backward difference, as in
+`seaopt.control.laws.structures`. :math:`\sigma` is the measured effort per effort on the link, so that a positive
+:math:`K_v` pulls the link to :math:`x_0`: 1 for a rotary actuator, -1 for a linear one, whose link 2 feels -F.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.errors import ControlError, require_number
+from seaopt.records import record
+
+
+@record
+class Impedance:
+    """A stiffness and a damping to be rendered at the link.
+
+    Parameters
+    ----------
+    stiffness : float
+        K_v, N/m or N m/rad; zero or more.
+    damping : float
+        D_v, N s/m or N m s/rad; below zero it takes damping away.
+    velocity_filter_s : float, optional
+        T_v, seconds, of the speed that is computed from the position; one sample if left out.
+
+    Raises
+    ------
+    ControlError
+        A number is not finite, or the stiffness or the filter is negative.
+
+    Examples
+    --------
+    >>> Impedance(stiffness=50.0, damping=2.0).stiffness
+    50.0
+
+    """
+
+    stiffness: float
+    damping: float
+    velocity_filter_s: float | None = None
+
+    def __post_init__(self) -> None:
+        filter_s = 0.0 if self.velocity_filter_s is None else self.velocity_filter_s
+        given = {"stiffness": self.stiffness, "damping": self.damping, "velocity_filter_s": filter_s}
+        for name, number in given.items():
+            value = require_number(number, name, ControlError)
+            if not np.isfinite(value):
+                raise ControlError(f"{name} = {value:g} is not finite; give a number")
+            if name != "damping" and value < 0.0:
+                raise ControlError(f"{name} = {value:g} is negative; give zero or more")
+
+    def filter_for(self, sample_time_s: float) -> float:
+        """Return T_v at a sample time."""
+        return sample_time_s if self.velocity_filter_s is None else self.velocity_filter_s
+
+
+@record
+class OuterLoop:
+    """The outer loop as it runs, once a sample, before the force law.
+
+    Parameters
+    ----------
+    stiffness, damping : float
+        K_v and D_v.
+    velocity_filter_s : float
+        T_v.
+    direction : float
+        The measured effort per effort on the link.
+    sample_time_s : float
+        Seconds.
+    place_unit : str
+        Of the position: m or rad.
+
+    Examples
+    --------
+    >>> outer = OuterLoop(
+    ...     stiffness=10.0, damping=1.0, velocity_filter_s=0.0, direction=1.0, sample_time_s=0.1, place_unit="rad"
+    ... )
+    >>> reference, state = outer.step(outer.reset(0.0), 1.0, 0.2)
+    >>> reference  # 10 (1 - 0.2) - (0.2 - 0)/0.1
+    6.0
+
+    """
+
+    stiffness: float
+    damping: float
+    velocity_filter_s: float
+    direction: float
+    sample_time_s: float
+    place_unit: str
+
+    @property
+    def pole(self) -> float:
+        """What the filtered speed keeps from one sample to the next."""
+        return self.velocity_filter_s / (self.velocity_filter_s + self.sample_time_s)
+
+    @property
+    def rate(self) -> float:
+        """What a step of the position adds to the filtered speed, 1/s."""
+        return 1.0 / (self.velocity_filter_s + self.sample_time_s)
+
+    def reset(self, position: float) -> float:
+        """Return the state of a link at rest: what is taken off the next difference."""
+        return -self.rate * position
+
+    def step(self, state: float, reference: float, position: float) -> tuple[float, float]:
+        """Return the force law's reference of this sample, and the next state.
+
+        Parameters
+        ----------
+        state : float
+            Of `reset`, or of the last step.
+        reference, position : float
+            x_0 and x, m or rad.
+
+        """
+        speed = state + self.rate * position
+        asked = self.direction * (self.stiffness * (reference - position) - self.damping * speed)
+        return asked, self.pole * speed - self.rate * position
+
+    def difference(self, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return D at points of the z plane."""
+        return self.rate * (z - 1.0) / (z - self.pole)
+
+    def difference_slope(self, z: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Return dD/dz."""
+        return self.rate * (1.0 - self.pole) / (z - self.pole) ** 2
