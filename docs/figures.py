@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -166,7 +167,10 @@ def verification() -> None:
     stand, swing, params = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
     spec = so.ControllerSpec(bandwidth_hz=30.0, max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
     controller = so.tune(stand, params, spec, robust_to={"swing": swing})
-    found = [large_signal(controller, plant, params) for plant in (stand, swing)]
+    found = [
+        replace(large_signal(controller, plant, params), plant=name)
+        for name, plant in (("stand", stand), ("swing", swing))
+    ]
     drawn = [panel for sweep in found for panel in (amplitude_panel(sweep), saturation_panel(sweep))]
     save(compose_sheet(drawn), "large_signal")
     save(compose_sheet(environment_panels(coupled_stability(controller, stand, params))), "environments")
