@@ -8,13 +8,15 @@ import os
 import re
 import secrets
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from seaopt.errors import FileError
+from seaopt.errors import FileError, SeaoptError
 
+MOST_BYTES = 64 << 20  # of a file that is read as one text: problems, laws, results
 # What JSON may hold raw and a terminal would obey, and halves of characters, which are in names that are no text.
 _ESCAPED = re.compile(r"[\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
@@ -117,7 +119,49 @@ def write_json(path: Path | str, content: dict[str, Any]) -> Path:
     return write_text(path, to_json(content))
 
 
-def read_json(path: Path | str, schema: str) -> dict[str, Any]:
+def parse_file(
+    path: Path | str, parse: Callable[[str], Any], form: str, *, remedy: str, error: type[SeaoptError] = FileError
+) -> Any:
+    """Read a small file of text and parse it, or say in one line why that cannot be.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    parse : callable
+        `json.loads` or `tomllib.loads`.
+    form : str
+        What it should be: "JSON" or "TOML".
+    remedy : str
+        Where such a file comes from.
+    error : type of SeaoptError
+        What is raised.
+
+    Raises
+    ------
+    SeaoptError
+        The file is missing, is no regular file, is larger than `MOST_BYTES`, or is not what it should be.
+
+    """
+    source = Path(path)
+    check_regular(source)
+    try:
+        if source.stat().st_size > MOST_BYTES:
+            raise error(f"{source}: is larger than {MOST_BYTES >> 20} MB, is it {form}?; {remedy}")
+        text = source.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as problem:
+        raise error(f"{source}: no such file; {remedy}") from problem
+    except OSError as problem:
+        raise error(f"{source}: cannot be read ({describe_os_error(problem)}); {remedy}") from problem
+    except ValueError as problem:  # bytes that are no text, or a path that no system has
+        raise error(f"{source}: cannot be read as UTF-8 text ({problem}); {remedy}") from problem
+    try:
+        return parse(text)
+    except (ValueError, RecursionError) as problem:  # also a number of more digits than Python reads
+        raise error(f"{source}: is not valid {form} ({problem}); correct that place, or {remedy}") from problem
+
+
+def read_json(path: Path | str, schema: str, *, remedy: str = "run its stage again") -> dict[str, Any]:
     """Read a result file and check its "schema" field.
 
     Raises
@@ -127,16 +171,8 @@ def read_json(path: Path | str, schema: str) -> dict[str, Any]:
 
     """
     source = Path(path)
-    check_regular(source)
-    try:
-        content = json.loads(source.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise FileError(f"{source}: no such file; run the earlier stage first") from error
-    except OSError as error:
-        raise FileError(f"{source}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise FileError(f"{source}: not valid JSON ({error}); run its stage again") from error
+    content = parse_file(source, json.loads, "JSON", remedy=remedy)
     found = content.get("schema") if isinstance(content, dict) else None
     if found != schema:
-        raise FileError(f'{source}: schema is {found!r}, expected "{schema}"; run its stage again with this version')
+        raise FileError(f'{source}: schema is {found!r}, expected "{schema}"; {remedy}')
     return content

@@ -13,9 +13,8 @@ from seaopt.estimation.result.findings import FitFinding
 from seaopt.formatting import format_count, format_number
 from seaopt.records import record
 from seaopt.robustness import Certificate
-from seaopt.robustness.certificate.certificate import Requirement
+from seaopt.robustness.certificate.failures import Failure, group_failures
 
-STABILITY = "spectral_radius"
 FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
 DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
@@ -134,7 +133,7 @@ def judge_certificate(certificate: Certificate, again: str, sweep: str) -> Stage
         text = f"Certificate: passed, {draws.failures} failures in {draws.samples} draws{bound}{runs}"
         return StageVerdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
-    reasons = group_requirements(broken)
+    reasons = [explain_failure(one) for one in group_failures(broken)]
     remedies = [_advise(row.name) for row in broken]
     first = next((text for text in remedies if text), "")
     command = f"type {again}" if not first else f"{first}; then type {again}"
@@ -150,39 +149,14 @@ def _advise(name: str) -> str:
     return BY_REQUIREMENT[name].remedy if name in BY_REQUIREMENT else REMEDIES.get(name, "")
 
 
-def group_requirements(broken: Sequence[Requirement]) -> list[Reason]:
-    """Return each requirement that is not met once, by its worst case, with the number of places where it is not.
-
-    Of a plant that is unstable only that is said: that it has no margins follows.
-    """
-    unstable = [row for row in broken if row.name == STABILITY]
-    if unstable:
-        plants = ", ".join(dict.fromkeys(row.where.split(":")[0] for row in unstable))
-        rest = [row for row in broken if row.name != STABILITY and math.isfinite(row.value)]
-        follows = len(broken) - len(unstable) - len(rest)
-        more = f"; {format_count(follows, 'more requirement')} cannot be met then" if follows else ""
-        first = [Reason(what=f"unstable on {plants}", where=f"tune with that plant in robust_to{more}")]
-    else:
-        first, rest = list[Reason](), list(broken)
-    named: dict[str, list[Requirement]] = {}
-    for row in rest:
-        named.setdefault(row.name, []).append(row)
-    return first + [_describe(rows) for rows in named.values()]
-
-
-def _describe(rows: Sequence[Requirement]) -> Reason:
-    worst = max(rows, key=_overshoot)
-    value, limit = format_number(worst.value, 4), format_number(worst.limit, 4)
-    return Reason(what=f"{worst.name} {value}, limit {worst.sense} {limit}", where=worst.where, count=len(rows))
-
-
-def _overshoot(row: Requirement) -> float:
-    """Return by how much a requirement is missed, as a ratio."""
-    if not math.isfinite(row.value):
-        return math.inf
-    if row.sense == "≥":
-        return row.limit / row.value if row.value > 0.0 else math.inf
-    return row.value / row.limit if row.limit > 0.0 else row.value
+def explain_failure(failure: Failure) -> Reason:
+    """Return what a certificate fails on, by its worst case."""
+    row = failure.worst
+    if failure.unstable:
+        what = f"unstable on {', '.join(failure.places)}"
+        return Reason(what=what, where=f"tune with that plant in robust_to{failure.consequence}")
+    value, limit = format_number(row.value, 4), format_number(row.limit, 4)
+    return Reason(what=f"{row.name} {value}, limit {row.sense} {limit}", where=row.where, count=failure.count)
 
 
 def _group(pairs: Iterable[tuple[str, str]]) -> list[Reason]:

@@ -17,7 +17,7 @@ from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_l
 from seaopt.control import ControllerSpec, Notch
 from seaopt.control import draw as draw_values
 from seaopt.documents import check_table
-from seaopt.errors import ProblemError, SeaoptError, UnitError, require_type, suggestion
+from seaopt.errors import FileError, ProblemError, SeaoptError, UnitError, require_type, suggestion
 from seaopt.estimation import (
     Experiment,
     Fit,
@@ -29,7 +29,7 @@ from seaopt.estimation import (
     SoftL1,
     Squares,
 )
-from seaopt.files import check_regular
+from seaopt.files import check_regular, parse_file
 from seaopt.formatting import join_words
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
@@ -56,7 +56,6 @@ from seaopt.robustness import place_value
 from seaopt.signals import Signal
 from seaopt.units import ROTARY, factor, same_dimension, unit_after
 
-MAX_BYTES = 4 << 20
 OWN = "parameter "  # before the name of a parameter that is read as a channel
 ROUNDED = 1e-9  # relative: a constant column that was interpolated to another clock
 
@@ -567,17 +566,9 @@ def _read_table(source: Path) -> ProblemTable:
 
 def _read_toml(source: Path) -> dict[str, Any]:
     try:
-        if source.is_dir():
-            found = next(iter(sorted(source.glob("*.toml"))), source / "problem.toml")
-            raise ProblemError(f"{source}: is a folder; give a problem file (TOML), such as {found}")
-        if source.stat().st_size > MAX_BYTES:
-            raise ProblemError(f"{source}: is larger than {MAX_BYTES >> 20} MB; give a problem file (TOML)")
         check_regular(source)
-        return tomllib.loads(source.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        remedy = f"check the path, or write one from a log: seaopt new LOG -o {source}"
-        raise ProblemError(f"{source}: no such file; {remedy}") from error
-    except OSError as error:
-        raise ProblemError(f"{source}: cannot be read ({error.strerror}); check the path") from error
-    except (ValueError, RecursionError) as error:  # also a number of more digits than Python reads
-        raise ProblemError(f"{source}: is not valid TOML ({error}); correct that place") from error
+    except FileError as error:
+        found = next(iter(sorted(source.glob("*.toml"))), "problem.toml")
+        raise ProblemError(f"{error}: seaopt run {found}") from error
+    remedy = f"write one from a log: seaopt new LOG -o {source}"
+    return parse_file(source, tomllib.loads, "TOML", remedy=remedy, error=ProblemError)

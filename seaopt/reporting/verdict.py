@@ -2,53 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.verdict import join_labels
 from seaopt.estimation import Fit
-from seaopt.formatting import format_count, format_number
-from seaopt.records import record
-from seaopt.reporting.figures.certificate import label_requirement, usage_of
+from seaopt.formatting import format_count, format_number, join_words
+from seaopt.reporting.figures.certificate import label_requirement
 from seaopt.robustness import Certificate
-from seaopt.robustness.certificate.certificate import Requirement
+from seaopt.robustness.certificate.failures import Failure, group_failures
 from seaopt.robustness.verification.verification import Verification
 
 Line = tuple[bool, str]
 
 
-@record
-class Failure:
-    """Requirements of one name that are not met: the worst of them, and how many there are."""
-
-    worst: Requirement
-    count: int
-
-    @property
-    def label(self) -> str:
-        """What is missed."""
-        return label_requirement(self.worst)
-
-    @property
-    def text(self) -> str:
-        """The figure against its limit, where, and how many more there are."""
-        row, more = self.worst, self.count - 1
-        against = {"≤": "above", "≥": "below"}.get(row.sense, "not")
-        others = "" if not more else f" (the worst of {self.count})"
-        size = f"{format_number(row.value)}, {against} {format_number(row.limit)}"
-        return f"{self.label} {size}{others}: {row.where}"
+def label_failure(failure: Failure) -> str:
+    """Return what is missed."""
+    return f"unstable on {join_words(failure.places)}" if failure.unstable else label_requirement(failure.worst)
 
 
-def group_failures(requirements: Sequence[Requirement]) -> list[Failure]:
-    """Return what is not met, each kind once with its worst case and its count, the worst first."""
-    kinds: dict[str, list[Requirement]] = {}
-    for row in requirements:
-        if not row.met:
-            kinds.setdefault(row.name, []).append(row)
-    failures = [
-        Failure(worst=max(rows, key=lambda row: usage_of(row) or 0.0), count=len(rows)) for rows in kinds.values()
-    ]
-    return sorted(failures, key=lambda one: -(usage_of(one.worst) or 0.0))
+def describe_failure(failure: Failure) -> str:
+    """Return the figure against its limit, where, and how many more there are."""
+    row = failure.worst
+    if failure.unstable:
+        return label_failure(failure) + failure.consequence
+    against = {"≤": "above", "≥": "below"}.get(row.sense, "not")
+    others = f" (the worst of {failure.count})" if failure.count > 1 else ""
+    size = f"{format_number(row.value)}, {against} {format_number(row.limit)}"
+    return f"{label_failure(failure)} {size}{others}: {row.where}"
 
 
 def verdict(
@@ -78,7 +57,7 @@ def _describe_certificate(certificate: Certificate) -> str:
     """Return what a certificate says in one line: the bound of its draws, or what it fails on."""
     draws = certificate.monte_carlo
     if not certificate.passed:
-        kinds = [f"{one.label}{f' ({one.count} times)' if one.count > 1 else ''}"
+        kinds = [label_failure(one) + (f" ({one.count} times)" if one.count > 1 and not one.unstable else "")
                  for one in group_failures(certificate.requirements)]  # fmt: skip
         return "failed – " + ", ".join(kinds)
     runs = "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulations passed"

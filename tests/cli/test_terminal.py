@@ -14,8 +14,9 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.cli.session import format_left
 from seaopt.cli.terminal import Terminal
-from seaopt.cli.verdicts import group_requirements
+from seaopt.cli.verdicts import explain_failure
 from seaopt.robustness.certificate.certificate import Requirement
+from seaopt.robustness.certificate.failures import group_failures
 
 
 def broken(name, value, limit, where):
@@ -24,14 +25,14 @@ def broken(name, value, limit, where):
 
 def test_the_same_failure_in_twelve_runs_is_said_once():
     rows = [broken("step_overshoot", 1.4 + 0.01 * k, 1.3, f"plant {k}, step") for k in range(12)]
-    (reason,) = group_requirements(rows)
+    (reason,) = map(explain_failure, group_failures(rows))
     assert (reason.count, reason.where) == (12, "plant 11, step")
     assert "1.51" in reason.what and "1.3" in reason.what
 
 
 def test_what_must_be_large_is_worst_where_it_is_least():
     rows = [broken("min_disk_margin", value, 0.7, str(value)) for value in (0.6, 0.2, 0.5)]
-    (reason,) = group_requirements(rows)
+    (reason,) = map(explain_failure, group_failures(rows))
     assert reason.where == "0.2"
 
 
@@ -42,7 +43,7 @@ def test_of_an_unstable_plant_only_that_is_said():
         broken("max_complementary", np.inf, 1.3, "swing"),
         broken("max_noise_gain", 30.0, 25.0, "stand"),
     ]
-    unstable, other = group_requirements(rows)
+    unstable, other = map(explain_failure, group_failures(rows))
     assert "swing" in unstable.what and "2 more" in unstable.where
     assert other.what.startswith("max_noise_gain 30")
 

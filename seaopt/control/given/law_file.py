@@ -17,10 +17,12 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Whole, check_table
 from seaopt.errors import ControlError, FileError
-from seaopt.files import check_regular
+from seaopt.files import parse_file
 from seaopt.records import record
 
 Positive = Annotated[Finite, Field(gt=0.0)]
+# A whole one, in one line.
+LAW_EXAMPLE = "sample_rate_hz = 1000, delay_samples = 1, pid = { k_p = 2.0, k_i = 30.0 }"
 PID_GAINS = {"parallel": ("k_p", "k_i", "k_d", "T_f"), "ideal": ("K", "T_i", "T_d", "N")}
 
 
@@ -217,16 +219,8 @@ def read_law(path: Path | str) -> GivenLaw:
 
     """
     source = Path(path)
-    check_regular(source)
-    try:
-        text = source.read_text(encoding="utf-8-sig")
-        content = json.loads(text) if source.suffix.lower() == ".json" else tomllib.loads(text)
-    except FileNotFoundError as error:
-        raise FileError(f"{source}: no such file; give the law's JSON or TOML") from error
-    except OSError as error:
-        raise FileError(f"{source}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise FileError(f"{source}: not valid {'JSON' if source.suffix == '.json' else 'TOML'} ({error})") from error
+    parse, form = (json.loads, "JSON") if source.suffix.lower() == ".json" else (tomllib.loads, "TOML")
+    content = parse_file(source, parse, form, remedy=f"give the law's file: {LAW_EXAMPLE}")
     return check_table(LawFile, content, str(source)).build(str(source))
 
 

@@ -16,12 +16,12 @@ from seaopt.reporting.figures.loop import Plants
 from seaopt.reporting.figures.panel import NAMES_LEFT, Panel
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import Requirement
+from seaopt.robustness.certificate.failures import usage_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_USED = 3.0  # times a limit: what is beyond stands at the edge
-NOT_SHARED = ("spectral_radius",)
 LOWEST_HZ = 0.05
 PORT_POINTS = 800
 
@@ -29,22 +29,6 @@ PORT_POINTS = 800
 def plants_of(certificate: Certificate) -> Plants:
     """Return the plants whose loops are measured, at the nominal parameters: one with friction sliding and stuck."""
     return {name: (plant, certificate.parameters) for name, plant in certificate.linear_models.items()}
-
-
-def usage_of(row: Requirement) -> float | None:
-    """Return which share of its limit a requirement uses, above 1 where it is not met; None where a share says nothing.
-
-    A stable loop's spectral radius is next to 1 however stable it is.
-    """
-    if not np.isfinite(row.value):
-        return None if row.met else np.inf
-    if row.name in NOT_SHARED or row.sense == "=":
-        return None if row.met else np.inf
-    if row.limit == 0.0:
-        return 0.0 if row.met else np.inf
-    if row.sense == "≥":
-        return row.limit / row.value if row.value > 0.0 else np.inf
-    return row.value / row.limit
 
 
 def label_requirement(row: Requirement) -> str:

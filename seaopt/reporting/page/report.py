@@ -31,8 +31,9 @@ from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.reporting.page.chart import Chart, make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_template
-from seaopt.reporting.verdict import group_failures, verdict
+from seaopt.reporting.verdict import describe_failure, verdict
 from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.failures import group_failures
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.judgement import Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal
@@ -322,7 +323,7 @@ def list_reasons(material: Material) -> list[str]:
         if one is not None and not one.feasible:
             reasons.append(one.explanation)
     if material.certificate is not None:
-        reasons += [one.text for one in group_failures(material.certificate.requirements)]
+        reasons += [describe_failure(one) for one in group_failures(material.certificate.requirements)]
     elif material.verification is not None:
         reasons += [f"{row.plant}, {row.scenario}: {row.reason}" for row in material.verification.failures[:1]]
     return reasons
