@@ -34,7 +34,9 @@ if TYPE_CHECKING:
     from seaopt.estimation import diagnose as diagnose
     from seaopt.estimation import fit as fit
     from seaopt.estimation import profile as profile
+    from seaopt.frequency import MeasuredResponse as MeasuredResponse
     from seaopt.frequency import h1 as h1
+    from seaopt.frequency import measure_response as measure_response
     from seaopt.logs import Column as Column
     from seaopt.logs import Log as Log
     from seaopt.logs import contents as contents
@@ -67,6 +69,8 @@ _HOME = {
     "Sensors": "seaopt.bench",
     "virtual_log": "seaopt.bench",
     "h1": "seaopt.frequency",
+    "MeasuredResponse": "seaopt.frequency",
+    "measure_response": "seaopt.frequency",
     "Experiment": "seaopt.estimation",
     "Huber": "seaopt.estimation",
     "SoftL1": "seaopt.estimation",
@@ -97,7 +101,8 @@ _HOME = {
 }
 __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "contents", "read_log", "write_log",
-    "simulate", "Sensors", "virtual_log", "h1", "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
+    "simulate", "Sensors", "virtual_log", "h1", "measure_response", "MeasuredResponse",
+    "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
     "PredictionError", "Fit", "fit", "diagnose", "compare", "profile", "bootstrap", "design_experiment",
     "ControllerSpec", "Controller", "corners", "tune", "assess", "export", "Certificate", "certify", "verify",
     "demo_path", "read_problem", "write_report", "testing", "SeaoptError",

@@ -220,7 +220,7 @@ def survey(
     """
     names = tuple(outputs) or tuple(name for name in plant.outputs if name in log.signals)
     sources = _excited_inputs(plant, log)
-    _check(log, (*sources, *names))
+    check_record(log, (*sources, *names))
     chosen = clock if clock is not None else Clock(period=log.period)
     pairs = [_pair(plant, log, chosen, source, name, stretch_s) for source in sources for name in names]
     return Survey(plant=plant, clock=chosen, gain=dict(gain or {}), pairs=tuple(pairs))
@@ -235,7 +235,15 @@ def _excited_inputs(plant: Plant, log: Log) -> list[str]:
     return excited
 
 
-def _check(log: Log, names: Sequence[str]) -> None:
+def check_record(log: Log, names: Sequence[str]) -> None:
+    """Refuse a log that has gaps, is too short for a frequency response, or lacks samples of some channels.
+
+    Raises
+    ------
+    LogError
+        As said.
+
+    """
     if len(log.segments) != 1:
         raise LogError(
             f"{log.source}: the log has {len(log.segments)} stretches between gaps and a frequency response takes one; "

@@ -10,6 +10,7 @@ import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
+from seaopt.control.laws.measured import MeasuredFigures
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
 from seaopt.control.laws.verdict import (
@@ -97,6 +98,9 @@ class Controller:
         Where it is not feasible: the bandwidths that keep the limits; None where none were looked for.
     friction : FrictionMargin or None
         Of the design plant; None where it has no friction.
+    measured : tuple of MeasuredFigures
+        What the law does on every measured response that it was tuned for. Where the design plant is one, `design` is
+        None, and `achieved` is the worst of the responses in its discs.
 
     """
 
@@ -118,6 +122,7 @@ class Controller:
     blocked_by: tuple[str, ...] = ()
     possible: PossibleBandwidths | None = None
     friction: FrictionMargin | None = None
+    measured: tuple[MeasuredFigures, ...] = ()
 
     @property
     def design_loop(self) -> MeasuredLoop:

@@ -10,6 +10,7 @@ import numpy as np
 
 from seaopt.control.laws.limits import Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.disc_loop import DiscLoop, bound_disc
 from seaopt.control.loops.loop import Loop
 from seaopt.formatting import format_count, join_words
 from seaopt.records import record
@@ -170,7 +171,7 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[Verdict]) -> list[str]:
     ]
 
 
-def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop) -> list[str]:
+def explain_broken(spec: Limits, verdicts: Sequence[Verdict], design: MeasuredLoop, loop: Loop | DiscLoop) -> list[str]:
     """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
 
     `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
@@ -246,7 +247,7 @@ def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[Desi
     return rows
 
 
-def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop) -> str:
+def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop | DiscLoop) -> str:
     limit, port = verdict.limit, design.port
     if limit.name == "stability":
         return limit.name
@@ -266,7 +267,7 @@ def _explain(spec: Limits, verdict: Verdict, design: MeasuredLoop, loop: Loop) -
     return f"{limit.name} {verdict.value:.{digits}g} of {verdict.allowed:g}"
 
 
-def _reached(spec: Limits, verdict: Verdict, loop: Loop) -> str:
+def _reached(spec: Limits, verdict: Verdict, loop: Loop | DiscLoop) -> str:
     """Return how far a curve is off its level: where it first crosses says little when it lies along the level."""
     curve = verdict.limit.curve
     assert curve is not None and curve.until_hz is not None
@@ -275,5 +276,8 @@ def _reached(spec: Limits, verdict: Verdict, loop: Loop) -> str:
     p, (c_r, response) = loop.plant.response(f), loop.law.responses(f)
     c_y = -response
     values = np.abs(curve.numerator(p, c_y, c_r, p * c_y)) / np.abs(1.0 + p * c_y)
+    if isinstance(loop, DiscLoop):
+        least, most = bound_disc(curve.of, p, loop.plant.discs(f), c_y, c_r)
+        values = least if curve.floor else most
     extreme = f"falls to {np.min(values):.4f}" if curve.floor else f"reaches {np.max(values):.4f}"
     return f"{curve.symbol} {extreme} below {until:.4g} Hz, {curve.level(verdict.allowed):.4f} allowed"

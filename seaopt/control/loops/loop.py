@@ -161,6 +161,10 @@ class Loop:
         """Return the closed loop's eigenvalues."""
         return self.system().poles
 
+    def is_stable(self) -> bool:
+        """Tell whether all of them are inside the unit circle."""
+        return bool(np.max(np.abs(self.eigenvalues()), initial=0.0) < STABLE)
+
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
         base = np.geomspace(GRID_LOWEST_HZ, self.plant.nyquist_hz, 1200)

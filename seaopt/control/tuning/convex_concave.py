@@ -33,7 +33,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
@@ -46,6 +46,7 @@ from seaopt.control.tuning.optimisation_problem import (
     LawNumbers,
     Task,
     choose_prominent,
+    use_disc,
 )
 from seaopt.records import record
 
@@ -53,6 +54,8 @@ MOST_PROGRAMS = 8
 ROWS_PER_LIMIT = 10  # per kind of limit
 FIRST_GAIN_RADIUS = 0.4  # trust region, as a fraction of the gains
 SMALLEST_GAIN_RADIUS = 0.01
+NEAR = 0.4  # of a limit: points that use less of it are left out
+STEP = 1e-5  # of C_y: of differences where responses lie in discs
 USAGE_PRICE = 20.0  # of one unit of usage beyond the limit, in logarithms of the objective
 
 
@@ -161,13 +164,18 @@ def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _L
 
     def chosen(name: str, plants: Complex[np.ndarray, "k m"] = grid.p) -> tuple[Any, Any, Any, Any]:
         """Return usage, plant response, law's columns, and 1 + L of the points that matter."""
-        index = choose_prominent(usage[name], ROWS_PER_LIMIT)
-        index = index[usage[name].ravel()[index] > 0.4]
+        index = choose_near(usage[name])
         p, column = plants.ravel()[index], index % m
         return usage[name].ravel()[index], p, column, 1.0 + p * law.c_y[column]
 
+    measured = bool(np.any(grid.discs))
     for name, curve in CURVES.items():
         used, p, column, one = chosen(name)
+        if measured:
+            slope = _differentiate_usage(task, grid, law, name, choose_near(usage[name]))
+            near_limit = curve.of == "1"
+            rows.add(2.0 - 1.0 / used if near_limit else used, slope / used[:, None] ** 2 if near_limit else slope)
+            continue
         c_y, c_r, by_y, by_r = law.c_y[column], law.c_r[column], law.by_y[:, column], law.by_r[:, column]
         near = _differentiate_size(one, p * by_y) / np.abs(one)[:, None]
         if curve.of == "1":  # the limit is on abs(1 + L) itself
@@ -187,6 +195,31 @@ def _linearise_limits(task: Task, grid: Grid, x: LawNumbers, law: _Affine) -> _L
         rows.add(used, used[:, None] * (_differentiate_size(c_y, by_y) / np.abs(c_y)[:, None] - near))
     _add_bandwidth(task, grid, x, law, rows)
     return rows
+
+
+def choose_near(usage: Float[np.ndarray, "k m"]) -> Int[np.ndarray, " c"]:
+    """Return flat indices of the points of a limit that are given to the program."""
+    index = choose_prominent(usage, ROWS_PER_LIMIT)
+    return index[usage.ravel()[index] > NEAR]
+
+
+def _differentiate_usage(
+    task: Task, grid: Grid, law: _Affine, name: str, index: Int[np.ndarray, " c"]
+) -> Float[np.ndarray, "c 5"]:
+    """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
+    curve, column = CURVES[name], index % grid.f.size
+    p, discs, level = grid.p.ravel()[index], grid.discs.ravel()[index], task.level(name, grid.f[column])
+    slope = np.zeros((index.size, 5))
+    for k in range(5):
+        by_y, by_r = law.by_y[k, column], law.by_r[k, column]
+        size = np.maximum(np.abs(by_y), np.abs(by_r))
+        step = STEP * np.maximum(np.abs(law.c_y[column]), 1e-9) / np.maximum(size, 1e-300)
+        ends: list[Float[np.ndarray, " c"]] = []
+        for sign in (1.0, -1.0):
+            c_y, c_r = (c[column] + sign * step * by for c, by in ((law.c_y, by_y), (law.c_r, by_r)))
+            ends.append(use_disc(curve, level, p, discs, c_y, c_r))
+        slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
+    return slope
 
 
 def _add_bandwidth(task: Task, grid: Grid, x: LawNumbers, law: _Affine, rows: _LinearLimits) -> None:

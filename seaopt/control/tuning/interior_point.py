@@ -22,7 +22,9 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
+from seaopt.control.loops.disc_loop import leave_positive
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     FRICTION,
@@ -97,6 +99,10 @@ class _Complex:
         """Return the squared magnitude."""
         return self.re * self.re + self.im * self.im
 
+    def conjugate(self) -> _Complex:
+        """Return the conjugate."""
+        return _Complex(self.re, -self.im)
+
 
 def refine(task: Task, grid: Grid, start: LawNumbers, rounds: int = 5) -> LawNumbers:
     """Return the numbers at a local optimum, or the start if no better ones are found.
@@ -163,7 +169,7 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
 
 @lru_cache(maxsize=32)
 def _build_program(
-    quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool, friction: bool
+    quadrature: int, observer: bool, notch: bool, noise: bool, passive: bool, friction: bool, discs: bool
 ) -> tuple[Any, list[str]]:
     """Return the IPOPT solver and the names of its data, in order."""
     kinds = (*CURVES, *([PASSIVE] * passive), *([FRICTION] * friction))
@@ -172,7 +178,7 @@ def _build_program(
     shapes = {
         "p_re": total, "p_im": total, "q_re": total, "q_im": total, "kept_re": total, "kept_im": total, "inv_re": total,
         "inv_im": total, "weight": quadrature, "ln_level": n, "at": 8, "ts": 1, "kff": 1, "scale": 10, "linear": 15,
-        "unit": 2 * POINTS_PER_LIMIT * passive,
+        "unit": 2 * POINTS_PER_LIMIT * passive, "discs": n * discs,
     }  # fmt: skip
     data = {name: ca.MX.sym(name, rows) for name, rows in shapes.items()}
     v, t, slack = ca.MX.sym("v", 10), ca.MX.sym("t"), ca.MX.sym("slack")
@@ -208,6 +214,10 @@ def _build_program(
             usage[kind] = 0.5 * ca.log(size) - data["ln_level"][where]
             continue
         curve = CURVES[kind]
+        if discs:
+            size = _bound_disc(curve, p, data["discs"], c_y, c_r)[where]
+            usage[kind] = data["ln_level"][where] - size if curve.floor else size - data["ln_level"][where]
+            continue
         value = curve.numerator(p, c_y, c_r, open_loop)
         top = value.square()[where] if isinstance(value, _Complex) else value
         size = 0.5 * ca.log((top + SMOOTHING) / distance[where]) - data["ln_level"][where]
@@ -239,11 +249,35 @@ def _build_program(
     return ca.nlpsol("polish", "ipopt", nlp, options), list(data)
 
 
+def _bound_disc(curve: LimitCurve, p: _Complex, r: Any, c_y: _Complex, c_r: _Complex) -> Any:
+    """Return the logarithm of the largest (of a floor the least) X/(1 + L) of discs: `disc_loop.bound_disc`."""
+    open_loop = p * c_y
+    a, reach = open_loop + 1.0, r * ca.sqrt(c_y.square() + SMOOTHING)
+    size, back = a.square() + SMOOTHING, a.conjugate()
+    room = size * leave_positive(1.0 - reach * reach / size, ca.fmin, ca.fmax)
+    match curve.of:
+        case "1":
+            centre, radius = back, reach
+        case "L":
+            centre, radius = open_loop * back - reach * reach, reach
+        case "1 - L":
+            centre, radius = (1.0 - open_loop) * back + reach * reach, 2.0 * reach
+        case "C_y":
+            centre, radius = c_y * back, reach * ca.sqrt(c_y.square() + SMOOTHING)
+        case "P C_r":
+            centre = c_r * (p * back - c_y.conjugate() * (r * r))
+            radius = r * ca.sqrt(c_r.square() + SMOOTHING)
+    far = ca.sqrt(centre.square() + SMOOTHING)
+    top = far * leave_positive(1.0 - radius / far, ca.fmin, ca.fmax) if curve.floor else far + radius
+    return ca.log(top / room)
+
+
 def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.ndarray, " n"]]) -> LawNumbers | None:
     """Solve the program on the chosen points; None if its answer is not of numbers."""
     spec, noise = task.spec, task.spec.objective == "noise"
     m, kinds, passive, friction = grid.f.size, (*CURVES,), task.port is not None, grid.friction_plant.size > 0
     flat = np.concatenate([chosen[kind] for kind in kinds])
+    radii = grid.discs.ravel()[flat]
     columns, p, unit = flat % m, grid.p.ravel()[flat], np.zeros(0, dtype=complex)
     levels = [task.level(kind, grid.f[chosen[kind] % m]) for kind in kinds]
     if passive:
@@ -255,6 +289,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         last = chosen[FRICTION]
         levels.append(grid.friction_level.ravel()[last])
         columns, p = np.concatenate([columns, last % m]), np.concatenate([p, grid.friction_plant.ravel()[last]])
+    radii = np.concatenate([radii, np.zeros(columns.size - radii.size)]) if np.any(grid.discs) else np.zeros(0)
     weights = np.zeros(0)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)
@@ -281,7 +316,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
     data = [
         *parts, weights, np.log(np.concatenate(levels)),
         np.array([part for z in one for part in (np.real(z), np.imag(z))]), [spec.sample_time_s], [task.k_ff], scale,
-        (linear * scale[GAINS] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit),
+        (linear * scale[GAINS] / rows[:, None]).ravel(order="F"), np.real(unit), np.imag(unit), radii,
     ]  # fmt: skip
     solver, _ = _build_program(
         weights.size,
@@ -290,6 +325,7 @@ def _solve(task: Task, grid: Grid, start: LawNumbers, chosen: dict[str, Int[np.n
         noise,
         passive,
         friction,
+        radii.size > 0,
     )
     used = max(float(np.max(curve)) for curve in task.usage(grid, start).values())
     value = task.objective(grid, start)

@@ -33,7 +33,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, MeasuredLoop, Scope
+from seaopt.control.laws.limits import BY_NAME, INTEGRAL_RAD_S, LIMITS, LimitCurve, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
 from seaopt.control.laws.structures import DisturbanceObserver, Gains, LawTerms, Nominal, Notch, evaluate_terms
@@ -44,9 +44,11 @@ from seaopt.control.loops.absolute_stability import (
     friction_margin,
     limit_feedback,
 )
+from seaopt.control.loops.disc_loop import DiscLoop, bound_disc
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import GROWING, STABLE, Loop
+from seaopt.control.loops.loop import GROWING, Loop, LoopFigures
+from seaopt.control.loops.measured_plant import MeasuredPlant
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.plants import Plant
@@ -59,6 +61,7 @@ SLOW_FREQUENCIES = 40  # frequencies below 0.1 Hz
 MORE_FREQUENCIES = 300  # about lightly damped modes
 LIGHT_DAMPING = 0.2  # damping ratio below which a mode is resolved
 NO_LIMIT = 1e9
+LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 NEARLY_KEPT = 1.001
 SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
@@ -86,6 +89,8 @@ class Grid:
         Frequencies in Hz, and exp(-j omega T_s).
     p : array, shape (plants, m)
         Plants with hold and delay; the first is the design plant.
+    discs : array, shape (plants, m)
+        Radii of the discs around them of those that are measured; zeros of models.
     rows : tuple of int
         Which of the task's plants they are.
     kept, inverse
@@ -100,6 +105,7 @@ class Grid:
     f: Float[np.ndarray, " m"]
     q: Complex[np.ndarray, " m"]
     p: Complex[np.ndarray, "n m"]
+    discs: Float[np.ndarray, "n m"]
     rows: tuple[int, ...]
     kept: Complex[np.ndarray, " m"]
     inverse: Complex[np.ndarray, " m"]
@@ -111,8 +117,8 @@ class Grid:
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
         return Grid(
-            f=self.f[index], q=self.q[index], p=self.p[:, index], rows=self.rows, kept=self.kept[index],
-            inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
+            f=self.f[index], q=self.q[index], p=self.p[:, index], discs=self.discs[:, index], rows=self.rows,
+            kept=self.kept[index], inverse=self.inverse[index], port=self.port[index], unit=self.unit[index],
             friction_plant=self.friction_plant[:, index],
             friction_level=self.friction_level[:, index],
         )  # fmt: skip
@@ -159,7 +165,7 @@ class Task:
     """
 
     spec: ControllerSpec
-    plants: tuple[DigitalPlant, ...]
+    plants: tuple[DigitalPlant | MeasuredPlant, ...]
     names: tuple[str, ...]
     k_ff: float
     nominal: Nominal | None
@@ -258,15 +264,14 @@ class Task:
         """Return the law of a vector, not balanced."""
         return self.gains(x).law(self.spec.structure, self.spec.sample_time_s)
 
-    def loop(self, x: LawNumbers, plant: int = 0) -> Loop:
+    def loop(self, x: LawNumbers, plant: int = 0) -> Loop | DiscLoop:
         """Return the loop around one plant."""
-        return Loop(plant=self.plants[plant], law=self.law_of(x))
+        return close_plant(self.plants[plant], self.law_of(x))
 
     def is_stable(self, x: LawNumbers) -> bool:
-        """Tell whether every plant's loop is stable, by its eigenvalues."""
+        """Tell whether every plant's loop is stable: by its eigenvalues, or by the turns of a measured one."""
         law = self.law_of(x)
-        loops = (Loop(plant=plant, law=law) for plant in self.plants)
-        return all(np.max(np.abs(loop.eigenvalues())) < STABLE for loop in loops)
+        return all(close_plant(plant, law).is_stable() for plant in self.plants)
 
     def grid(self, f: Float[np.ndarray, " m"], rows: Sequence[int] | None = None) -> Grid:
         """Return the responses of the plants, or of some of them, at frequencies."""
@@ -277,6 +282,7 @@ class Task:
             inverse = self.nominal.inverse_response(f, self.spec.sample_time_s)
         rows = tuple(range(len(self.plants)) if rows is None else rows)
         p = np.array([self.plants[row].response(f) for row in rows])
+        discs = np.array([measured_discs(self.plants[row], f) for row in rows])
         port, unit = np.zeros(f.size, dtype=complex), np.zeros(f.size, dtype=complex)
         if self.port is not None and self.spec.passive_band_hz is not None:
             low, high = self.spec.passive_band_hz
@@ -289,8 +295,8 @@ class Task:
         for k, one in enumerate(asked):
             plants[k], levels[k] = self._limit_feedback(one, f)
         return Grid(
-            f=f, q=q, p=p, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit, friction_plant=plants,
-            friction_level=levels,
+            f=f, q=q, p=p, discs=discs, rows=rows, kept=kept, inverse=inverse, port=port, unit=unit,
+            friction_plant=plants, friction_level=levels,
         )  # fmt: skip
 
     def _limit_feedback(
@@ -327,7 +333,9 @@ class Task:
         for position in range(len(grid.rows)):
             for name, curve in self.design_usage(grid, position, c_y, c_r).items():
                 rows.setdefault(name, []).append(curve)
-        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r) | self.friction_usage(grid, c_y)
+        everywhere = self.curves(SCOPES["every plant"], grid.f, grid.p, c_y, c_r, grid.discs) | self.friction_usage(
+            grid, c_y
+        )
         return everywhere | {name: np.array(curves) for name, curves in rows.items()}
 
     def curves(
@@ -337,13 +345,18 @@ class Task:
         p: Complex[np.ndarray, "*k m"],
         c_y: Complex[np.ndarray, "*n m"],
         c_r: Complex[np.ndarray, "*n m"],
+        discs: Float[np.ndarray, "*k m"],
     ) -> dict[str, np.ndarray]:
-        """Return the usage of some limits on plants p."""
+        """Return the usage of some limits on plants p, the worst of what lies in the discs around them."""
         open_loop = p * c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
+        measured = bool(np.any(discs))
         for name in names:
             curve = CURVES[name]
+            if measured:
+                out[name] = use_disc(curve, self.level(name, f), p, discs, c_y, c_r)
+                continue
             size, allowed = np.abs(curve.numerator(p, c_y, c_r, open_loop)), self.level(name, f) * distance
             out[name] = allowed / np.maximum(size, 1e-12) if curve.floor else size / allowed
         return out
@@ -362,7 +375,7 @@ class Task:
     ) -> dict[str, np.ndarray]:
         """Return the usage of the limits that one of the grid's plants keeps as the design plant, sliding or stuck."""
         row = grid.rows[position]
-        out = self.curves(self.design_limits(row), grid.f, grid.p[position], c_y, c_r)
+        out = self.curves(self.design_limits(row), grid.f, grid.p[position], c_y, c_r, grid.discs[position])
         return out | (self.port_usage(grid, c_y) if row == 0 else {})
 
     def design_limits(self, row: int) -> tuple[str, ...]:
@@ -419,11 +432,15 @@ class Task:
             slopes = {one.plant: margin.least_slope for one, margin in margins}
         return [
             MeasuredLoop(
-                name=name, figures=Loop(plant=self.plants[i], law=law).figures(), port=None if i else port,
+                name=name, figures=self._figures(i, law), port=None if i else port,
                 filter_samples=filter_samples, integral_rad_s=integral_rad_s, friction_slope=slopes.get(i, np.inf),
             )
             for i, name in enumerate(self.names)
         ]  # fmt: skip
+
+    def _figures(self, row: int, law: Law) -> LoopFigures:
+        loop = close_plant(self.plants[row], law)
+        return loop.figures(self.spec.bandwidth_hz) if isinstance(loop, DiscLoop) else loop.figures()
 
     def weights(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
@@ -461,17 +478,43 @@ def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:
     return (low, high) if fixed is None else (fixed, fixed)
 
 
-def find_light_modes(plant: DigitalPlant) -> list[tuple[float, float]]:
-    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly."""
+def close_plant(plant: DigitalPlant | MeasuredPlant, law: Law) -> Loop | DiscLoop:
+    """Return the loop of a law around a plant, a model or a measured one."""
+    return DiscLoop(plant=plant, law=law) if isinstance(plant, MeasuredPlant) else Loop(plant=plant, law=law)
+
+
+def use_disc(
+    curve: LimitCurve, level: Float[np.ndarray, "..."], p: Complex[np.ndarray, "..."], discs: Float[np.ndarray, "..."],
+    c_y: Complex[np.ndarray, "..."], c_r: Complex[np.ndarray, "..."],
+) -> Float[np.ndarray, "..."]:  # fmt: skip
+    """Return the usage of a limit by the worst of the responses in discs."""
+    least, most = bound_disc(curve.of, p, discs, c_y, c_r)
+    return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
+
+
+def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return the radii of the discs around a plant's responses; zeros of a model."""
+    return plant.discs(f) if isinstance(plant, MeasuredPlant) else np.zeros(f.size)
+
+
+def find_light_modes(plant: DigitalPlant | MeasuredPlant) -> list[tuple[float, float]]:
+    """Return frequency (Hz) and the damping ratio's size of the modes that are lightly damped, or grow slowly.
+
+    Of a measured plant there are none: its own frequencies are looked at instead.
+    """
+    if isinstance(plant, MeasuredPlant):
+        return []
     values = np.linalg.eigvals(plant.a).astype(complex)
     poles = np.log(values[np.imag(values) > 0.0]) / plant.sample_time_s  # a delay's are zero
     modes = [(abs(p) / (2 * np.pi), abs(p.real) / abs(p)) for p in poles]
     return [(float(f), float(max(zeta, 1e-9))) for f, zeta in modes if zeta < LIGHT_DAMPING]
 
 
-def count_growing(plant: DigitalPlant) -> int:
-    """Return how many of a plant's poles grow without control."""
-    return int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
+def count_growing(plant: DigitalPlant | MeasuredPlant) -> int:
+    """Return how many of a plant's poles grow without control; none of a measured one, whose log is bounded."""
+    return (
+        0 if isinstance(plant, MeasuredPlant) else int(np.count_nonzero(np.abs(np.linalg.eigvals(plant.a)) > GROWING))
+    )
 
 
 def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
@@ -487,6 +530,9 @@ def place_frequencies(task: Task) -> Float[np.ndarray, " m"]:
         near.append(np.linspace(f - reach, f + reach, int(min(2 * reach / max(zeta * f / 4, 1e-4), 80))))
     extra = np.sort(np.concatenate([np.zeros(0), *near]))
     extra = extra[:: 1 + extra.size // MORE_FREQUENCIES]
+    for plant in task.plants:
+        if isinstance(plant, MeasuredPlant):
+            extra = np.concatenate([extra, plant.f[:: 1 + plant.f.size // MORE_FREQUENCIES]])
     slow, base = (
         np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES),
         np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES),

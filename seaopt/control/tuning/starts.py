@@ -128,7 +128,8 @@ def _thin_grid(task: Task, grid: Grid) -> Grid:
     even = np.searchsorted(grid.f, np.geomspace(OBJECTIVE_HZ, grid.f[-1], COARSE_FREQUENCIES))
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
-    return replace(coarse, p=coarse.p[:SCANNED_PLANTS], rows=coarse.rows[:SCANNED_PLANTS])
+    some = slice(SCANNED_PLANTS)
+    return replace(coarse, p=coarse.p[some], discs=coarse.discs[some], rows=coarse.rows[some])
 
 
 def _list_shapes(task: Task) -> Iterator[Shape]:
@@ -297,7 +298,7 @@ def _judge_loops(scan: _Scan, c_y: Complex[np.ndarray, "n m"]) -> Float[np.ndarr
         worst = np.max(margins, axis=(1, 2))
     for row, p in enumerate(grid.p):
         own = tuple(name for name in task.design_limits(row) if name not in TRACKING)
-        usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid.f, p, c_y, c_y)
+        usage = task.curves(_imposed(task, SCOPES["every plant"] + own), grid.f, p, c_y, c_y, grid.discs[row])
         usage |= task.port_usage(grid, c_y) if row == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=1))
@@ -319,7 +320,7 @@ def _judge_tracking(
     task, grid, worst = scan.task, scan.grid, np.zeros(c_y.shape[0])
     for row in range(task.design_states):
         names = _imposed(task, tuple(name for name in task.design_limits(row) if name in TRACKING))
-        for curve in task.curves(names, grid.f, grid.p[row], c_y, c_r).values():
+        for curve in task.curves(names, grid.f, grid.p[row], c_y, c_r, grid.discs[row]).values():
             worst = np.maximum(worst, np.max(curve, axis=1))
     return _price(worst)
 

@@ -23,6 +23,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.measured import measure_all_discs, see_response
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM, DisturbanceObserver, Nominal
 from seaopt.control.laws.verdict import (
@@ -33,9 +34,11 @@ from seaopt.control.laws.verdict import (
     list_broken,
     list_broken_limits,
 )
+from seaopt.control.loops.disc_loop import DiscLoop
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law, make_static_law
 from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.measured_plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.tuning.falling_friction import find_largest_fall
@@ -46,6 +49,7 @@ from seaopt.control.tuning.optimisation_problem import (
     LawNumbers,
     PlantWithFriction,
     Task,
+    close_plant,
     count_growing,
 )
 from seaopt.control.tuning.possible_bandwidths import find_possible_bandwidths
@@ -53,6 +57,7 @@ from seaopt.control.tuning.solution import solve
 from seaopt.errors import ControlError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import (
@@ -69,12 +74,14 @@ from seaopt.progress import Progress, divide, ignore
 
 SOLUTION, BANDWIDTHS = 1.0, 2.0  # of the time of a tune that is not possible as asked
 
+RobustTo = Mapping[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse]
+
 
 def tune(
-    plant: Plant,
+    plant: Plant | MeasuredResponse,
     params: Fit | ParameterSet,
     spec: ControllerSpec,
-    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    robust_to: RobustTo | None = None,
     *,
     draws: Sequence[Mapping[str, float]] = (),
     progress: Progress = ignore,
@@ -83,14 +90,18 @@ def tune(
 
     Parameters
     ----------
-    plant : Plant
-        The design plant, the test stand as a rule.
+    plant : Plant or MeasuredResponse
+        The design plant, the test stand as a rule; or its measured frequency response (`seaopt.measure_response`), of
+        which all limits hold for every response in the discs: the bandwidth is placed on their centres, and none is
+        below 0.97 of it.
     params : Fit or ParameterSet
-        Its parameters; of a fit also the delay, where the specification leaves delay_samples out.
+        Its parameters; of a fit also the delay, where the specification leaves delay_samples out. Of a measured
+        response they only say what effort the command makes, in which gains are counted.
     spec : ControllerSpec
         Bandwidth and limits.
-    robust_to : mapping of name to Plant or (Plant, ParameterSet), optional
-        Plants that must be stable and meet Ms, Mt and disk margin too, driven by the same current.
+    robust_to : mapping of name to Plant, (Plant, ParameterSet) or MeasuredResponse, optional
+        Plants that must be stable and meet Ms, Mt and disk margin too, driven by the same current; of a measured one
+        every response in the discs.
     draws : sequence of mappings of parameter to value, optional
         Values at which the design plant and every plant of robust_to must meet them too; see `corners` and `draw`.
     progress : callable, optional
@@ -120,18 +131,19 @@ def tune(
 
     """
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
-    require_plant(plant, "plant", ControlError)
+    model = name_design(plant)
     if spec.structure == CUSTOM:
         raise ControlError('structure = "custom" is of a law that is given, which nothing tunes; use seaopt.assess')
-    spec = settle_delay(spec, plant, params)
+    spec = settle_delay(spec, model, params)
     params = params.parameters if isinstance(params, Fit) else params
-    values = plant.complete(params)
-    if plant.winding is not None:
-        rate_motor(plant, values)  # the controller states it: refused here, not when it is printed
+    values = model.complete(params)
+    if model.winding is not None:
+        rate_motor(model, values)  # the controller states it: refused here, not when it is printed
     task = make_task(plant, values, spec, robust_to or {}, draws)
-    check_delay(spec, task.plants[0])
-    command = command_of(plant, values, spec.measured)
-    check_current(spec, task.k_ff, command, find_dry_friction(plant, values))
+    if isinstance(task.plants[0], DigitalPlant):
+        check_delay(spec, task.plants[0])
+    command = command_of(model, values, spec.measured)
+    check_current(spec, task.k_ff, command, {} if model is not plant else find_dry_friction(model, values))
     solving, seeking, again = divide(progress, SOLUTION * (8.0 if task.asks_margin else 1.0), BANDWIDTHS, SOLUTION)
     x, loops = solve(task, progress=solving)
     possible, broken = None, list_broken_limits(spec, loops, task.design_states)
@@ -143,6 +155,20 @@ def tune(
     controller = make_controller(task, x, loops, (plant, params), possible)
     progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
     return controller
+
+
+def name_design(plant: Plant | MeasuredResponse) -> Plant:
+    """Return the plant that says what a design plant, a model or a measured one, is commanded by.
+
+    Raises
+    ------
+    ControlError
+        It is neither.
+
+    """
+    model = plant.plant if isinstance(plant, MeasuredResponse) else plant
+    require_plant(model, "plant", ControlError)
+    return model
 
 
 def _find_possible(
@@ -168,8 +194,8 @@ def _find_possible(
 
 
 def make_task(
-    plant: Plant, params: ParameterSet, spec: ControllerSpec,
-    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]] = (),
+    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec, robust_to: RobustTo,
+    draws: Sequence[Mapping[str, float]] = (),
 ) -> Task:  # fmt: skip
     """Return what is to be tuned.
 
@@ -179,24 +205,34 @@ def make_task(
         As `tune`.
 
     """
-    require_plant(plant, "plant", ControlError)
-    values = plant.complete(params)
-    gain = command_of(plant, values, spec.measured).per_effort
+    design = name_design(plant)
+    values = design.complete(params)
+    command = command_of(design, values, spec.measured)
+    gain = command.per_effort
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
     require_type(draws, Sequence, "draws", "give a sequence of mappings of parameter to value", ControlError)
     for draw in draws:
         require_type(draw, Mapping, "one of draws", "give a mapping of parameter to value", ControlError)
-    for name, other in robust_to.items():
+    measured = {str(name): one for name, one in robust_to.items() if isinstance(one, MeasuredResponse)}
+    models_given = {name: one for name, one in robust_to.items() if not isinstance(one, MeasuredResponse)}
+    for name, other in models_given.items():
         count = len(other) if isinstance(other, tuple) else 2
         if count != 2:
             raise ControlError(f"robust_to: {name} is a tuple of {count}; give a plant, or (plant, parameters)")
         require_plant(other[0] if isinstance(other, tuple) else other, f"robust_to: {name}", ControlError)
-    named = {"design plant": (plant, values)}
-    named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in robust_to.items()}
+    seen = {name: see_response(one, spec, command) for name, one in measured.items()}
+    first: dict[str, MeasuredPlant] = {}
+    named: dict[str, tuple[Plant, ParameterSet]] = {}
+    if isinstance(plant, MeasuredResponse):
+        _check_measured_design(spec)
+        first[f"frf:{plant.name}"] = see_response(plant, spec, command)
+    else:
+        named["design plant"] = (plant, values)
+    named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in models_given.items()}
     varied = {parameter for draw in draws for parameter in draw}
     models: dict[str, tuple[Plant, CompletedParameters]] = {}
-    design_states = len(split_friction({"": plant}, values, varied))
+    design_states = 1 if first else len(split_friction({"": design}, values, varied))
     whole: dict[Plant, Plant] = {}  # the plant with its friction, of one that slides
     for name, (model, given) in named.items():
         completed = model.complete(given)
@@ -205,34 +241,51 @@ def make_task(
         if model not in variants.values():  # it has friction, and is there twice or more
             whole[friction_states(model)[SLIDING]] = model
     pairs = [*models.items(), *_draw_plants(models, draws)]
-    design_plant = pairs[0][1][0]
-    plants = tuple(
-        sample(model, values, spec.measured, gain, spec.sample_time_s, spec.loop_delay_samples)
-        for _, (model, values) in pairs
-    )
+    plants = (
+        *first.values(),
+        *(sample(model, values, spec.measured, gain, spec.sample_time_s, spec.loop_delay_samples)
+          for _, (model, values) in pairs),
+        *seen.values(),
+    )  # fmt: skip
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
         raise ControlError(
-            f"measured = {spec.measured}: the static gain of {plant.name} from what the motor gives is {static:g}, "
+            f"measured = {spec.measured}: the static gain of {design.name} from what the motor gives is {static:g}, "
             "which feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
-    names = tuple(name for name, _ in pairs)
-    nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
-    port = None if spec.passive_band_hz is None else port_of(design_plant, values, spec.measured, gain)
+    names = (*first, *(name for name, _ in pairs), *seen)
+    nominal = port = None
+    if isinstance(plants[0], DigitalPlant):
+        nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
+        port = None if spec.passive_band_hz is None else port_of(pairs[0][1][0], values, spec.measured, gain)
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
         design_states=design_states,
-        frictions=_find_friction(spec, [pair for _, pair in pairs], plants, whole, gain),
+        frictions=_find_friction(spec, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)),
     )  # fmt: skip
 
 
+def _check_measured_design(spec: ControllerSpec) -> None:
+    """Refuse what takes a model of the design plant, where that is a measured response."""
+    if spec.structure == "pid_dob":
+        raise ControlError(
+            'structure = "pid_dob" has a model of the design plant in it, and that is a measured response; use "pid"'
+        )
+    if spec.passive_band_hz is not None or spec.level(FRICTION) is not None:
+        name = "passive_band_hz" if spec.passive_band_hz is not None else FRICTION
+        raise ControlError(
+            f"{name} takes a model of the design plant, and that is a measured response; leave it out, or design on a "
+            "model and name the response in robust_to"
+        )
+
+
 def _find_friction(
-    spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]], plants: Sequence[DigitalPlant],
-    whole: Mapping[Plant, Plant], gain: float,
+    spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]],
+    plants: Sequence[DigitalPlant | MeasuredPlant], whole: Mapping[Plant, Plant], gain: float, before: int,
 ) -> tuple[PlantWithFriction, ...]:  # fmt: skip
     """Return the plants of which a friction margin is asked, and those that grow as they slide.
 
-    Of those that slide, `whole` is the one with friction.
+    Of those that slide, `whole` is the one with friction; in the task, `before` plants precede these.
     """
     slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s)
     found: list[PlantWithFriction] = []
@@ -249,7 +302,7 @@ def _find_friction(
                 "change the plant or the measured output"
             )
         flattest, _ = friction_slopes(plant, values)
-        found.append(PlantWithFriction(plant=number, model=plant, loop=loop, flattest=flattest))
+        found.append(PlantWithFriction(plant=before + number, model=plant, loop=loop, flattest=flattest))
     return tuple(found)
 
 
@@ -279,7 +332,7 @@ def make_controller(
     task: Task,
     x: LawNumbers,
     loops: Sequence[MeasuredLoop],
-    design: tuple[Plant, ParameterSet],
+    design: tuple[Plant | MeasuredResponse, ParameterSet],
     possible: PossibleBandwidths | None = None,
 ) -> Controller:
     """Return the controller of tuned numbers."""
@@ -291,12 +344,12 @@ def make_controller(
 
 
 def describe_law(
-    task: Task, law: Law, loops: Sequence[MeasuredLoop], design: tuple[Plant, ParameterSet], *,
+    task: Task, law: Law, loops: Sequence[MeasuredLoop], design: tuple[Plant | MeasuredResponse, ParameterSet], *,
     gains: Mapping[str, float], observer: DisturbanceObserver | None = None,
     possible: PossibleBandwidths | None = None,
 ) -> Controller:  # fmt: skip
     """Return the controller of a law whose loops are measured."""
-    spec = task.spec
+    spec, (plant, params) = task.spec, design
     verdicts = judge_all(spec, loops, task.design_states)
     broken = list_broken(verdicts)
     controller = Controller(
@@ -305,21 +358,24 @@ def describe_law(
         sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
         law=law,
-        command=command_of(*design, spec.measured),
+        command=command_of(name_design(plant), params, spec.measured),
         spec=spec,
         achieved=loops[0].figures,
         feasible=not broken,
         active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
-        design=design,
+        design=None if isinstance(plant, MeasuredResponse) else (plant, params),
         observer=observer,
-        blocked_by=tuple(explain_broken(spec, verdicts, loops[0], Loop(plant=task.plants[0], law=law))),
+        blocked_by=tuple(explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))),
         possible=None if not broken else possible,
+        measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
     )
-    return replace(controller, friction=find_friction_margin(controller, *design))
+    if isinstance(plant, MeasuredResponse):
+        return controller
+    return replace(controller, friction=find_friction_margin(controller, plant, params))
 
 
-def disturbance(loop: Loop, bandwidth_hz: float) -> float:
+def disturbance(loop: Loop | DiscLoop, bandwidth_hz: float) -> float:
     """Return the integral over ln f of abs(S) from 0.1 Hz to the bandwidth."""
     f = np.geomspace(OBJECTIVE_HZ, bandwidth_hz, 2000)
     s: Complex[np.ndarray, " m"] = loop.sensitivity(f)

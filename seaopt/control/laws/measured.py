@@ -1,0 +1,101 @@
+"""What a law does on measured frequency responses: figures of every response in their discs, and what is assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from seaopt.control.laws.command import Command
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.disc_loop import DiscLoop
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.loop import LoopFigures
+from seaopt.control.loops.measured_plant import ASSUMED, MeasuredPlant, sample_measured
+from seaopt.errors import ControlError
+from seaopt.formatting import format_number
+from seaopt.frequency import MeasuredResponse
+from seaopt.records import record
+
+REPORTED = ("stable", "ms", "ms_hz", "mt", "disk_margin", "noise_gain", "reference_peak", "droop_db")
+
+
+@record
+class MeasuredFigures:
+    """A law on one measured response; the figures are the worst of all responses in its discs.
+
+    Parameters
+    ----------
+    name : str
+        Such as frf:chirp.
+    confidence : float
+        That the discs hold the truth, all of them.
+    points : int
+        Measured frequencies.
+    band_hz : (low, high)
+        Of them.
+    figures : LoopFigures
+        `stable` means shown to be stable, by the turns of 1 + L, under what is assumed.
+    bandwidth_hz : (low or None, high or None)
+        Of the responses in the discs.
+
+    """
+
+    name: str
+    confidence: float
+    points: int
+    band_hz: tuple[float, float]
+    figures: LoopFigures
+    bandwidth_hz: tuple[float | None, float | None]
+
+    def describe(self) -> str:
+        """Return one sentence."""
+        low, high = (format_number(f, 3) for f in self.band_hz)
+        head = f"{self.name}: on {self.points} measured points from {low} to {high} Hz, at {self.confidence:.4g}"
+        if not self.figures.stable:
+            return f"{head}: not shown to be stable"
+        least, most = (format_number(f, missing="none") for f in self.bandwidth_hz)
+        return f"{head}: bandwidth {least} to {most} Hz, {self.figures.describe_peaks()}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return {
+            "confidence": self.confidence, "points": self.points, "band_hz": list(self.band_hz),
+            "bandwidth_hz": list(self.bandwidth_hz), **{name: getattr(self.figures, name) for name in REPORTED},
+            "assumed": ASSUMED,
+        }  # fmt: skip
+
+
+def see_response(measured: MeasuredResponse, spec: ControllerSpec, command: Command) -> MeasuredPlant:
+    """Return what a controller sees of a measured response.
+
+    Raises
+    ------
+    ControlError
+        It is of another output than the controller measures, or of another input than it commands; or as
+        `sample_measured`.
+
+    """
+    for what, own, other in (
+        ("output", measured.output, spec.measured), ("input", measured.source, command.input)
+    ):  # fmt: skip
+        if own != other:
+            raise ControlError(
+                f"frf:{measured.name}: is measured at the {what} {own}, and the controller's is {other}; measure that"
+            )
+    return sample_measured(measured, command.per_effort, spec.sample_time_s, spec.loop_delay_samples)
+
+
+def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> MeasuredFigures:
+    """Return the figures of a law on a measured response; the bandwidth is that asked for."""
+    loop = DiscLoop(plant=plant, law=law)
+    figures = loop.figures(bandwidth_hz)
+    return MeasuredFigures(
+        name=plant.name, confidence=plant.confidence, points=plant.f.size,
+        band_hz=(float(plant.f[0]), float(plant.f[-1])), figures=figures,
+        bandwidth_hz=loop.bandwidths_hz() if figures.stable else (None, None),
+    )  # fmt: skip
+
+
+def measure_all_discs(plants: Sequence[object], law: Law, bandwidth_hz: float) -> tuple[MeasuredFigures, ...]:
+    """Return the figures of a law on those of some plants that are measured."""
+    return tuple(measure_discs(plant, law, bandwidth_hz) for plant in plants if isinstance(plant, MeasuredPlant))

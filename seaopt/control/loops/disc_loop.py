@@ -1,0 +1,224 @@
+r"""The loop of a law and a measured plant: the worst that any response in its discs does, and whether it is stable.
+
+With P in the disc of centre :math:`P_0` and radius r, :math:`a = 1 + P_0 C_y`, :math:`\rho = r |C_y|` and
+:math:`D = |a|^2 - \rho^2 > 0`, every figure is a Moebius map of P, whose image is again a disc:
+
+.. math:: \frac{X}{1 + P C_y} \in \frac{1}{D}\Big(X_0 \bar a + s,\; R\Big), \qquad
+    \begin{array}{c|ccccc} X & 1 & L & 1 - L & C_y & P C_r \\ \hline
+    s & 0 & -\rho^2 & \rho^2 & 0 & -r^2 C_r \bar C_y \\ R & \rho & \rho & 2\rho & \rho |C_y| & r |C_r| \end{array}
+
+so that the largest and the least are exact. Where :math:`D \le 0` some response in the disc makes a pole on the circle.
+
+**Stability** cannot be told from points alone. With a stable plant, a law with m poles at 1 and none outside, and no
+disc that reaches -1/C_y at any frequency, it can: every response in the discs turns 1 + L as often as the centres do,
+and the loop is stable if and only if that is :math:`m \pi/2` from 0 Hz to the Nyquist frequency (Nyquist; as the
+condition on measured data: Karimi, Kammer, Automatica 85, 2017, theorem 1, with C = 0 as the stabilising law that is
+known). Between, below and above the points it holds under the assumptions of `seaopt.control.loops.measured_plant`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.loops.crossings import find_crossings
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.loop import (
+    DROOP_BAND,
+    FALLEN_ABOVE,
+    GRID_LOWEST_HZ,
+    SHOULDER,
+    SHOULDER_FALL,
+    LoopFigures,
+)
+from seaopt.control.loops.measured_plant import MeasuredPlant
+from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.records import record
+
+POINTS_BETWEEN = 4  # of the grid between two measured frequencies
+LEAST_TURN_RAD = 0.5  # between neighbours of the grid, refined until then
+REFINEMENTS = 12
+LEFT = 0.1  # of abs(1 + L)^2: where discs leave less, D goes on as a positive number, so that it has a logarithm
+KNOWN_TO = 0.97  # of a bandwidth: what `seaopt.control.laws.limits` asks of |F/F_ref| up to there
+ROUND = 0.25  # of a quarter turn, by which the count may be off
+SLOWEST_HZ = 1e-6
+
+
+def leave_positive(left: Any, least: Any = np.minimum, most: Any = np.maximum) -> Any:
+    """Return a number, or where it is less than `LEFT` a positive one that continues it smoothly.
+
+    `least` and `most` are those of arrays, or of a solver's expressions.
+
+    Examples
+    --------
+    >>> leave_positive(np.array([0.5, 0.1, -0.1])).round(4).tolist()
+    [0.5, 0.1, 0.0333]
+
+    """
+    return most(left, LEFT) - LEFT + LEFT * LEFT / (2.0 * LEFT - least(left, LEFT))
+
+
+@record(eq=False)
+class DiscLoop:
+    """A measured plant closed by a law."""
+
+    plant: MeasuredPlant
+    law: Law
+
+    def open_loop(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return L of the centres."""
+        return self.plant.response(f) * self.law.measurement_response(f)
+
+    def sensitivity(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return S of the centres."""
+        return 1.0 / (1.0 + self.open_loop(f))
+
+    def tracking(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Return F/F_ref of the centres."""
+        return self.plant.response(f) * self.law.reference_response(f) * self.sensitivity(f)
+
+    def grid(self) -> Float[np.ndarray, " m"]:
+        """Return frequencies up to the Nyquist frequency: the measured ones, some between, and the law's own."""
+        at, nyquist = self.plant.f, self.plant.nyquist_hz
+        steps = np.linspace(0.0, 1.0, POINTS_BETWEEN, endpoint=False)
+        between = (at[:-1, None] + np.diff(at)[:, None] * steps).ravel()
+        own = np.abs(np.angle(self.law.poles)) / (2 * np.pi * self.plant.sample_time_s)
+        grid = np.concatenate([np.geomspace(GRID_LOWEST_HZ, nyquist, 1200), between, at[-1:], own])
+        return np.unique(grid[(grid >= GRID_LOWEST_HZ) & (grid <= nyquist)])
+
+    def is_stable(self) -> bool:
+        """Tell whether the loop is stable with every response in the discs, under the assumptions of the module."""
+        f = self.grid()
+        response, reach = self._distance(f)
+        if np.any(np.abs(response) <= reach):
+            return False
+        f = np.concatenate([[SLOWEST_HZ], f])
+        for _ in range(REFINEMENTS):
+            one = 1.0 + self.open_loop(f)
+            steps = np.angle(one[1:] / one[:-1])
+            wide = np.flatnonzero(np.abs(steps) > LEAST_TURN_RAD)
+            if not wide.size:
+                break
+            f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
+        if np.any(np.abs(self.law.poles[self.law.integrators :]) >= 1.0):
+            return False  # a law that grows by itself is not counted here
+        turned = float(np.sum(np.angle(one[1:] / one[:-1]))) / (0.5 * np.pi)
+        return abs(turned - self.law.integrators) < ROUND
+
+    def _distance(self, f: Float[np.ndarray, " m"]) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Return 1 + L of the centres, and how far the discs reach from it."""
+        law = self.law.measurement_response(f)
+        return 1.0 + self.plant.response(f) * law, self.plant.discs(f) * np.abs(law)
+
+    def figures(self, asked_hz: float | None = None) -> LoopFigures:
+        r"""Return the worst figures of all responses in the discs; of a loop that is not shown to be stable, none.
+
+        The bandwidth is that asked for where the discs cannot tell it from their own: it lies between their least and
+        their largest, and the least is above 0.97 of it. Else it is the least. The crossover is that of the centres.
+        Gain and phase margins are those that Ms and Mt leave at least, and the delay margin that of
+        :math:`|1 - e^{-j\omega\tau}| < 1/|T|` at every frequency.
+        """
+        if not self.is_stable():
+            return LoopFigures(
+                stable=False, spectral_radius=np.inf, bandwidth_hz=None, tracking_band_hz=None, crossover_hz=None,
+                sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
+                droop_db=np.inf, return_hz=None, gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0,
+                disk_margin=0.0, noise_gain=np.inf,
+            )  # fmt: skip
+        f = self.grid()
+        p, r = self.plant.response(f), self.plant.discs(f)
+        reference, negative = self.law.responses(f)
+        sizes = {
+            name: bound_disc(name, p, r, -negative, reference) for name in ("1", "L", "1 - L", "C_y", "P C_r")
+        }  # fmt: skip
+        (least, most), s, crossovers = sizes["P C_r"], sizes["1"][1], self._find_crossovers(f)
+        ms, static = float(np.max(s)), 1.0 if self.law.integrators else float(least[0])
+        down, top = (_first(f, HALF_POWER * static - size) for size in (least, most))
+        if down is not None and asked_hz is not None and KNOWN_TO * asked_hz <= down <= asked_hz <= (top or np.inf):
+            down = asked_hz
+        droop = np.min(least[f <= DROOP_BAND * (down or f[-1])], initial=static)
+        mt = float(np.max(sizes["L"][1]))
+        phase = 2.0 * np.arcsin(min(max(0.5 / ms, 0.5 / mt), 1.0))
+        large = sizes["L"][1] > 0.5
+        late = np.arcsin(0.5 / sizes["L"][1][large]) / (np.pi * f[large])
+        return LoopFigures(
+            stable=True, spectral_radius=0.0, bandwidth_hz=down, tracking_band_hz=_band(f, least, most),
+            crossover_hz=crossovers[-1] if crossovers else None,
+            sensitivity_bandwidth_hz=_first(f, s - HALF_POWER) or float(f[-1]), ms=ms, mt=mt,
+            ms_hz=float(f[np.argmax(s)]), reference_peak=float(np.max(most)) / static,
+            droop_db=max(0.0, -20.0 * float(np.log10(max(droop, 1e-300) / static))),
+            return_hz=None if down is None else self._find_return(f, most, down, static),
+            gain_margin_db=float(-20.0 * np.log10(1.0 - 1.0 / ms)) if ms > 1.0 else None,
+            phase_margin_deg=float(np.degrees(phase)),
+            delay_margin_s=float(np.min(late)) if late.size else None,
+            disk_margin=2.0 / float(np.max(sizes["1 - L"][1])), noise_gain=float(np.max(sizes["C_y"][1])),
+        )  # fmt: skip
+
+    def bandwidths_hz(self) -> tuple[float | None, float | None]:
+        """Return the least and the largest bandwidth of the responses in the discs."""
+        f = self.grid()
+        reference, negative = self.law.responses(f)
+        low, high = bound_disc("P C_r", self.plant.response(f), self.plant.discs(f), -negative, reference)
+        static = 1.0 if self.law.integrators else float(low[0])
+        return _first(f, HALF_POWER * static - low), _first(f, HALF_POWER * static - high)
+
+    def _find_crossovers(self, f: Float[np.ndarray, " m"]) -> list[float]:
+        return [float(x) for x in find_crossings(lambda g: np.abs(self.open_loop(g)) - 1.0, f)]
+
+    def _find_return(
+        self, f: Float[np.ndarray, " m"], most: Float[np.ndarray, " m"], down: float, static: float
+    ) -> float | None:
+        """Return where the largest of the discs comes back above -3 dB, or lingers, above the bandwidth."""
+        low, high = FALLEN_ABOVE * down, min(SHOULDER * down, self.plant.nyquist_hz)
+        allowed = HALF_POWER * static * (down / f) ** SHOULDER_FALL
+        back = f[(f > low) & (f < high) & (most > allowed)]
+        return float(back[0]) if back.size else None
+
+
+def bound_disc(
+    of: str, p: Any, r: Any, c_y: Any, c_r: Any
+) -> tuple[Float[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
+    """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table."""
+    open_loop = p * c_y
+    a, reach = 1.0 + open_loop, r * np.abs(c_y)
+    size = np.abs(a) ** 2
+    room = size * leave_positive(1.0 - reach**2 / np.maximum(size, 1e-300))
+    back = np.conj(a)
+    match of:
+        case "1":
+            centre, radius = back, reach
+        case "L":
+            centre, radius = open_loop * back - reach**2, reach
+        case "1 - L":
+            centre, radius = (1.0 - open_loop) * back + reach**2, 2.0 * reach
+        case "C_y":
+            centre, radius = c_y * back, reach * np.abs(c_y)
+        case _:
+            centre, radius = c_r * (p * back - r**2 * np.conj(c_y)), r * np.abs(c_r)
+    centre = np.abs(centre)
+    room = np.maximum(room, 1e-300)
+    return np.maximum(centre - radius, 0.0) / room, (centre + radius) / room
+
+
+def _first(f: Float[np.ndarray, " m"], over: Float[np.ndarray, " m"]) -> float | None:
+    """Return the first frequency at which a curve is above zero, by a straight line; None where it never is."""
+    above = np.flatnonzero(over > 0.0)
+    if not above.size:
+        return None
+    k = int(above[0])
+    if k == 0:
+        return float(f[0])
+    share = over[k - 1] / (over[k - 1] - over[k])
+    return float(f[k - 1] + share * (f[k] - f[k - 1]))
+
+
+def _band(
+    f: Float[np.ndarray, " m"], least: Float[np.ndarray, " m"], most: Float[np.ndarray, " m"]
+) -> tuple[float, float] | None:
+    """Return the widest band in which every response in the discs stays within 3 dB of 1."""
+    inside = (least > HALF_POWER) & (most < 1.0 / HALF_POWER)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]]))).reshape(-1, 2)
+    low, high = max(edges, key=lambda run: f[run[1] - 1] - f[run[0]], default=(0, 0))
+    return (float(f[low]), float(f[high - 1])) if high > low else None
