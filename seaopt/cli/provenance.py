@@ -111,7 +111,13 @@ def _read_by_design(problem: Problem) -> dict[str, Any]:
     """Return what a design reads besides [robustness]: [controller], its plants and values."""
     asked = _controller(problem)
     out = problem.table.model_dump(mode="json", include={"controller"})
-    return out | _describe_plants(problem, {asked.plant, *asked.robust_to})
+    names = {name for name in (asked.plant, *asked.robust_to) if name in problem.plants}
+    responses = {
+        f"frf:{one.name}": one.model_dump(mode="json")
+        for one in problem.table.experiment
+        if f"frf:{one.name}" in problem.response_names
+    }
+    return out | _describe_plants(problem, names) | ({"responses": responses} if responses else {})
 
 
 def _shape_by_robustness(problem: Problem, retune: int) -> dict[str, Any]:

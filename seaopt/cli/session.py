@@ -41,6 +41,7 @@ from seaopt.problem.stages import (
     can_design,
     certify_problem,
     fit_problem,
+    list_plants,
     score_problem,
     tune_problem,
 )
@@ -135,7 +136,7 @@ class Session:
         """Return the stages that the problem has what it takes for."""
         stages = ["fit"] if self.problem.table.experiment else []
         if self.problem.spec is not None:
-            stages += ["tune", "certify"]
+            stages += ["tune"] if self.problem.designs_on_response else ["tune", "certify"]
         if not stages:
             raise ProblemError(
                 f"{self.problem.source}: has no [[experiment]] and no [controller]; add one of them (a whole file is "
@@ -146,6 +147,8 @@ class Session:
     def explain_left_out(self, stages: list[str]) -> list[str]:
         """Return what the file, or the fit, gives reason to expect of a whole run and does not get, and why."""
         source, table = self.problem.source, self.problem.table
+        if self.problem.designs_on_response and "tune" in stages:
+            return [f"certifying: it takes a model, and [controller] is designed on {self.problem.response_names[0]}"]
         if table.robustness is not None and table.controller is None:
             return [f"tuning and certifying: {source} has [robustness] but no [controller]; add one"]
         if table.controller is not None and "tune" not in stages:
@@ -240,8 +243,11 @@ class Session:
         return self._experiments
 
     def parameters(self) -> Fit | ParameterSet:
-        """Return the fit of this run or of the folder; the file's own values if it has no experiments."""
-        if "fit" not in self.results and self.problem.table.experiment:
+        """Return the fit of this run or of the folder; the file's own values if nothing is designed on a model."""
+        fitted = self.problem.table.experiment and not (
+            self.problem.designs_on_response and not (self.folder / FILES["fit"]).exists()
+        )
+        if "fit" not in self.results and fitted:
             self.results["fit"] = Fit.from_dict(self._read("fit"))
         return self.results.get("fit", self.problem.parameters)
 
@@ -279,7 +285,8 @@ class Session:
     def controller(self) -> Controller:
         """Return the controller of this run or of the folder; one for other limits than the problem's is refused."""
         if "tune" not in self.results:
-            controller = Controller.from_dict(self._read("tune"), self.problem.design_plant, self.values())
+            design, _ = list_plants(self.problem, self.parameters())
+            controller = Controller.from_dict(self._read("tune"), design, self.values())
             self._check_spec(controller.spec)
             self.results["tune"] = controller
         return self.results["tune"]
@@ -440,6 +447,12 @@ class Session:
     def _sweep(self, tell: Progress) -> None:
         design, robust_to = self.problem.design_plant, self.problem.robust_to(self.values())
         values = self._design_values(design, *(plant for plant, _ in robust_to.values()))
+        _, robust_to = list_plants(self.problem, self.parameters())
+        if self.problem.designs_on_response:
+            raise ProblemError(
+                f"{self.problem.source}: a sweep takes a model, and [controller] is designed on "
+                f"{self.problem.response_names[0]}; name a plant there, and the response in robust_to"
+            )
         draws = self.problem.draws(self.parameters())
         result = sweep(design, values, self._spec(), self.bandwidths_hz, robust_to, draws=draws, progress=tell)
         self.results["sweep"] = result

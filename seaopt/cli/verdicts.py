@@ -96,7 +96,8 @@ def judge_controller(controller: Controller, sweep: str) -> StageVerdict:
     spec = controller.spec
     name = f"Controller: {controller.structure} on {spec.measured}, {spec.bandwidth_hz:g} Hz"
     if controller.feasible:
-        return StageVerdict(met=True, text=f"{name}, every limit met")
+        on = " on measured points" if controller.design is None else ""
+        return StageVerdict(met=True, text=f"{name}, every limit met{on}")
     blocked = controller.blocked_by or (join_labels(controller.active_constraints),)
     reasons = [Reason(what=text, where="") for text in blocked]
     return StageVerdict(

@@ -197,6 +197,7 @@ def _choose_discs(estimates: Sequence[FrequencyResponse], confidence: float, hig
     As the discs of all estimates hold the truth together, any choice among them does.
     """
     lines = sum(np.count_nonzero(one.frequency_hz < highest_hz) for one in estimates)
+    discs: list[Discs] = []
     for _ in range(2):  # of all lines, then of those in the bands alone
         discs = [_place_discs(one, (1.0 - confidence) / max(lines, 1), highest_hz) for one in estimates]
         lines = sum(f.size for f, *_ in discs)
@@ -204,7 +205,11 @@ def _choose_discs(estimates: Sequence[FrequencyResponse], confidence: float, hig
     parts: list[Discs] = []
     for low, high in pairwise(highest_hz * 2.0 ** (-np.arange(PARTS * OCTAVES, -1, -1) / PARTS)):
         inside = [(f >= low) & (f < high) for f, *_ in discs]
-        own = [tuple(part[chosen] for part in one) for one, chosen in zip(discs, inside, strict=True) if chosen.any()]
+        own = [
+            (at[chosen], centre[chosen], radius[chosen], averages[chosen])
+            for (at, centre, radius, averages), chosen in zip(discs, inside, strict=True)
+            if chosen.any()
+        ]
         if own:
             parts.append(min(own, key=lambda one: float(np.mean(np.log(one[2] / np.abs(one[1]))))))
     if not parts:

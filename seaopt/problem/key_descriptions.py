@@ -222,7 +222,7 @@ KEYS: dict[str, dict[str, str]] = {
         "depth": "Gain at its centre; tuned where left out.",
     },
     "ControllerTable": {
-        "plant": "The plant that it is designed on.",
+        "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',
         "measured": "The output that is regulated.",
         "structure": "pid_dob adds a disturbance observer.",
         "notch": "Whether there is one, or which.",
@@ -231,7 +231,8 @@ KEYS: dict[str, dict[str, str]] = {
         "sample_rate_hz": "At which it runs.",
         "delay_samples": "Whole samples from measurement to command, besides the hold; that of the fit where left out.",
         "objective": "Of what the limits leave: least disturbance, or least noise.",
-        "robust_to": "Plants on which stability, Ms and Mt hold too.",
+        "robust_to": 'Plants on which stability, Ms and Mt hold too; "frf:NAME" for a measured frequency response.',
+        "frf_confidence": "That the discs about measured frequency responses hold the truth, all of them.",
         "draws": "Of the uncertain parameters, on which they hold too.",
         "current_limit_A": "Of the drive.",
         "command_limit": "The same of another command: V, or a duty.",

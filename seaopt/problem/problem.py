@@ -31,12 +31,13 @@ from seaopt.estimation import (
 )
 from seaopt.files import check_regular, parse_file
 from seaopt.formatting import join_words
+from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Difference, Plant, known_parameters, plant_of_kind
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, make_plant, order_plants
-from seaopt.problem.references import check_references, range_remarks
+from seaopt.problem.references import RESPONSE, check_references, range_remarks
 from seaopt.problem.schema import (
     AnyPlant,
     ColumnTable,
@@ -54,6 +55,7 @@ from seaopt.problem.schema import (
 from seaopt.records import record
 from seaopt.robustness import place_value
 from seaopt.signals import Signal
+from seaopt.simulation import Clock
 from seaopt.units import ROTARY, factor, same_dimension, unit_after
 
 OWN = "parameter "  # before the name of a parameter that is read as a channel
@@ -102,10 +104,57 @@ class Problem:
 
     @property
     def design_plant(self) -> Plant:
-        """The plant that the controller is designed on."""
+        """The plant that the controller is designed on; of a measured response, what was on the bench."""
         if self.table.controller is None:
             raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
-        return self.plants[self.table.controller.plant]
+        name = self.table.controller.plant
+        on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in self.table.experiment}
+        return self.plants[on_bench.get(name, name)]
+
+    @property
+    def designs_on_response(self) -> bool:
+        """Whether the controller is designed on a measured response, without a model."""
+        return self.table.controller is not None and self.table.controller.plant.startswith(RESPONSE)
+
+    @property
+    def response_names(self) -> tuple[str, ...]:
+        """The measured responses that the controller is tuned on, such as frf:chirp."""
+        asked = self.table.controller
+        names = [] if asked is None else [asked.plant, *asked.robust_to]
+        return tuple(dict.fromkeys(name for name in names if name.startswith(RESPONSE)))
+
+    def measure_responses(self, source: Fit | ParameterSet) -> dict[str, MeasuredResponse]:
+        """Return the measured responses that the controller is tuned on, by name.
+
+        The delay that an experiment is known to have, given or fitted, is in its response already.
+
+        Raises
+        ------
+        SeaoptError
+            A log cannot be read, or does not allow a frequency response.
+
+        """
+        out: dict[str, MeasuredResponse] = {}
+        for name in self.response_names:
+            table = next(one for one in self.table.experiment if f"{RESPONSE}{one.name}" == name)
+            try:
+                out[name] = self._measure_response(self._make_experiment(table), source)
+            except SeaoptError as error:
+                raise type(error)(f"{self.source}: {name}: {error}") from error
+        return out
+
+    def _measure_response(self, experiment: Experiment, source: Fit | ParameterSet) -> MeasuredResponse:
+        asked, given = self.table.controller, experiment.delay_s
+        assert asked is not None
+        known = given.value if isinstance(given, Parameter) else given
+        if isinstance(given, Parameter) and given.free:
+            known = 0.0
+        if isinstance(source, Fit) and experiment.name in source.nuisance:
+            known = source.nuisance[experiment.name].delay_s
+        return measure_response(
+            experiment.plant, experiment.log, asked.measured, name=experiment.name, confidence=asked.frf_confidence,
+            clock=Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known),
+        )  # fmt: skip
 
     @property
     def notes(self) -> list[str]:
@@ -149,8 +198,8 @@ class Problem:
         """Return the design plant and those of [robustness], by name."""
         if self.table.controller is None:
             raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
-        names = [self.table.controller.plant]
-        names += self.table.controller.robust_to
+        names = [self.table.controller.plant, *self.table.controller.robust_to]
+        names = [name for name in names if not name.startswith(RESPONSE)]
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
 
     def remarks(self, parameters: ParameterSet) -> list[str]:
@@ -165,6 +214,8 @@ class Problem:
         """Return the plants of `robust_to`, at the nominal parameters and at the ends of the ranges."""
         out: dict[str, tuple[Plant, ParameterSet]] = {}
         for name in self.table.controller.robust_to if self.table.controller else []:
+            if name.startswith(RESPONSE):
+                continue
             plant = self.plants[name]
             values = plant.complete(parameters).drop_conditions()
             out[name] = (plant, values)
@@ -543,7 +594,7 @@ def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
 def _make_spec(table: ProblemTable) -> ControllerSpec | None:
     if table.controller is None:
         return None
-    fields = table.controller.model_dump(exclude={"plant", "robust_to", "draws", "notch"})
+    fields = table.controller.model_dump(exclude={"plant", "robust_to", "frf_confidence", "draws", "notch"})
     notch = table.controller.notch
     tuned = (Notch() if notch else None) if isinstance(notch, bool) else Notch(**notch.model_dump())
     if table.robustness is not None and table.robustness.min_friction_margin is not None:

@@ -12,12 +12,13 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.columns import check_inside
 from seaopt.problem.proposal.vocabulary import read_header
-from seaopt.problem.schema import ExpectTable, ExperimentTable, ProblemTable, RangeTable, SensorsTable
+from seaopt.problem.schema import ControllerTable, ExpectTable, ExperimentTable, ProblemTable, RangeTable, SensorsTable
 from seaopt.robustness import check_ranges, place_value
 from seaopt.robustness.uncertainty.draws import find_modes
 from seaopt.units import factor, unit_after
 
 MAX_LINK_DELAY_SAMPLES = 20
+RESPONSE = "frf:"  # before the name of an experiment whose frequency response is meant
 
 
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
@@ -31,8 +32,10 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
     """
     places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
     if table.controller:
-        places.append(("controller.plant", table.controller.plant))
-        places += [("controller.robust_to", name) for name in table.controller.robust_to]
+        _check_responses(table, table.controller)
+        named = [("controller.plant", table.controller.plant)]
+        named += [("controller.robust_to", name) for name in table.controller.robust_to]
+        places += [(place, name) for place, name in named if not name.startswith(RESPONSE)]
     if table.robustness:
         places += [("robustness.plants", name) for name in table.robustness.plants]
     for place, name in places:
@@ -49,6 +52,26 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         _check_experiment(experiment, plants[experiment.plant])
     if table.expect is not None:
         _check_expected(table, table.expect, plants, parameters)
+
+
+def _check_responses(table: ProblemTable, controller: ControllerTable) -> None:
+    """Refuse measured responses of experiments that the file has not, or that do not measure what is regulated."""
+    experiments = {experiment.name: experiment for experiment in table.experiment}
+    for place, names in (("plant", [controller.plant]), ("robust_to", controller.robust_to)):
+        for name in names:
+            if not name.startswith(RESPONSE):
+                continue
+            of = name.removeprefix(RESPONSE)
+            if of not in experiments:
+                raise ProblemError(
+                    f'controller.{place} = "{name}" is of no [[experiment]] of this file; {suggestion(of, experiments)}'
+                )
+            one = experiments[of]
+            if one.virtual is None and controller.measured not in one.outputs:
+                raise ProblemError(
+                    f'controller.{place} = "{name}" is of an experiment that does not measure {controller.measured}; '
+                    f"name its column in experiment.{of}.outputs"
+                )
 
 
 def _check_expected(
@@ -95,11 +118,10 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     if table.controller is None:
         return
     measured = table.controller.measured
-    for name in (
-        table.controller.plant,
-        *table.controller.robust_to,
-        *(table.robustness.plants if table.robustness else ()),
-    ):
+    named = [table.controller.plant, *table.controller.robust_to]
+    named += table.robustness.plants if table.robustness else []
+    by_experiment = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in table.experiment}
+    for name in (by_experiment.get(name, name) for name in named):
         if measured not in plants[name].outputs:
             given = "measured" in table.controller.model_fields_set
             sensing = plants[name].sensing

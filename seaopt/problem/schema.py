@@ -28,6 +28,7 @@ class _Strict(BaseModel):
 
 NotNegative = Annotated[Number, Field(ge=0)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=64)]
+PlantOrResponse = Annotated[str, StringConstraints(pattern=r"^(frf:)?[A-Za-z][A-Za-z0-9_-]*$", max_length=68)]
 
 
 class ParameterTable(_Strict):
@@ -391,7 +392,7 @@ Level = Number | Literal[False] | None  # of a limit: false lifts it
 class ControllerTable(_Strict):
     """What is asked of the controller."""
 
-    plant: Name
+    plant: PlantOrResponse
     measured: str = "F1"
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
@@ -411,7 +412,8 @@ class ControllerTable(_Strict):
     min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")
     passive_band_hz: tuple[Number, Number] | None = _limit("passive_band_hz")
     objective: Literal["disturbance", "noise"] = "disturbance"
-    robust_to: list[Name] = []
+    robust_to: list[PlantOrResponse] = []
+    frf_confidence: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.95
     draws: Annotated[Whole, Field(ge=0, le=200)] = 0
     current_limit_A: Number | None = None
     command_limit: Number | None = None

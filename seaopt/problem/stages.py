@@ -12,7 +12,9 @@ from seaopt.control import Controller, GivenLaw, assess, command_of, tune
 from seaopt.control.laws.delay import settle_delay
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 from seaopt.problem.problem import Problem
 from seaopt.progress import Progress, ignore
 from seaopt.robustness import Budget, Certificate, JointTuning, certify, tune_certified
@@ -79,15 +81,42 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
         As in `seaopt.tune`.
 
     """
-    design, robust_to = problem.design_plant, problem.robust_to(problem.values(source))
+    design, robust_to = list_plants(problem, source)
     assert problem.spec is not None
-    spec, draws, table = settle_delay(problem.spec, design, source), problem.draws(source), problem.robustness
+    spec, table = settle_delay(problem.spec, problem.design_plant, source), problem.robustness
+    draws = problem.draws(source)
     if not table.retune:
         return tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
+    if problem.response_names:
+        raise ProblemError(
+            f"{problem.source}: retune = {table.retune} in [robustness] tunes again on models, and "
+            f"{problem.response_names[0]} is a measured response; leave retune out"
+        )
     return tune_certified(
-        design, source, spec, problem.certified_plants(), ranges=problem.ranges, robust_to=robust_to, draws=draws,
-        others=problem.parameters, samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
+        problem.design_plant, source, spec, problem.certified_plants(), ranges=problem.ranges,
+        robust_to=problem.robust_to(problem.values(source)), draws=draws, others=problem.parameters,
+        samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
     )  # fmt: skip
+
+
+def list_plants(problem: Problem, source: Fit | ParameterSet) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
+    """Return what the controller is designed on, and what it must be robust to, models and measured responses.
+
+    Parameters
+    ----------
+    problem : Problem
+        With a [controller].
+    source : Fit or ParameterSet
+        The fit; or values, of a problem without experiments.
+
+    """
+    measured = problem.measure_responses(source)
+    others: dict[str, Any] = problem.robust_to(problem.values(source))
+    assert problem.table.controller is not None
+    named = problem.table.controller.robust_to
+    others |= {name: one for name, one in measured.items() if name in named}
+    design = measured[problem.table.controller.plant] if problem.designs_on_response else problem.design_plant
+    return design, others
 
 
 def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet) -> Controller:
@@ -116,9 +145,15 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
             f'correct one of them: measured = "{given.measured}"'
         )
     spec = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, delay_samples=given.delay_samples)
+    if problem.designs_on_response:
+        raise ProblemError(
+            f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
+            f"{problem.response_names[0]}; name a plant there, and the response in robust_to"
+        )
     design, values = problem.design_plant, problem.values(source)
+    _, robust_to = list_plants(problem, source)
     law = given.to_effort(command_of(design, values, spec.measured).per_effort)
-    return assess(design, values, law, spec, problem.robust_to(values), draws=problem.draws(source))
+    return assess(design, values, law, spec, robust_to, draws=problem.draws(source))
 
 
 def certify_problem(
@@ -142,11 +177,18 @@ def certify_problem(
 
     """
     table = problem.robustness
+    if problem.designs_on_response:
+        raise ProblemError(
+            f"{problem.source}: a certificate takes a model, and [controller] is designed on "
+            f"{problem.response_names[0]}, where the controller's own verdict is the one on its points; to certify, "
+            "name a plant there, and the response in robust_to"
+        )
     return certify(
         controller, problem.certified_plants(), source, ranges=problem.ranges, others=problem.parameters,
         samples=table.samples, seed=table.seed, bounds=Budget() if table.bounds else None,
         max_failure_probability=table.max_failure_probability, min_friction_margin=table.min_friction_margin,
         sensors=problem.sensors, current_step_A=table.step, progress=progress,
+        measured=problem.measure_responses(source),
     )  # fmt: skip
 
 
@@ -207,7 +249,7 @@ class Stages:
         return tuned.controller if isinstance(tuned, JointTuning) else tuned
 
     def _certify(self) -> Certificate | None:
-        if self.controller is None:
+        if self.controller is None or self.problem.designs_on_response:
             return None
         return certify_problem(self.problem, self.controller, self.fit or self.problem.parameters)
 

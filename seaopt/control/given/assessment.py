@@ -11,7 +11,7 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law
-from seaopt.control.tuning.tuner import describe_law, make_task
+from seaopt.control.tuning.tuner import RobustTo, describe_law, make_task
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
@@ -26,7 +26,7 @@ def assess(
     params: Fit | ParameterSet,
     law: Any,
     spec: ControllerSpec,
-    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    robust_to: RobustTo | None = None,
     *,
     draws: Sequence[Mapping[str, float]] = (),
 ) -> Controller:

@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
-from seaopt.control.laws.measured import MeasuredFigures
+from seaopt.control.laws.measured import MeasuredFigures, see_response
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
 from seaopt.control.laws.verdict import (
@@ -22,6 +22,7 @@ from seaopt.control.laws.verdict import (
     shorten_blocked,
 )
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.disc_loop import DiscLoop
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
@@ -38,6 +39,7 @@ from seaopt.formatting import (
     html_paragraph,
     html_table,
 )
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import name_slope_unit, split_friction, take_sliding
@@ -183,7 +185,7 @@ class Controller:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        lifted = self.lifted_notes
+        lifted = (*self.lifted_notes, *map(str, self.measured))
         if self.design is None:
             return lifted
         plant, values = self.design
@@ -302,6 +304,7 @@ class Controller:
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": None if self.possible is None else asdict(self.possible),
             "notes": list(self.notes),
+            "measured_responses": [one.to_dict() for one in self.measured],
         }
 
     def _heat_dict(self) -> dict[str, Any] | None:
@@ -325,7 +328,7 @@ class Controller:
         }
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet) -> Controller:
+    def from_dict(cls, content: Mapping[str, Any], plant: Plant | MeasuredResponse, params: ParameterSet) -> Controller:
         """Return the controller of a controller.json; what it achieves is computed again on the design plant.
 
         One that calls itself feasible and breaks a limit there, as it may with other parameters, is not feasible.
@@ -340,6 +343,8 @@ class Controller:
         from seaopt.control.laws.stored import check_achieved, check_friction_margin, read_controller
 
         stored = read_controller(content)
+        if isinstance(plant, MeasuredResponse):
+            return cls._on_measured(stored, content, plant, params)
         measured = plant.outputs.get(stored["spec"].measured, "")
         stored["command"] = replace(
             stored["command"], largest=find_range(plant, params),
@@ -361,6 +366,25 @@ class Controller:
         ]
         loops[0] = controller._add_friction(loops[0])
         broken = tuple(list_broken_figures(controller.spec, loops) if controller.feasible else ())
+        if not broken:
+            return controller
+        return replace(controller, feasible=False, active_constraints=broken, blocked_by=broken)
+
+    @classmethod
+    def _on_measured(
+        cls, stored: dict[str, Any], content: Mapping[str, Any], measured: MeasuredResponse, params: ParameterSet
+    ) -> Controller:
+        """Return the controller of a file whose design plant is a measured response."""
+        from seaopt.control.laws.stored import check_achieved
+
+        spec: ControllerSpec = stored["spec"]
+        command: Command = stored["command"]
+        seen = see_response(measured, spec, command)
+        achieved = DiscLoop(plant=seen, law=stored["law"]).figures(spec.bandwidth_hz)
+        check_achieved(content.get("achieved"), _list_achieved(achieved))
+        stored["command"] = replace(command, largest=find_range(measured.plant, params))
+        controller = cls(**stored, achieved=achieved)
+        broken = tuple(list_broken_figures(spec, [controller.design_loop]) if controller.feasible else ())
         if not broken:
             return controller
         return replace(controller, feasible=False, active_constraints=broken, blocked_by=broken)

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.disc_loop import DiscLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import LoopFigures
 from seaopt.control.loops.measured_plant import ASSUMED, MeasuredPlant, sample_measured
 from seaopt.errors import ControlError
 from seaopt.formatting import format_number
 from seaopt.frequency import MeasuredResponse
 from seaopt.records import record
 
-REPORTED = ("stable", "ms", "ms_hz", "mt", "disk_margin", "noise_gain", "reference_peak", "droop_db")
-
 
 @record
 class MeasuredFigures:
-    """A law on one measured response; the figures are the worst of all responses in its discs.
+    """A law on one measured response; the figures are the worst of all responses in its discs, as in `LoopFigures`.
 
     Parameters
     ----------
@@ -33,10 +31,14 @@ class MeasuredFigures:
         Measured frequencies.
     band_hz : (low, high)
         Of them.
-    figures : LoopFigures
-        `stable` means shown to be stable, by the turns of 1 + L, under what is assumed.
     bandwidth_hz : (low or None, high or None)
         Of the responses in the discs.
+    stable : bool
+        Shown to be stable, by the turns of 1 + L, under what is `assumed`.
+    ms, ms_hz, mt, disk_margin, noise_gain, reference_peak, droop_db : float
+        Infinite, and the disk margin zero, where it is not.
+    assumed : str
+        Of the plant, besides the points.
 
     """
 
@@ -44,25 +46,33 @@ class MeasuredFigures:
     confidence: float
     points: int
     band_hz: tuple[float, float]
-    figures: LoopFigures
     bandwidth_hz: tuple[float | None, float | None]
+    stable: bool
+    ms: float
+    ms_hz: float
+    mt: float
+    disk_margin: float
+    noise_gain: float
+    reference_peak: float
+    droop_db: float
+    assumed: str = ASSUMED
 
-    def describe(self) -> str:
-        """Return one sentence."""
+    def __str__(self) -> str:
         low, high = (format_number(f, 3) for f in self.band_hz)
-        head = f"{self.name}: on {self.points} measured points from {low} to {high} Hz, at {self.confidence:.4g}"
-        if not self.figures.stable:
-            return f"{head}: not shown to be stable"
+        head = (
+            f"{self.name}: on {self.points} measured points from {low} to {high} Hz, at {100 * self.confidence:.4g} %"
+        )
+        if not self.stable:
+            return f"{head}, not shown to be stable"
         least, most = (format_number(f, missing="none") for f in self.bandwidth_hz)
-        return f"{head}: bandwidth {least} to {most} Hz, {self.figures.describe_peaks()}"
+        return (
+            f"{head}: bandwidth {least} to {most} Hz, Ms {self.ms:.4g}, Mt {self.mt:.4g}, noise gain "
+            f"{self.noise_gain:.4g}; assumed: {self.assumed}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
-        return {
-            "confidence": self.confidence, "points": self.points, "band_hz": list(self.band_hz),
-            "bandwidth_hz": list(self.bandwidth_hz), **{name: getattr(self.figures, name) for name in REPORTED},
-            "assumed": ASSUMED,
-        }  # fmt: skip
+        return asdict(self)
 
 
 def see_response(measured: MeasuredResponse, spec: ControllerSpec, command: Command) -> MeasuredPlant:
@@ -89,10 +99,12 @@ def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> Measur
     """Return the figures of a law on a measured response; the bandwidth is that asked for."""
     loop = DiscLoop(plant=plant, law=law)
     figures = loop.figures(bandwidth_hz)
+    taken = ("stable", "ms", "ms_hz", "mt", "disk_margin", "noise_gain", "reference_peak", "droop_db")
     return MeasuredFigures(
         name=plant.name, confidence=plant.confidence, points=plant.f.size,
-        band_hz=(float(plant.f[0]), float(plant.f[-1])), figures=figures,
+        band_hz=(float(plant.f[0]), float(plant.f[-1])),
         bandwidth_hz=loop.bandwidths_hz() if figures.stable else (None, None),
+        **{name: getattr(figures, name) for name in taken},
     )  # fmt: skip
 
 

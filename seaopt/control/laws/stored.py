@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, model_validator
 
 from seaopt.control.laws.command import Command
+from seaopt.control.laws.measured import MeasuredFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import (
     AGREES,
@@ -156,6 +157,33 @@ class StoredPossible(ResultTable):
         return self
 
 
+class StoredMeasured(ResultTable):
+    """What the law does on one measured response; what is not finite stands as nothing."""
+
+    name: str
+    confidence: Finite
+    points: Whole
+    band_hz: tuple[Finite, Finite]
+    bandwidth_hz: tuple[Finite | None, Finite | None]
+    stable: Flag
+    ms: Finite | None
+    ms_hz: Finite | None
+    mt: Finite | None
+    disk_margin: Finite
+    noise_gain: Finite | None
+    reference_peak: Finite | None
+    droop_db: Finite | None
+    assumed: str
+
+    def build(self) -> MeasuredFigures:
+        """Return the figures."""
+        fields: dict[str, Any] = self.model_dump()
+        sizes = ("ms", "mt", "noise_gain", "reference_peak", "droop_db")
+        missing: dict[str, Any] = {name: np.inf for name in sizes if fields[name] is None}
+        missing |= {"ms_hz": np.nan} if self.ms_hz is None else {}
+        return MeasuredFigures(**(fields | missing))
+
+
 class StoredController(ResultTable):
     """A controller.json."""
 
@@ -174,6 +202,7 @@ class StoredController(ResultTable):
     possible: StoredPossible | None = None
     observer: StoredObserver | None = None
     engineering: dict[str, StoredNumber] = {}
+    measured_responses: list[StoredMeasured] = []
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -207,6 +236,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "delay_samples": table.delay_samples, "command": _build_command(table.command), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
         "observer": observer, "blocked_by": tuple(table.blocked_by),
+        "measured": tuple(one.build() for one in table.measured_responses),
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
 

@@ -38,7 +38,7 @@ from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.records import record
 
 POINTS_BETWEEN = 4  # of the grid between two measured frequencies
-LEAST_TURN_RAD = 0.5  # between neighbours of the grid, refined until then
+MOST_TURN_RAD = 0.5  # between neighbours of the grid, refined until then
 REFINEMENTS = 12
 LEFT = 0.1  # of abs(1 + L)^2: where discs leave less, D goes on as a positive number, so that it has a logarithm
 KNOWN_TO = 0.97  # of a bandwidth: what `seaopt.control.laws.limits` asks of |F/F_ref| up to there
@@ -94,18 +94,22 @@ class DiscLoop:
         response, reach = self._distance(f)
         if np.any(np.abs(response) <= reach):
             return False
+        if np.any(np.abs(self.law.poles[self.law.integrators :]) >= 1.0):
+            return False  # a law that grows by itself is not counted here
         f = np.concatenate([[SLOWEST_HZ], f])
+        steps = self._turns(f)
         for _ in range(REFINEMENTS):
-            one = 1.0 + self.open_loop(f)
-            steps = np.angle(one[1:] / one[:-1])
-            wide = np.flatnonzero(np.abs(steps) > LEAST_TURN_RAD)
+            wide = np.flatnonzero(np.abs(steps) > MOST_TURN_RAD)
             if not wide.size:
                 break
             f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
-        if np.any(np.abs(self.law.poles[self.law.integrators :]) >= 1.0):
-            return False  # a law that grows by itself is not counted here
-        turned = float(np.sum(np.angle(one[1:] / one[:-1]))) / (0.5 * np.pi)
-        return abs(turned - self.law.integrators) < ROUND
+            steps = self._turns(f)
+        return abs(float(np.sum(steps)) / (0.5 * np.pi) - self.law.integrators) < ROUND
+
+    def _turns(self, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+        """Return by how much 1 + L of the centres turns from each frequency to the next (rad)."""
+        one = 1.0 + self.open_loop(f)
+        return np.angle(one[1:] / one[:-1])
 
     def _distance(self, f: Float[np.ndarray, " m"]) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return 1 + L of the centres, and how far the discs reach from it."""

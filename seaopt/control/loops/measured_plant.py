@@ -80,7 +80,7 @@ class MeasuredPlant:
 
     def response(self, f: Float[np.ndarray, " k"]) -> Complex[np.ndarray, " k"]:
         """Return the centres at any frequencies: zero above the band."""
-        out = np.interp(f, self.f, self.centre.real) + 1j * np.interp(f, self.f, self.centre.imag)
+        out = np.interp(f, self.f, np.real(self.centre)) + 1j * np.interp(f, self.f, np.imag(self.centre))
         below = f < self.f[0]
         turn = np.angle(self.centre[0] * np.sign(np.real(self.centre[0])))
         out[below] = self.static_gain * np.exp(1j * turn * f[below] / self.f[0])

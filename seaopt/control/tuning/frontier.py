@@ -13,10 +13,11 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
-from seaopt.control.tuning.tuner import disturbance, make_controller, make_task
+from seaopt.control.tuning.tuner import RobustTo, disturbance, make_controller, make_task
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import MISSING, format_figure, format_number, format_table, html_table
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
@@ -140,7 +141,7 @@ def sweep(
     params: Fit | ParameterSet,
     spec: ControllerSpec,
     bandwidths_hz: Sequence[float],
-    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]] | None = None,
+    robust_to: RobustTo | None = None,
     *,
     draws: Sequence[Mapping[str, float]] = (),
     progress: Progress = ignore,
@@ -202,11 +203,16 @@ def sweep(
 
 def _make_sliding_task(
     plant: Plant, params: ParameterSet, spec: ControllerSpec,
-    robust_to: Mapping[str, Plant | tuple[Plant, ParameterSet]], draws: Sequence[Mapping[str, float]],
+    robust_to: RobustTo, draws: Sequence[Mapping[str, float]],
 ) -> Task:  # fmt: skip
-    """Return the task on the sliding plants alone."""
-    pairs = {name: one if isinstance(one, tuple) else (one, params) for name, one in robust_to.items()}
-    sliding = {name: (take_sliding(model, model.complete(values)), values) for name, (model, values) in pairs.items()}
+    """Return the task on the sliding plants alone; measured ones are what they are."""
+    sliding: dict[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse] = {}
+    for name, one in robust_to.items():
+        if isinstance(one, MeasuredResponse):
+            sliding[name] = one
+            continue
+        model, values = one if isinstance(one, tuple) else (one, params)
+        sliding[name] = (take_sliding(model, model.complete(values)), values)
     return make_task(take_sliding(plant, plant.complete(params)), params, spec, sliding, draws)
 
 

@@ -19,11 +19,13 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
+from seaopt.control.laws.measured import measure_discs, see_response
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
@@ -45,6 +47,7 @@ from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
     friction_requirements,
+    measured_requirements,
     plant_requirements,
 )
 from seaopt.robustness.uncertainty.batch import batch_figures
@@ -115,6 +118,7 @@ def certify(
     simulations: bool = True,
     sensors: Sensors | None = None,
     current_step_A: float = 0.0,
+    measured: Mapping[str, MeasuredResponse] | None = None,
     progress: Progress = ignore,
 ) -> Certificate:
     """Check a controller against plants: at the nominal parameters, over draws, and simulated on the nonlinear plants.
@@ -158,6 +162,9 @@ def certify(
         `Certificate.with_simulation` does. False plays steps of several sizes alone, which takes a few seconds less.
     sensors, current_step_A
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
+    measured : mapping of name to MeasuredResponse, optional
+        Measured frequency responses on which stability, Ms, Mt and disk margin are required too, of every response in
+        the discs. Draws and simulations are of the models.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -240,13 +247,17 @@ def certify(
         *(row for name in plants for row in plant_requirements(controller, name, figures[name])),
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
+        *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
     )
     certificate = Certificate(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
         brackets=brackets, friction=friction, friction_draws=friction_draws, drawn_ms=drawn_ms,
-        remarks=(*_remark_delay(controller, parameters), *_remark_amplitude(controller, models, nominal)),
+        remarks=(
+            *_remark_measured(controller, measured or {}), *_remark_delay(controller, parameters),
+            *_remark_amplitude(controller, models, nominal),
+        ),
     )  # fmt: skip
     certificate = certificate.with_steps(stepping)
     if simulations:
@@ -270,6 +281,13 @@ def _add_warm_winding(
     check_ranges(ranges, models)
     ends = [*warm, *([ranges[AMBIENT]] if AMBIENT in ranges else [])]
     return {**ranges, AMBIENT: (min(low for low, _ in ends), max(high for _, high in ends))}
+
+
+def _remark_measured(controller: Controller, measured: Mapping[str, MeasuredResponse]) -> tuple[str, ...]:
+    """Say on which measured points the law was judged, and under what assumptions."""
+    spec = controller.spec
+    plants = {name: see_response(one, spec, controller.command) for name, one in measured.items()}
+    return tuple(str(measure_discs(plant, controller.law, spec.bandwidth_hz)) for plant in plants.values())
 
 
 def _remark_delay(controller: Controller, parameters: Fit | ParameterSet) -> tuple[str, ...]:
