@@ -101,7 +101,7 @@ _HOME = {
 }
 __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Parameter", "ParameterSet", "Plant", "plants", "Column", "Log", "contents", "read_log", "write_log",
-    "simulate", "Sensors", "virtual_log", "h1", "measure_response", "MeasuredResponse",
+    "simulate", "Sensors", "virtual_log", "h1", "MeasuredResponse", "measure_response",
     "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
     "PredictionError", "Fit", "fit", "diagnose", "compare", "profile", "bootstrap", "design_experiment",
     "ControllerSpec", "Controller", "corners", "tune", "assess", "export", "Certificate", "certify", "verify",

@@ -143,7 +143,7 @@ class DiscLoop:
         if down is not None and asked_hz is not None and KNOWN_TO * asked_hz <= down <= asked_hz <= (top or np.inf):
             down = asked_hz
         droop = np.min(least[f <= DROOP_BAND * (down or f[-1])], initial=static)
-        mt = float(np.max(sizes["L"][1]))
+        mt = float(np.max(sizes["L"][1], initial=1.0 if self.law.integrators else 0.0))  # T is 1 at 0 Hz
         phase = 2.0 * np.arcsin(min(max(0.5 / ms, 0.5 / mt), 1.0))
         large = sizes["L"][1] > 0.5
         late = np.arcsin(0.5 / sizes["L"][1][large]) / (np.pi * f[large])
@@ -151,7 +151,7 @@ class DiscLoop:
             stable=True, spectral_radius=0.0, bandwidth_hz=down, tracking_band_hz=_band(f, least, most),
             crossover_hz=crossovers[-1] if crossovers else None,
             sensitivity_bandwidth_hz=_first(f, s - HALF_POWER) or float(f[-1]), ms=ms, mt=mt,
-            ms_hz=float(f[np.argmax(s)]), reference_peak=float(np.max(most)) / static,
+            ms_hz=float(f[np.argmax(s)]), reference_peak=max(float(np.max(most)) / static, 1.0),
             droop_db=max(0.0, -20.0 * float(np.log10(max(droop, 1e-300) / static))),
             return_hz=None if down is None else self._find_return(f, most, down, static),
             gain_margin_db=float(-20.0 * np.log10(1.0 - 1.0 / ms)) if ms > 1.0 else None,
