@@ -10,7 +10,6 @@ import numpy as np
 
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
-from seaopt.control.laws.measured import MeasuredFigures, see_response
 from seaopt.control.laws.spec import ControllerSpec, describe_lifted
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains
 from seaopt.control.laws.verdict import (
@@ -22,10 +21,11 @@ from seaopt.control.laws.verdict import (
     shorten_blocked,
 )
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
-from seaopt.control.loops.disc_loop import DiscLoop
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
+from seaopt.control.loops.measured.figures import MeasuredFigures
+from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
@@ -379,7 +379,7 @@ class Controller:
 
         spec: ControllerSpec = stored["spec"]
         command: Command = stored["command"]
-        seen = see_response(measured, spec, command)
+        seen = spec.see_response(measured, command)
         achieved = DiscLoop(plant=seen, law=stored["law"]).figures(spec.bandwidth_hz)
         check_achieved(content.get("achieved"), _list_achieved(achieved))
         stored["command"] = replace(command, largest=find_range(measured.plant, params))

@@ -6,9 +6,12 @@ import math
 from dataclasses import asdict, fields
 from typing import Any, Literal
 
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.limits import BY_NAME, FIELDS, GIVEN_LAW_LIMITS, LIMITS, Limit
 from seaopt.control.laws.structures import CUSTOM, REFERENCE_WEIGHTS, STRUCTURES, Notch, ReferenceWeights, Structure
+from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
 from seaopt.errors import ControlError, suggestion
+from seaopt.frequency import MeasuredResponse
 from seaopt.records import record
 
 Level = float | Literal[False] | None  # of a limit: None is its default, False lifts it
@@ -222,6 +225,25 @@ class ControllerSpec:
     def sensitivity_bandwidth_limit_hz(self) -> float:
         """The smallest allowed sensitivity bandwidth: as given, or bandwidth_hz/5."""
         return self.level("min_sensitivity_bandwidth_hz") or 0.0
+
+    def see_response(self, measured: MeasuredResponse, command: Command) -> MeasuredPlant:
+        """Return what a controller of this specification, which gives a command, sees of a measured response.
+
+        Raises
+        ------
+        ControlError
+            The response is of another output, or of another input; or as `sample_measured`.
+
+        """
+        for what, own, other in (
+            ("output", measured.output, self.measured), ("input", measured.source, command.input)
+        ):  # fmt: skip
+            if own != other:
+                raise ControlError(
+                    f"frf:{measured.name}: is measured at the {what} {own}, and the controller's is {other}; measure "
+                    "that"
+                )
+        return sample_measured(measured, command.per_effort, self.sample_time_s, self.loop_delay_samples)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, model_validator
 
 from seaopt.control.laws.command import Command
-from seaopt.control.laws.measured import MeasuredFigures
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import (
     AGREES,
@@ -25,6 +24,7 @@ from seaopt.control.laws.structures import (
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError

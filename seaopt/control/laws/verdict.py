@@ -10,8 +10,8 @@ import numpy as np
 
 from seaopt.control.laws.limits import Limit, MeasuredLoop, Scope
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.disc_loop import DiscLoop, bound_disc
 from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
 from seaopt.formatting import format_count, join_words
 from seaopt.records import record
 

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
-from seaopt.control.loops.disc_loop import leave_positive
+from seaopt.control.loops.measured.loop import leave_positive
 from seaopt.control.tuning.optimisation_problem import (
     CURVES,
     FRICTION,

@@ -44,11 +44,11 @@ from seaopt.control.loops.absolute_stability import (
     friction_margin,
     limit_feedback,
 )
-from seaopt.control.loops.disc_loop import DiscLoop, bound_disc
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, Loop, LoopFigures
-from seaopt.control.loops.measured_plant import MeasuredPlant
+from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
+from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.plants import Plant

@@ -23,7 +23,6 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
-from seaopt.control.laws.measured import measure_all_discs, see_response
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM, DisturbanceObserver, Nominal
 from seaopt.control.laws.verdict import (
@@ -34,11 +33,12 @@ from seaopt.control.laws.verdict import (
     list_broken,
     list_broken_limits,
 )
-from seaopt.control.loops.disc_loop import DiscLoop
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law, make_static_law
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.measured_plant import MeasuredPlant
+from seaopt.control.loops.measured.figures import measure_all_discs
+from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.tuning.falling_friction import find_largest_fall
@@ -221,12 +221,12 @@ def make_task(
         if count != 2:
             raise ControlError(f"robust_to: {name} is a tuple of {count}; give a plant, or (plant, parameters)")
         require_plant(other[0] if isinstance(other, tuple) else other, f"robust_to: {name}", ControlError)
-    seen = {name: see_response(one, spec, command) for name, one in measured.items()}
+    seen = {name: spec.see_response(one, command) for name, one in measured.items()}
     first: dict[str, MeasuredPlant] = {}
     named: dict[str, tuple[Plant, ParameterSet]] = {}
     if isinstance(plant, MeasuredResponse):
         _check_measured_design(spec)
-        first[f"frf:{plant.name}"] = see_response(plant, spec, command)
+        first[f"frf:{plant.name}"] = spec.see_response(plant, command)
     else:
         named["design plant"] = (plant, values)
     named |= {str(name): p if isinstance(p, tuple) else (p, values) for name, p in models_given.items()}

@@ -19,8 +19,8 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller
 from seaopt.control.laws.delay import warn_short_delay
 from seaopt.control.laws.limits import LIMIT_ROUNDING
-from seaopt.control.laws.measured import measure_discs, see_response
 from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
@@ -286,7 +286,7 @@ def _add_warm_winding(
 def _remark_measured(controller: Controller, measured: Mapping[str, MeasuredResponse]) -> tuple[str, ...]:
     """Say on which measured points the law was judged, and under what assumptions."""
     spec = controller.spec
-    plants = {name: see_response(one, spec, controller.command) for name, one in measured.items()}
+    plants = {name: spec.see_response(one, controller.command) for name, one in measured.items()}
     return tuple(str(measure_discs(plant, controller.law, spec.bandwidth_hz)) for plant in plants.values())
 
 

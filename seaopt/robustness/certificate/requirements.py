@@ -9,11 +9,10 @@ import numpy as np
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.limits import LIMIT_ROUNDING, MeasuredLoop, PortFigures
-from seaopt.control.laws.measured import see_response
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import Verdict, judge
 from seaopt.control.loops.absolute_stability import FrictionMargin
-from seaopt.control.loops.disc_loop import DiscLoop
+from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.port import port_of
 from seaopt.formatting import format_values
 from seaopt.frequency import MeasuredResponse
@@ -58,7 +57,7 @@ def plant_requirements(controller: Controller, name: str, figures: LoopFigures) 
 
 def measured_requirements(controller: Controller, name: str, measured: MeasuredResponse) -> list[Requirement]:
     """Return what is required on a measured response: the limits of every plant, of every response in the discs."""
-    plant = see_response(measured, controller.spec, controller.command)
+    plant = controller.spec.see_response(measured, controller.command)
     figures = DiscLoop(plant=plant, law=controller.law).figures(controller.spec.bandwidth_hz)
     on = f"{name} (on measured points, at {100 * measured.confidence:.4g} %)"
     return plant_requirements(controller, on, figures)

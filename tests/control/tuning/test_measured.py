@@ -17,9 +17,9 @@ import seaopt as so
 from seaopt.bench import Chirp, Noise
 from seaopt.control import Gains, Loop
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.measured import measure_discs, see_response
-from seaopt.control.loops.disc_loop import DiscLoop, bound_disc
-from seaopt.control.loops.measured_plant import sample_measured
+from seaopt.control.loops.measured.figures import measure_discs
+from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
+from seaopt.control.loops.measured.plant import sample_measured
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, LogError
 from seaopt.files import to_json
@@ -217,7 +217,7 @@ def test_beside_a_model_the_limits_hold_on_the_discs_too():
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
     other = replace(exact(1e-3, relative=0.02), response=1.4 * exact(1e-3).response)  # 40 % more gain than the model
     alone, both = so.tune(STAND, THOR, spec), so.tune(STAND, THOR, spec, {"frf:chirp": other})
-    plant = see_response(other, both.spec, both.command)
+    plant = both.spec.see_response(other, both.command)
     assert measure_discs(plant, alone.law, 30.0).ms > 1.6
     assert both.feasible and measure_discs(plant, both.law, 30.0).ms <= 1.6
     assert "frf:chirp" in both.robust_to

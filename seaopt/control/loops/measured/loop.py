@@ -13,7 +13,7 @@ so that the largest and the least are exact. Where :math:`D \le 0` some response
 disc that reaches -1/C_y at any frequency, it can: every response in the discs turns 1 + L as often as the centres do,
 and the loop is stable if and only if that is :math:`m \pi/2` from 0 Hz to the Nyquist frequency (Nyquist; as the
 condition on measured data: Karimi, Kammer, Automatica 85, 2017, theorem 1, with C = 0 as the stabilising law that is
-known). Between, below and above the points it holds under the assumptions of `seaopt.control.loops.measured_plant`.
+known). Between, below and above the points it holds under the assumptions of `seaopt.control.loops.measured.plant`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from seaopt.control.loops.loop import (
     SHOULDER_FALL,
     LoopFigures,
 )
-from seaopt.control.loops.measured_plant import MeasuredPlant
+from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.records import record
 

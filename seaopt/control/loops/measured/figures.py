@@ -6,14 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from seaopt.control.laws.command import Command
-from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.disc_loop import DiscLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.measured_plant import ASSUMED, MeasuredPlant, sample_measured
-from seaopt.errors import ControlError
+from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.measured.plant import ASSUMED, MeasuredPlant
 from seaopt.formatting import format_number
-from seaopt.frequency import MeasuredResponse
 from seaopt.records import record
 
 
@@ -73,26 +69,6 @@ class MeasuredFigures:
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         return asdict(self)
-
-
-def see_response(measured: MeasuredResponse, spec: ControllerSpec, command: Command) -> MeasuredPlant:
-    """Return what a controller sees of a measured response.
-
-    Raises
-    ------
-    ControlError
-        It is of another output than the controller measures, or of another input than it commands; or as
-        `sample_measured`.
-
-    """
-    for what, own, other in (
-        ("output", measured.output, spec.measured), ("input", measured.source, command.input)
-    ):  # fmt: skip
-        if own != other:
-            raise ControlError(
-                f"frf:{measured.name}: is measured at the {what} {own}, and the controller's is {other}; measure that"
-            )
-    return sample_measured(measured, command.per_effort, spec.sample_time_s, spec.loop_delay_samples)
 
 
 def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> MeasuredFigures:

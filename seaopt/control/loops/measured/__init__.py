@@ -1,0 +1,1 @@
+"""Measured frequency responses as plants: discs over frequency, and the loops around them."""
