@@ -6,15 +6,18 @@ JSON has no infinity, so that null stands for one where a type here says so.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
 
 from seaopt.errors import FileError, SeaoptError, suggestion
 
+EXAMPLES = {"float": "1.0", "int": "1", "bool": "true", "string": '"..."'}  # of a kind of value
 MAX_SHOWN = 60  # characters of a wrong value that a message repeats
 # In a place of pydantic's these name what a value was tried as, and are no keys of the file.
 UNION_BRANCH = re.compile(r"\w*Table|float|int|bool|str|(literal|dict|tuple|list)\[.*|(function|constrained)-.*")
@@ -96,15 +99,27 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     ]
     first = inside[0] if first["type"] == "string_type" and inside else first
     place = _place(first["loc"])
+    own = place.rpartition(".")[2]
     if first["type"] == "extra_forbidden":
-        return f"unknown key {place}; {suggestion(str(first['loc'][-1]), _known_keys(model, first['loc']))}"
+        known = _known_keys(model, first["loc"])
+        near = get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.6)
+        line = f" write {near[0]} = {_spell(first['input'])}" if near else ""
+        return f"unknown key {place}; {suggestion(str(first['loc'][-1]), known)}{line}"
     if _is_range(first):
         at = _place(first["loc"][:-1] if first["type"] == "missing" else first["loc"])
-        return f"{at} = {_shorten(first['input'])} is not a range; give [low, high]"
+        return (
+            f"{at} = {_shorten(first['input'])} is not a range; give [low, high]: {at.rpartition('.')[2]} = [1.0, 2.0]"
+        )
     if first["type"] == "missing":
-        return f"key {place} is missing; {remedy or 'add it'}"
+        return f"key {place} is missing; {remedy or f'add it: {own} = ...'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    return f"{place} = {_shorten(first['input'])}: {words}" + (f"; {remedy}" if remedy else "")
+    correct = f"correct it: {own} = {EXAMPLES.get(first['type'].partition('_')[0], '...')}"
+    return f"{place} = {_shorten(first['input'])}: {words}; {remedy or correct}"
+
+
+def _spell(value: Any) -> str:
+    """Return a value as TOML has it, where it is short."""
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | int | float) else "..."
 
 
 def _is_range(mistake: Mapping[str, Any]) -> bool:

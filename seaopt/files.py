@@ -51,9 +51,9 @@ def check_folder(path: Path) -> None:
     try:
         is_file = path.exists() and not path.is_dir()
     except (OSError, ValueError) as error:
-        raise FileError(f"{path}: cannot be a folder ({describe_os_error(error)}); give another one with -o") from error
+        raise FileError(f"{path}: cannot be a folder ({describe_os_error(error)}); give another one: -o out") from error
     if is_file:
-        raise FileError(f"{path}: is a file; give a folder for the results with -o")
+        raise FileError(f"{path}: is a file; give a folder for the results: -o out")
 
 
 def write_bytes(path: Path | str, content: bytes) -> Path:

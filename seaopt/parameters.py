@@ -63,18 +63,22 @@ class Parameter:
         if not math.isfinite(self.value):
             unit = unit_after(self.unit)
             what = f"a number in{unit}" if unit else "a number"
-            raise ParameterError(f"parameter {self.name} = {self.value} is not finite; give {what}")
+            raise ParameterError(f"parameter {self.name} = {self.value} is not finite; give {what}: {self.name} = 1.0")
         if not self.min <= self.max:
-            raise ParameterError(f"parameter {self.name}: min = {self.min:g} is above max = {self.max:g}; swap them")
+            raise ParameterError(
+                f"parameter {self.name}: min = {self.min:g} is above max = {self.max:g}; swap them: "
+                f"min = {self.max:g}, max = {self.min:g}"
+            )
         if not self.min <= self.value <= self.max:
             raise ParameterError(
                 f"parameter {self.name} = {self.value:g}{unit_after(self.unit)} is outside its bounds "
-                f"[{self.min:g}, {self.max:g}]; change the value or the bounds"
+                f"[{self.min:g}, {self.max:g}]; change the value or the bounds: "
+                f"min = {min(self.min, self.value):g}, max = {max(self.max, self.value):g}"
             )
         if self.prior_std is not None and not 0.0 < self.prior_std < math.inf:
             raise ParameterError(
                 f"parameter {self.name}: prior_std = {self.prior_std:g} is not a positive number; "
-                "leave it out where nothing is known, or fix the parameter"
+                f"leave it out where nothing is known, or fix the parameter: {self.name} = {self.value:g}"
             )
 
     @property

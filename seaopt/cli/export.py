@@ -34,7 +34,7 @@ def export_controller(
         raise ProblemError(
             f"{path}: no such file; give the folder of results, or make them: seaopt run PROBLEM -o {results}"
         )
-    content = read_json(path, SCHEMAS["tune"])
+    content = read_json(path, SCHEMAS["tune"], remedy=f"run seaopt tune PROBLEM -o {results}")
     fitted, made_from = results / FILES["fit"], content.get("made_from")
     check_unedited(path, content, "run seaopt tune again")
     expected = None if made_from is None else made_from.get(fitted.name)

@@ -36,6 +36,7 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
+from seaopt.problem.problem import WRITE_ONE
 from seaopt.problem.stages import (
     assess_problem,
     can_design,
@@ -120,7 +121,7 @@ class Session:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ProblemError(f"{folder}: cannot be made ({error.strerror}); give another folder with -o") from error
+            raise ProblemError(f"{folder}: cannot be made ({error.strerror}); give another folder: -o out") from error
         self.folder = folder
         self.stretch_s = stretch_s
         self.bandwidths_hz = bandwidths_hz
@@ -337,7 +338,7 @@ class Session:
         path, again = self.folder / FILES[stage], f"run seaopt {stage} {self.problem.source} -o {self.folder}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
-        content = read_json(path, SCHEMAS[stage])
+        content = read_json(path, SCHEMAS[stage], remedy=again)
         check_unedited(path, content, f"{again} again")
         made_from = content.get("made_from")
         if made_from is None:
@@ -352,7 +353,7 @@ class Session:
 
     def _simulate(self, tell: Progress) -> None:
         if not self.problem.table.experiment:
-            raise ProblemError(f"{self.problem.source}: has no [[experiment]] to simulate; add one")
+            raise ProblemError(f"{self.problem.source}: has no [[experiment]] to simulate; {WRITE_ONE}")
         runs: dict[str, Log] = {}
         tables = {table.name: table for table in self.problem.table.experiment}
         for experiment in count_off(self.experiments(), "experiment", tell):
@@ -394,7 +395,7 @@ class Session:
         """Score the folder's fit on another log, and print that; all of what the log has to say, if `verbose`."""
         fitted = self.parameters()
         if isinstance(fitted, ParameterSet):
-            raise ProblemError(f"{self.problem.source}: has no [[experiment]] that is fitted; nothing to validate")
+            raise ProblemError(f"{self.problem.source}: has no [[experiment]] that is fitted; {WRITE_ONE}")
         score = fitted.predict(self.problem.experiment_like(log, like))
         if as_json:
             content = {
@@ -416,7 +417,7 @@ class Session:
 
     def _frf(self, tell: Progress) -> None:
         if not self.problem.table.experiment:
-            raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; add one")
+            raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; {WRITE_ONE}")
         experiments = self.experiments()
         fitted = self._read_fit_if_any()
         responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s, tell)

@@ -58,6 +58,7 @@ from seaopt.signals import Signal
 from seaopt.simulation import Clock
 from seaopt.units import ROTARY, factor, same_dimension, unit_after
 
+WRITE_ONE = "add one, or write a file from a log: seaopt new LOG"
 OWN = "parameter "  # before the name of a parameter that is read as a channel
 ROUNDED = 1e-9  # relative: a constant column that was interpolated to another clock
 
@@ -102,11 +103,16 @@ class Problem:
             "holdout": table.holdout,
         }
 
+    def _ask_for_controller(self) -> str:
+        """Return what to say where the file has no controller: the least table of one."""
+        table = f'controller = {{ plant = "{next(iter(self.plants), "stand")}", bandwidth_hz = 30 }}'
+        return f"{self.source}: has no [controller]; add one to tune or certify: {table}"
+
     @property
     def design_plant(self) -> Plant:
         """The plant that the controller is designed on; of a measured response, what was on the bench."""
         if self.table.controller is None:
-            raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
+            raise ProblemError(self._ask_for_controller())
         name = self.table.controller.plant
         on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in self.table.experiment}
         return self.plants[on_bench.get(name, name)]
@@ -197,7 +203,7 @@ class Problem:
     def certified_plants(self) -> dict[str, Plant]:
         """Return the design plant and those of [robustness], by name."""
         if self.table.controller is None:
-            raise ProblemError(f"{self.source}: has no [controller]; add one to tune or certify")
+            raise ProblemError(self._ask_for_controller())
         names = [self.table.controller.plant, *self.table.controller.robust_to]
         names = [name for name in names if not name.startswith(RESPONSE)]
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}

@@ -40,14 +40,20 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         places += [("robustness.plants", name) for name in table.robustness.plants]
     for place, name in places:
         if name not in plants:
-            raise ProblemError(f'{place} = "{name}" is not a [plant] of this file; {suggestion(name, plants)}')
+            key, near = place.rpartition(".")[2], _nearest(name, [*plants])
+            line = f'{key} = "{near}"' if key == "plant" else f'{key} = ["{near}"]'
+            raise ProblemError(
+                f'{place} = "{name}" is not a [plant] of this file ({suggestion(name, plants)}); write {line}'
+            )
     _check_measured(table, plants)
     _check_ranges(table, plants, parameters)
     _check_sensors(table, plants)
     seen: set[str] = set()
     for experiment in table.experiment:
         if experiment.name in seen:
-            raise ProblemError(f'experiment.name = "{experiment.name}" is used twice; rename one')
+            raise ProblemError(
+                f'experiment.name = "{experiment.name}" is used twice; rename one: name = "{experiment.name}_2"'
+            )
         seen.add(experiment.name)
         _check_experiment(experiment, plants[experiment.plant])
     if table.expect is not None:
@@ -171,7 +177,8 @@ def _check_own_bounds(place: str, ends: tuple[float, float], parameter: Paramete
     if ends[0] < parameter.min or ends[1] > parameter.max:
         raise ProblemError(
             f"{place}{unit_after(parameter.unit)} leaves the bounds [{parameter.min:g}, {parameter.max:g}] that this "
-            f"file gives {parameter.name}; keep inside, or change min and max of parameters.{parameter.name}"
+            f"file gives {parameter.name}; keep inside, or change min and max: "
+            f"min = {min(ends[0], parameter.min):g}, max = {max(ends[1], parameter.max):g}"
         )
 
 
@@ -181,7 +188,7 @@ def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
         raise ProblemError(
             f"{place} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
             f"takes at most {MAX_LINK_DELAY_SAMPLES} ({MAX_LINK_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and "
-            "whole samples that are always there belong in controller.delay_samples"
+            f"whole samples that are always there are delay_samples = {max(1, round(longest_s * rate_hz))}"
         )
 
 
@@ -192,7 +199,7 @@ def _first_log(experiment: ExperimentTable) -> str:
 def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
     place = f"experiment.{experiment.name}"
     if (experiment.log is None) == (experiment.virtual is None):
-        raise ProblemError(f"{place}: give either log or virtual, and not both")
+        raise ProblemError(f'{place}: give either log or virtual, and not both: log = "NAME.csv"')
     if experiment.log is not None:
         driven = any(name not in plant.optional_inputs for name in plant.inputs)
         if not experiment.outputs or (driven and not experiment.inputs):

@@ -15,7 +15,7 @@ from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.problem.problem import Problem
+from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, ignore
 from seaopt.robustness import Budget, Certificate, JointTuning, certify, tune_certified
 
@@ -44,10 +44,10 @@ def fit_problem(
 
     """
     if not problem.table.experiment:
-        raise ProblemError(f"{problem.source}: has no [[experiment]] to fit; add one")
+        raise ProblemError(f"{problem.source}: has no [[experiment]] to fit; {WRITE_ONE}")
     fitted = problem.choose_fitted(problem.experiments() if experiments is None else experiments)
     if not fitted:
-        raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them')
+        raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them: use = "fit"')
     return fit(
         fitted, problem.parameters, progress=progress, alternatives=tuple(problem.plants.values()),
         **problem.fit_options,
@@ -138,7 +138,9 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
 
     """
     if problem.spec is None:
-        raise ProblemError(f"{problem.source}: has no [controller], whose limits a law is measured against; add one")
+        raise ProblemError(
+            f"{problem.source}: has no [controller], whose limits a law is measured against; add one: bandwidth_hz = 30"
+        )
     if given.measured not in (None, problem.spec.measured):
         raise ProblemError(
             f"the law measures {given.measured}, and [controller] of {problem.source} {problem.spec.measured}; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -238,3 +239,58 @@ def test_names_that_are_not_utf8_are_files_too(folder):
         io.TextIOWrapper(io.BytesIO(done.stdout), encoding="utf-8").read()
     assert (os.fsencode(folder) + b"/out\xfe/quality.json").decode("utf-8", "surrogateescape")
     assert os.path.exists(os.fsencode(folder) + b"/out\xfe/quality.json")  # noqa: PTH110
+
+
+# A command, a line of a problem file, an option, or a call of Python, at the end of the message.
+REMEDY = re.compile(r'(seaopt [a-z]+( \S+)*|\bls \S+|\w+ = \S.*|-o \w+|"[\w:.]+")( in \[\w+\])?( (again|first))?$')
+REFUSALS = {
+    "missing problem": (("run", "nothing.toml"), "", ""),
+    "missing log": (("fit", "p.toml"), '"ok.csv"', '"gone.csv"'),
+    "empty log": (("fit", "p.toml"), '"ok.csv"', '"empty.csv"'),
+    "log that is missing": (("inspect", "gone.csv"), "", ""),
+    "wrong column": (("fit", "p.toml"), 'column = "F1"', 'column = "F11"'),
+    "no such column": (("fit", "p.toml"), 'column = "F1"', 'column = "torque"'),
+    "no TOML": (("fit", "p.toml"), "schema = 1", "schema ="),
+    "unknown key": (("fit", "p.toml"), "bandwidth_hz", "bandwith_hz"),
+    "missing key": (("fit", "p.toml"), "bandwidth_hz = 30\n", ""),
+    "kind of value": (("fit", "p.toml"), "bandwidth_hz = 30", 'bandwidth_hz = "fast"'),
+    "bandwidth": (("fit", "p.toml"), "bandwidth_hz = 30", "bandwidth_hz = 99"),
+    "limit": (("fit", "p.toml"), "bandwidth_hz = 30", "bandwidth_hz = 30\nmax_sensitivity = 0.9"),
+    "sample rate": (("fit", "p.toml"), "bandwidth_hz = 30", "bandwidth_hz = 30\nsample_rate_hz = 50"),
+    "delay": (("fit", "p.toml"), "bandwidth_hz = 30", "bandwidth_hz = 30\ndelay_samples = 9999"),
+    "bounds": (("fit", "p.toml"), "value = 3e-6", "value = 3.0"),
+    "plant": (("fit", "p.toml"), 'plant = "stand"\nbandwidth', 'plant = "stad"\nbandwidth'),
+    "measured": (("fit", "p.toml"), "bandwidth_hz = 30", 'bandwidth_hz = 30\nmeasured = "F3"'),
+    "name twice": (("fit", "p.toml"), "[controller]", EXPERIMENT + "[controller]"),
+    "no controller": (("tune", "p.toml"), CONTROLLER, ""),
+    "no experiment": (("fit", "p.toml"), EXPERIMENT, ""),
+    "nothing to simulate": (("simulate", "p.toml"), EXPERIMENT, ""),
+    "stage before": (("tune", "p.toml"), "", ""),
+    "no results": (("export", "none", "--c", "c"), "", ""),
+    "folder": (("fit", "p.toml", "-o", "ok.csv"), "", ""),
+    "law that is missing": (("certify", "p.toml", "--controller", "gone.json"), "", ""),
+    "sweep": (("tune", "p.toml", "--sweep", "15"), "", ""),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_what_is_refused_ends_with_what_to_type(seaopt, bad, folder, name):
+    arguments, old, new = REFUSALS[name]
+    text = BASE + EXPERIMENT + CONTROLLER
+    assert old in text
+    bad(text.replace(old, new, 1))
+    (folder / "empty.csv").write_text("", encoding="utf-8")
+    result = seaopt(*arguments)
+    check_refused(result)
+    assert REMEDY.search(result.stderr.strip()), result.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [({"schema": "seaopt/fit/1"}, "schema"), ({"made_from": {}}, "made_from"), ({"met": 3}, "")]
+)
+def test_a_stale_fit_is_refused_with_the_command_that_makes_it_again(copied, seaopt, change, words):
+    path = copied / "all" / "fit.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | change), encoding="utf-8")
+    result = seaopt("tune", "short.toml", "-o", "all")
+    check_refused(result, words)
+    assert REMEDY.search(result.stderr.strip()), result.stderr

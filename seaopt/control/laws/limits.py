@@ -264,13 +264,19 @@ class Limit:
         if level is None or level is False:
             return
         if isinstance(level, bool) or not isinstance(level, (int, float)) or not math.isfinite(level):
-            raise ControlError(f"{self.name} = {level!r} is not a finite number; give one, or false to lift the limit")
+            raise ControlError(
+                f"{self.name} = {level!r} is not a finite number; give one, or lift the limit: {self.name} = false"
+            )
         if self.above is not None and not self.in_range(level):
             upper = "" if self.below is None else f" and less than {self.below:g}"
-            raise ControlError(f"{self.name} = {level:g} can be met by no loop; give more than {self.above:g}{upper}")
+            raise ControlError(
+                f"{self.name} = {level:g} can be met by no loop; give more than {self.above:g}{upper}, "
+                f"or lift the limit: {self.name} = false"
+            )
         if self.bandwidth_divisor is not None and not 0.0 <= level < bandwidth_hz:
             raise ControlError(
-                f"{self.name} = {level:g} is not between 0 and bandwidth_hz = {bandwidth_hz:g}; lower it"
+                f"{self.name} = {level:g} is not between 0 and bandwidth_hz = {bandwidth_hz:g}; lower it: "
+                f"{self.name} = {0.2 * bandwidth_hz:g}"
             )
 
     def keeps(self, value: float, allowed: float) -> bool:

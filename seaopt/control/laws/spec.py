@@ -114,11 +114,15 @@ class ControllerSpec:
         self._check_types()
         low, high = self.bandwidth_range_hz
         if not 0.0 < low < high:
-            raise ControlError(f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high")
+            raise ControlError(
+                f"bandwidth_range_hz = [{low:g}, {high:g}] is not a range; give 0 < low < high: "
+                "bandwidth_range_hz = [15, 60]"
+            )
         if not low <= self.bandwidth_hz <= high:
             raise ControlError(
                 f"bandwidth_hz = {self.bandwidth_hz:g} is outside {low:g} to {high:g}; choose one inside, "
-                "or give another bandwidth_range_hz"
+                f"or give another range: bandwidth_range_hz = [{min(low, self.bandwidth_hz):g}, "
+                f"{max(high, self.bandwidth_hz):g}]"
             )
         if self.structure not in STRUCTURES:
             raise ControlError(
@@ -130,20 +134,24 @@ class ControllerSpec:
                 f"{suggestion(str(self.reference_weights), REFERENCE_WEIGHTS)}"
             )
         if self.objective not in ("disturbance", "noise"):
-            raise ControlError(f'objective = "{self.objective}" is not known; use "disturbance" or "noise"')
+            raise ControlError(
+                f'objective = "{self.objective}" is not known; use "noise", or objective = "disturbance"'
+            )
         if not 0 <= self.loop_delay_samples <= MAX_DELAY_SAMPLES:
-            raise ControlError(f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}")
+            raise ControlError(
+                f"delay_samples = {self.delay_samples} is not from 0 to {MAX_DELAY_SAMPLES}; give delay_samples = 1"
+            )
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
             raise ControlError(
                 f"sample_rate_hz = {self.sample_rate_hz:g} is too slow for bandwidth_hz = {self.bandwidth_hz:g}; "
-                "sample more than four times as fast"
+                f"sample more than four times as fast: sample_rate_hz = {10.0 * self.bandwidth_hz:g}"
             )
         self._check_limits()
 
     def _check_types(self) -> None:
         if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int | None):
             raise ControlError(
-                f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give 0, 1, ..."
+                f"delay_samples = {self.delay_samples!r} is not a whole number of samples; give delay_samples = 1"
             )
         for name in ("bandwidth_hz", "sample_rate_hz", "reserve", *OPTIONAL):
             value = getattr(self, name)
@@ -158,7 +166,9 @@ class ControllerSpec:
         self._check_notch()
         self._check_band()
         if self.step_N is not None and not self.step_N > 0.0:
-            raise ControlError(f"step_N = {self.step_N:g} is not positive; give the step's size")
+            raise ControlError(
+                f"step_N = {self.step_N:g} is not positive; give the step's size: step_N = {abs(self.step_N) or 10.0:g}"
+            )
         check_command_limits(self.current_limit_A, self.command_limit)
         if not 0.0 <= self.reserve < 0.5:
             raise ControlError(f"reserve = {self.reserve:g} is not a small fraction; give 0 to 0.5")

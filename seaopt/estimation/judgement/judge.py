@@ -48,6 +48,7 @@ HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
 PUSH = 4.0  # standard deviations that a bound holds an estimate away from where the logs want it
+NOISELESS = 1e-6  # of the spread: 20 bits, and less than rounding to single precision makes of a log
 FEWEST_SAMPLES, SAMPLES_PER_UNKNOWN = 100, 15
 RIVAL_SHARE = 0.9  # of what the best cause gains: no reason to prefer one
 FAR = 3.0  # times beyond a plausible range
@@ -78,7 +79,12 @@ def judge(fit: Fit, alternatives: Sequence[Plant] = (), progress: Progress = ign
     fit = replace(fit, outputs=outputs)
     excess = _measure_excess(minimum.problem, residuals)
     findings = [*_find_unexplained(fit, shares, excess), *_find_held_out(outputs), *_find_at_bound(fit, minimum)]
-    findings += [*_find_implausible(fit), *_find_contradicting_delays(fit), *_find_few_samples(fit, minimum)]
+    findings += [
+        *_find_implausible(fit),
+        *_find_contradicting_delays(fit),
+        *_find_few_samples(fit, minimum),
+        *_find_noiseless(fit, minimum),
+    ]
     tests = _run_tests(fit, minimum)
     suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     wrong = (
@@ -298,6 +304,21 @@ def _find_few_samples(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
             severity="error", kind="samples", where="",
             text=f"{samples} samples are too few for {unknowns} unknowns: nothing tests the model; log longer",
         )  # fmt: skip
+
+
+def _find_noiseless(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
+    """Yield outputs whose noise was estimated and is less than any sensor's: stds that follow from it say nothing."""
+    for output in minimum.problem.outputs:
+        experiment, name = output.experiment, output.name
+        spread = float(experiment.spread[experiment.data.outputs.index(name)])
+        one = fit.outputs[experiment.name][name]
+        if name not in experiment.data.sigma and 0.0 <= one.rms_residual < NOISELESS * spread:
+            yield FitFinding(
+                severity="note", kind="noise", where=f"{experiment.name}.{name}",
+                text=f"its residual of {one.rms_residual:.2g}{unit_after(one.unit)} is rounding, less than the noise "
+                "of any sensor, as of simulated data: the stds say nothing; give the noise that it "
+                "would have: sigma = ...",
+            )  # fmt: skip
 
 
 def _count(experiment: FitExperiment) -> int:

@@ -91,16 +91,16 @@ def _first_bytes(path: Path) -> bytes:
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            raise LogError(f"{path}: is a folder; give a file")
+            raise LogError(f"{path}: is a folder; give a file: seaopt inspect {path / 'NAME.csv'}")
         if not stat.S_ISREG(mode):
-            raise LogError(f"{path}: is a pipe, a device or a socket; give a regular file")
+            raise LogError(f"{path}: is a pipe, a device or a socket; give a regular file: seaopt inspect NAME.csv")
         with path.open("rb") as stream:
             head = stream.read(4096)
     except FileNotFoundError as error:
-        raise LogError(f"{path}: no such file; check the path") from error
+        raise LogError(f"{path}: no such file; check the path: ls {path.parent}") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise LogError(f"{path}: cannot be read ({reason}); check the path") from error
+        raise LogError(f"{path}: cannot be read ({reason}); check the path: ls {path.parent}") from error
     if not head.strip(b" \t\r\n"):
-        raise LogError(f"{path}: the file is empty; record the log again")
+        raise LogError(f"{path}: the file is empty; record the log again, then look at it: seaopt inspect {path}")
     return head

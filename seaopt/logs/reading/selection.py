@@ -6,6 +6,7 @@ import collections
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 from seaopt.errors import LogError, SeaoptError, UnitError, suggestion
@@ -203,7 +204,10 @@ def _explain_missing(places: Sequence[Source], name: str, column: str | int) -> 
         numbers = ", ".join(map(str, repeated[:MAX_NAMES]))
         how = spell_column(column=repeated[0] or 1)
         return f'{len(repeated)} columns are named "{column}"; give the number of the one for {name}, {numbers}: {how}'
-    return f'no column "{column}" for {name}; {suggest_names(column, [field.name for field in fields])}'
+    names = [field.name for field in fields]
+    near = get_close_matches(column, names, n=1, cutoff=0.6)
+    how = f' write {name} = "{near[0]}"' if near else f"; list them: seaopt inspect {places[0].path} --list"
+    return f'no column "{column}" for {name}; {suggest_names(column, names)}{how}'
 
 
 def suggest_names(name: str, names: Sequence[str]) -> str:
