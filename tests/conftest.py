@@ -14,10 +14,10 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from types import CodeType, ModuleType
-from typing import Literal
+from types import CodeType, ModuleType, SimpleNamespace
+from typing import Any, Literal, get_type_hints
 
 os.environ.setdefault("SEAOPT_CACHE_DIR", tempfile.mkdtemp(prefix="seaopt-tests-"))
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost these small problems more than they bring
@@ -53,9 +53,23 @@ checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=
 sys.modules["seaopt_type_checker"] = checker
 
 ALWAYS, EVERY = 3, 200
-check_all_calls = jaxtyping.jaxtyped
 numbers: dict[CodeType, int] = {}  # of functions: a hash of the code itself at every call takes longer than most calls
 calls: defaultdict[int, int] = defaultdict(int)
+
+
+def make_checked(function):
+    """Return a function that checks its arguments, then its result: once, where jaxtyping's own wrapper does so twice."""
+    function.__annotations__ = {name: resolve(hint, function) for name, hint in function.__annotations__.items()}
+    return checker.check(function)
+
+
+def resolve(hint, function):
+    """Return an annotation as a type; Any where its names are known to type checkers alone."""
+    one = SimpleNamespace(__annotations__={"hint": hint})
+    try:
+        return get_type_hints(one, function.__globals__, include_extras=True)["hint"]
+    except NameError:
+        return Any
 
 
 def check_calls(function):
@@ -76,8 +90,9 @@ def check_calls(function):
         if count > ALWAYS and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
-            checked = check_all_calls(function, typechecker=checker.check)
-        return checked(*args, **kwargs)
+            checked = make_checked(function)
+        with shapes_of_one_call():
+            return checked(*args, **kwargs)
 
     return call
 
@@ -92,6 +107,7 @@ def pytest_runtest_setup() -> None:
     calls.clear()
 
 
+shapes_of_one_call = partial(jaxtyping.jaxtyped, "context")
 jaxtyping.jaxtyped = lambda typechecker: check_calls
 jaxtyping.install_import_hook("seaopt", "seaopt_type_checker.check")
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import jaxtyping
 import numpy as np
 import pytest
+from beartype.roar import BeartypeCallHintViolation
 
 from seaopt.estimation.problem.normal_equations import measure_decrement
 
@@ -12,7 +12,7 @@ from seaopt.estimation.problem.normal_equations import measure_decrement
 @pytest.mark.parametrize("run", ["first", "after many calls"])
 def test_a_wrong_shape_is_caught(run):
     """Calls are checked now and then; the first ones of each test are, whatever ran before it."""
-    with pytest.raises(jaxtyping.TypeCheckError, match="gradient"):
+    with pytest.raises(BeartypeCallHintViolation, match="gradient"):
         measure_decrement(np.eye(2), np.ones(3), 1e-12)
     for _ in range(200):
         assert measure_decrement(np.eye(2), np.ones(2), 1e-12) == pytest.approx(2.0)
