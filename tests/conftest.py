@@ -58,7 +58,7 @@ calls: defaultdict[int, int] = defaultdict(int)
 
 
 def make_checked(function):
-    """Return a function that checks its arguments, then its result: once, where jaxtyping's own wrapper does so twice."""
+    """Return a function that checks its arguments once; those that jaxtyping makes do so again with the result."""
     function.__annotations__ = {name: resolve(hint, function) for name, hint in function.__annotations__.items()}
     return checker.check(function)
 

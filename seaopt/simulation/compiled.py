@@ -1,4 +1,7 @@
-"""The compiled passes: pass.c around CasADi's generated rate and output, or the exact matrices of a linear plant."""
+"""The compiled passes: pass.c around CasADi's generated rate and output, or the exact matrices of a linear plant.
+
+A kernel of passes is compiled for each model; what they do to residuals (sums.c) once for all.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from seaopt.plants.memo import memo
 from seaopt.simulation.discretisation import Clock, transition
 from seaopt.simulation.integrator import output_function, rate_functions, step_function
 from seaopt.simulation.model import Model
-from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
+from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, load_library, row_addresses
 from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
 
 PARALLEL = 20_000  # samples below which a second thread does not pay
@@ -36,8 +39,9 @@ def _arguments(nu: int, ny: int) -> np.dtype[Any]:
         ("drift", pointer),
         ("sos", pointer), ("sections", whole), ("loss", whole), ("knee", pointer), ("gram", pointer),
         ("rho", pointer), ("count", pointer), ("outputs", pointer), ("columns", pointer), ("states", pointer),
-        ("last", pointer), ("carry", pointer), ("into", pointer), ("correlation", pointer), ("ring", pointer),
-        ("form", pointer), ("lags", whole), ("parts", whole), ("warm", whole),
+        ("last", pointer), ("carry", pointer), ("lags", whole), ("parts", whole),
+        ("outputs_of", whole), ("columns_in", whole), ("into", pointer), ("correlation", pointer), ("ring", pointer),
+        ("form", pointer), ("warm", whole),
     ])  # fmt: skip
 
 
@@ -79,7 +83,7 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
             _chain_code("output", rates.output_pattern, model.ny),
         )
         generated += "\n".join((generate_code(rates.rate, rates.output), *chains))
-    return "\n".join((define_constants(constants), _text("layout.h"), generated, _text("pass.c")))
+    return "\n".join((define_constants(constants), _text("sums.h"), _text("layout.h"), generated, _text("pass.c")))
 
 
 def _write_sampling(model: Model) -> str:
@@ -101,7 +105,7 @@ def _drop_derivatives(function: ca.Function, name: str) -> ca.Function:
     return ca.Function(name, arguments, function.call(arguments)[:1], {"cse": True})
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _text(name: str) -> str:
     return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
 
@@ -125,8 +129,12 @@ def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int,
 def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
     kernel = load_kernel(kernel_source(model, layout, delayed, measured=measured), "seaopt_passes")
-    if kernel is not None:
-        kernel.library.carry_size.restype = ctypes.c_long
+    sums = load_library(_text("sums.h") + _text("sums.c"))
+    if kernel is None or sums is None:
+        return None
+    table = ctypes.c_char.in_dll(sums, "seaopt_sums")
+    ctypes.c_void_p.in_dll(kernel.library, "sums").value = ctypes.addressof(table)
+    kernel.library.carry_size.restype = ctypes.c_long
     return kernel
 
 
@@ -314,6 +322,7 @@ class Program:
         arguments = np.repeat(self.base, len(warm))
         arguments["from"], arguments["start"], arguments["to"] = edges[:-1] - warm, edges[:-1] - warm, edges[1:]
         arguments["warm"], arguments["lags"], arguments["parts"] = warm, len(r) - 1, width // 4
+        arguments["outputs_of"], arguments["columns_in"] = ny, nc
         arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
         for name, array in {"x0": starts, "ring": ring, "form": form}.items():
             arguments[name] = row_addresses(array)

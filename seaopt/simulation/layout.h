@@ -16,8 +16,6 @@
 #define NCP PADDED(NC)
 #define MAX_SECTIONS 8
 
-typedef double vec __attribute__((vector_size(32), may_alias)); /* four derivatives at once; no processor needs to know it */
-
 /* The C library's tanh is several times slower than its exp. Below 1/32 the series, whose next term is 1e-17. */
 static inline double seaopt_tanh(double x) {
     const double size = fabs(x), s = x * x;

@@ -1,6 +1,6 @@
 /* Passes over stretches of a log: state, sensitivities, outputs, weighted residuals and their Gram matrices.
 
-   Built with constants and layout.h in front (see seaopt/simulation/compiled.py).
+   Built with constants, sums.h and layout.h in front (see seaopt/simulation/compiled.py).
 
    Every array that is summed over derivatives has them last and padded to whole vectors: Z[i][0] is the state x_i and
    Z[i][j] its derivative to unknown j, so that one loop over j advances all.
@@ -43,14 +43,11 @@ typedef struct {
     double *last;                  /* NX x NJ: Z one step after the last row, or NULL; without sums, columns and influences
                                       its derivatives are not made */
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
-    const double *into;            /* NY x NC x 4 parts: takes v to its influence on so many estimates; or NULL */
-    const double *correlation;     /* (1 + lags) x NY x NY: R(k), R(0) halved */
-    double *ring;                  /* 2 (1 + lags) x NY x 4 parts: influences of the last samples, zero at first */
-    double *form;                  /* 2 x 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s), and of it
-                                      what t = s gives */
-    long lags, parts;
+    influences into;               /* of estimates, into.into NULL: none */
     long warm;                     /* rows from `from` that bring the state about, and are in no sum */
 } seaopt_pass_args;
+
+EXPORTED const column_sums *sums; /* of sums.c, set by who loads this */
 
 /* What goes on from one sample to the next. */
 typedef struct {
@@ -360,28 +357,8 @@ static inline double robust(const seaopt_pass_args *a, int o, double r, double *
     return knee / size;
 }
 
-/* Four rows of the Gram matrix by one or two vectors of columns, summed in registers over the waiting samples. */
-#define TILE(WIDE)                                                                                             \
-    do {                                                                                                       \
-        vec sum[4][WIDE];                                                                                      \
-        for (int r = 0; r < 4; r++)                                                                            \
-            for (int c = 0; c < WIDE; c++) sum[r][c] = ((vec *)q->sum[o][4 * row + r])[column + c];            \
-        for (long k = 0; k < count; k++) {                                                                     \
-            const vec *v = (const vec *)q->v[o][k];                                                            \
-            for (int r = 0; r < 4; r++)                                                                        \
-                for (int c = 0; c < WIDE; c++) sum[r][c] += (q->weight[o][k] * q->v[o][k][4 * row + r]) * v[column + c]; \
-        }                                                                                                      \
-        for (int r = 0; r < 4; r++)                                                                            \
-            for (int c = 0; c < WIDE; c++) ((vec *)q->sum[o][4 * row + r])[column + c] = sum[r][c];            \
-    } while (0)
-
-ONCE void sum_waiting(hot *q, int o) {
-    const long count = q->waiting[o];
-    for (int row = 0; row < NCP / 4; row++) {
-        int column = row;
-        for (; column + 1 < NCP / 4; column += 2) TILE(2);
-        if (column < NCP / 4) TILE(1);
-    }
+static inline void sum_waiting(const seaopt_pass_args *a, hot *q, int o) {
+    sums->add_products(q->v[o][0], q->weight[o], q->waiting[o], q->sum[o][0], NCP);
     q->waiting[o] = 0;
 }
 
@@ -393,44 +370,7 @@ static inline void accumulate(const seaopt_pass_args *a, hot *q, int o) {
     q->rho[o] += rho;
     q->count[o] += 1.0;
     q->waiting[o] = k + 1;
-    if (k + 1 == BLOCK) sum_waiting(q, o);
-}
-
-typedef double loose __attribute__((vector_size(32), may_alias, aligned(8))); /* four doubles at any address */
-
-/* The influences a = into v of a sample, and its part of the double sum over the samples before: the ring holds each
-   influence twice, so that those of the last lags always stand in a row. */
-ONCE void influence(const seaopt_pass_args *a, double *const *v, const int *counts, long k, long slot) {
-    const long size = a->lags + 1, parts = a->parts;
-    loose *const here = (loose *)a->ring + (slot + size) * NY * parts, *const again = here - size * NY * parts;
-    const loose *into = (const loose *)a->into;
-    for (int o = 0; o < NY; o++)
-        for (long j = 0; j < parts; j++) {
-            loose sum = {0.0, 0.0, 0.0, 0.0};
-            for (int c = 1; counts[o] && c < NC; c++) sum += v[o][c] * into[(o * NC + c) * parts + j];
-            here[o * parts + j] = again[o * parts + j] = sum;
-        }
-    for (long j = 0; j < parts && k >= a->from + a->warm; j++) {
-        loose sum[NY][NY], now[NY];
-        memset(sum, 0, sizeof sum);
-        const double *r = a->correlation;
-        for (long lag = 0; lag < size; lag++, r += NY * NY) {
-            for (int o = 0; o < NY; o++)
-                for (int b = 0; b < NY; b++) sum[o][b] += r[o * NY + b] * here[(b - lag * NY) * parts + j];
-            for (int o = 0; lag == 0 && o < NY; o++) {
-                now[o] = sum[o][0];
-                for (int b = 1; b < NY; b++) now[o] += sum[o][b];
-            }
-        }
-        for (int o = 0; o < NY; o++) {
-            for (int b = 1; b < NY; b++) sum[o][0] += sum[o][b];
-            for (long i = 0; i < 4 * parts; i++) {
-                const double one = ((const double *)(here + o * parts))[i];
-                ((loose *)a->form)[i * parts + j] += one * sum[o][0];
-                ((loose *)a->form)[(4 * parts + i) * parts + j] += one * now[o];
-            }
-        }
-    }
+    if (k + 1 == BLOCK) sum_waiting(a, q, o);
 }
 
 /* Denormal numbers, into which sensitivities to the initial state decay, cost a hundredfold: take them as zero. */
@@ -459,8 +399,6 @@ static void restore_denormals(unsigned long before) {
 #endif
 }
 
-#define EXPORTED __attribute__((visibility("default")))
-
 EXPORTED long carry_size(void) { return sizeof(state) / sizeof(double) + 1; }
 
 ONCE void begin(hot *q, const seaopt_pass_args *a) {
@@ -478,7 +416,7 @@ ONCE void begin(hot *q, const seaopt_pass_args *a) {
 }
 
 ONCE void deliver(hot *q, const seaopt_pass_args *a) {
-    for (int o = 0; o < NY; o++) sum_waiting(q, o);
+    for (int o = 0; o < NY; o++) sum_waiting(a, q, o);
     if (a->carry) {
         state *after = (state *)a->carry;
         memcpy(after->z, q->z, sizeof q->z);
@@ -489,8 +427,7 @@ ONCE void deliver(hot *q, const seaopt_pass_args *a) {
     for (int o = 0; a->gram && o < NY; o++) {
         a->rho[o] += q->rho[o];
         a->count[o] += q->count[o];
-        for (int r = 0; r < NC; r++)
-            for (int c = 0; c < NC; c++) a->gram[(o * NC + r) * NC + c] += r <= c ? q->sum[o][r][c] : q->sum[o][c][r];
+        sums->add_gram(q->sum[o][0], NCP, a->gram + o * NC * NC, NC);
     }
 }
 
@@ -529,9 +466,9 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
             present[o] = present[o] && k >= a->start + a->settle;
             if (a->gram && present[o] && k >= a->from + a->warm) accumulate(a, q, o);
         }
-        if (a->into && wide == ALL) {
-            influence(a, v, present, k, slot);
-            slot = slot < a->lags ? slot + 1 : 0;
+        if (a->into.into && wide == ALL) {
+            sums->add_influence(&a->into, v, present, slot, k >= a->from + a->warm);
+            slot = slot < a->into.lags ? slot + 1 : 0;
         }
     }
     deliver(q, a);
@@ -540,7 +477,7 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
 EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     const unsigned long mode = flush_denormals();
     for (long i = 0; i < count; i++) {
-        if (MEASURED && (ALL == 1 || list[i].gram || list[i].columns || list[i].into)) one_pass(list + i, ALL);
+        if (MEASURED && (ALL == 1 || list[i].gram || list[i].columns || list[i].into.into)) one_pass(list + i, ALL);
         else one_pass(list + i, 1);
     }
     restore_denormals(mode);

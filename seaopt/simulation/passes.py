@@ -16,7 +16,7 @@ from seaopt.errors import SimulationError
 from seaopt.records import record
 from seaopt.simulation.discretisation import Clock
 
-MAX_SECTIONS = 8  # as in pass.c
+MAX_SECTIONS = 8  # as in layout.h
 RobustLoss = Literal["square", "huber", "soft_l1"]
 
 
@@ -45,7 +45,7 @@ class Weights:
 
     def __post_init__(self) -> None:
         if len(self.sections) > MAX_SECTIONS:
-            raise SimulationError(f"{len(self.sections)} filter sections; pass.c has room for {MAX_SECTIONS}")
+            raise SimulationError(f"{len(self.sections)} filter sections; a pass has room for {MAX_SECTIONS}")
 
     @classmethod
     def plain(cls, ny: int) -> Weights:
