@@ -112,6 +112,9 @@ def _read_by_design(problem: Problem) -> dict[str, Any]:
     asked = _controller(problem)
     out = problem.table.model_dump(mode="json", include={"controller"})
     names = {name for name in (asked.plant, *asked.robust_to) if name in problem.plants}
+    if problem.table.impedance is not None:
+        out["impedance"] = problem.table.impedance.model_dump(mode="json")
+        names.add(problem.table.impedance.plant)
     responses = {
         f"frf:{one.name}": one.model_dump(mode="json")
         for one in problem.table.experiment

@@ -239,6 +239,12 @@ KEYS: dict[str, dict[str, str]] = {
         "step_N": "Size of the step that is judged.",
         "reserve": "Share of each limit that is kept free.",
     },
+    "ImpedanceTable": {
+        "plant": "Whose link is moved: a plant that does not hold it.",
+        "stiffness": "K_v, N/m or N m/rad.",
+        "damping": 'D_v, N s/m or N m s/rad; "critical": what makes the stiffness critically damped.',
+        "velocity_filter_s": "Of the speed that is computed from the position; one sample where left out.",
+    },
     "RobustnessTable": {
         "plants": "That are certified, besides the design plant and robust_to.",
         "parameters": "Ranges of what the fit does not tell.",

@@ -206,6 +206,7 @@ class Problem:
             raise ProblemError(self._ask_for_controller())
         names = [self.table.controller.plant, *self.table.controller.robust_to]
         names = [name for name in names if not name.startswith(RESPONSE)]
+        names += [] if self.table.impedance is None else [self.table.impedance.plant]
         return {name: self.plants[name] for name in dict.fromkeys([*names, *self.robustness.plants])}
 
     def remarks(self, parameters: ParameterSet) -> list[str]:

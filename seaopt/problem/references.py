@@ -36,6 +36,10 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
         named = [("controller.plant", table.controller.plant)]
         named += [("controller.robust_to", name) for name in table.controller.robust_to]
         places += [(place, name) for place, name in named if not name.startswith(RESPONSE)]
+    if table.impedance:
+        if table.controller is None:
+            raise ProblemError("[impedance] is there, and no [controller] is; add one, or leave it out")
+        places.append(("impedance.plant", table.impedance.plant))
     if table.robustness:
         places += [("robustness.plants", name) for name in table.robustness.plants]
     for place, name in places:
@@ -46,6 +50,7 @@ def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameter
                 f'{place} = "{name}" is not a [plant] of this file ({suggestion(name, plants)}); write {line}'
             )
     _check_measured(table, plants)
+    _check_link(table, plants)
     _check_ranges(table, plants, parameters)
     _check_sensors(table, plants)
     seen: set[str] = set()
@@ -126,6 +131,7 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     measured = table.controller.measured
     named = [table.controller.plant, *table.controller.robust_to]
     named += table.robustness.plants if table.robustness else []
+    named += [table.impedance.plant] if table.impedance else []
     by_experiment = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in table.experiment}
     for name in (by_experiment.get(name, name) for name in named):
         if measured not in plants[name].outputs:
@@ -138,6 +144,16 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
                 f'plant.{name}, which has {", ".join(known)}; write measured = "{_nearest(measured, known)}" in '
                 "[controller]"
             )
+
+
+def _check_link(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
+    """Refuse an impedance at a link that is held."""
+    if table.impedance is None:
+        return
+    moving = [name for name, plant in plants.items() if plant.port is not None and plant.port.motion is not None]
+    if table.impedance.plant not in moving:
+        known = f"write one of {', '.join(moving)}" if moving else "add a plant whose link moves"
+        raise ProblemError(f'impedance.plant = "{table.impedance.plant}" holds its link; {known}')
 
 
 def _nearest(name: str, known: list[str]) -> str:

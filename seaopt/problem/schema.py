@@ -421,6 +421,15 @@ class ControllerTable(_Strict):
     reserve: Number = 0.005
 
 
+class ImpedanceTable(_Strict):
+    """Stiffness and damping at the link, around the force loop."""
+
+    plant: Name
+    stiffness: NotNegative
+    damping: Number | Literal["critical"]
+    velocity_filter_s: NotNegative | None = None
+
+
 class RobustnessTable(_Strict):
     """What the controller must survive."""
 
@@ -539,6 +548,7 @@ class ProblemTable(_Strict):
     experiment: list[ExperimentTable] = []
     fit: FitTable = FitTable()
     controller: ControllerTable | None = None
+    impedance: ImpedanceTable | None = None
     robustness: RobustnessTable | None = None
     expect: ExpectTable | None = Field(None, description="What `seaopt run` and pytest check of the results.")
 

@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import Controller, GivenLaw, assess, command_of, tune
+from seaopt.control import (
+    Controller,
+    GivenLaw,
+    Impedance,
+    add_impedance,
+    assess,
+    command_of,
+    critical_impedance,
+    tune,
+)
 from seaopt.control.laws.delay import settle_delay
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
@@ -86,17 +95,39 @@ def tune_problem(problem: Problem, source: Fit | ParameterSet, progress: Progres
     spec, table = settle_delay(problem.spec, problem.design_plant, source), problem.robustness
     draws = problem.draws(source)
     if not table.retune:
-        return tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
+        tuned = tune(design, problem.values(source), spec, robust_to, draws=draws, progress=progress)
+        return add_outer_loop(problem, tuned, source)
     if problem.response_names:
         raise ProblemError(
             f"{problem.source}: retune = {table.retune} in [robustness] tunes again on models, and "
             f"{problem.response_names[0]} is a measured response; leave retune out"
         )
-    return tune_certified(
+    joint = tune_certified(
         problem.design_plant, source, spec, problem.certified_plants(), ranges=problem.ranges,
         robust_to=problem.robust_to(problem.values(source)), draws=draws, others=problem.parameters,
         samples=table.samples, seed=table.seed + 1, rounds=table.retune, progress=progress,
     )  # fmt: skip
+    return replace(joint, controller=add_outer_loop(problem, joint.controller, source))
+
+
+def add_outer_loop(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
+    """Return a controller with the outer loop of the problem's [impedance]; as it is where there is none.
+
+    Raises
+    ------
+    SeaoptError
+        The stiffness has no critically damped impedance.
+
+    """
+    table = problem.table.impedance
+    if table is None:
+        return controller
+    plant, values, filter_s = problem.plants[table.plant], problem.values(source), table.velocity_filter_s
+    if table.damping == "critical":
+        asked = critical_impedance(controller, plant, values, table.stiffness, velocity_filter_s=filter_s)
+    else:
+        asked = Impedance(stiffness=table.stiffness, damping=table.damping, velocity_filter_s=filter_s)
+    return add_impedance(controller, plant, values, asked, name=table.plant)
 
 
 def list_plants(problem: Problem, source: Fit | ParameterSet) -> tuple[Plant | MeasuredResponse, dict[str, Any]]:
@@ -155,7 +186,8 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     design, values = problem.design_plant, problem.values(source)
     _, robust_to = list_plants(problem, source)
     law = given.to_effort(command_of(design, values, spec.measured).per_effort)
-    return assess(design, values, law, spec, robust_to, draws=problem.draws(source))
+    controller = assess(design, values, law, spec, robust_to, draws=problem.draws(source))
+    return add_outer_loop(problem, controller, source)
 
 
 def certify_problem(

@@ -24,10 +24,12 @@ from seaopt.control.laws.realisation import RunnableLaw, choose_limit, realise
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import ControlError, FileError, require_type
 from seaopt.files import write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating
+from seaopt.units import mechanics_of
 
 Precision = Literal["double", "float"]
 LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
@@ -250,6 +252,12 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         "integrators": law.integrators,
         "gated": law.gate is not None,
         "heated": law.heat is not None,
+        "outer_units": {}
+        if stored["outer"] is None
+        else {
+            "stiffness": mechanics_of(stored["outer"].place_unit).stiffness,
+            "damping": mechanics_of(stored["outer"].place_unit).damping,
+        },
         "max_held": law.gate.max_held if law.gate is not None else 0,
     }
 
@@ -313,10 +321,25 @@ def _numbers(
             {"name": _identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
             for key, value in stored["gains"].items()
         ],
+        "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(("reference", "measurement"), transfer_functions, strict=True)
         ],
+    }
+
+
+def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, str]:
+    """Return the numbers of the outer loop as text, its direction in the gains."""
+    return {
+        "stiffness": number(outer.direction * outer.stiffness),
+        "damping": number(outer.direction * outer.damping),
+        "velocity_filter_s": number(outer.velocity_filter_s),
+        "pole": number(outer.pole),
+        "rate": number(outer.rate),
+        "place_unit": outer.place_unit,
+        "shown_stiffness": f"{outer.stiffness:.6g}",
+        "shown_damping": f"{outer.damping:.6g}",
     }
 
 

@@ -137,6 +137,7 @@ class LawFile(_Strict):
     engineering: Any = None
     observer: Any = None
     heat: Any = None
+    impedance: Any = None
     blocked_by: Any = None
     largest_bandwidth_hz: Any = None
     possible: Any = None

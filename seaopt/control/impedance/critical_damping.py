@@ -22,6 +22,7 @@ from jaxtyping import Float
 from seaopt.control.impedance.link import Link, find_link
 from seaopt.control.impedance.moving_loop import MovingLoop, close_link
 from seaopt.control.laws.controller import Controller
+from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.outer_loop import Impedance
 from seaopt.errors import ControlError, require_number
 from seaopt.parameters import ParameterSet
@@ -31,13 +32,14 @@ from seaopt.units import mechanics_of
 
 SLOWEST_POLE, FASTEST_POLE = 1e-4, 1.2  # p T of the double pole, looked at
 POLES = 800
-SAME_POLE = 1e-6  # to which the two poles of a double one are computed
+SAME_POLE = 1e-5  # to which the two poles of a double one are computed
+REAL = 1e-9  # imaginary part of a pole that does not oscillate
 NEWTON_STEPS, SMALL_STEP = 4, 1e-6
 
 
 @record(eq=False)
 class CriticalImpedances:
-    """Stiffness and damping of links whose slowest poles are one double real pole, from soft to stiff.
+    """Stiffness and damping of links with a double real pole than which nothing slower oscillates, from soft to stiff.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def critical_impedance(
     controller: Controller, plant: Plant, parameters: ParameterSet, stiffness: float, *,
     velocity_filter_s: float | None = None,
 ) -> Impedance:  # fmt: skip
-    """Return the damping that makes a stiffness at the link critically damped: its slowest poles are one double one.
+    """Return the damping that makes a stiffness at the link critically damped: two of its poles are one real one.
 
     Parameters
     ----------
@@ -94,7 +96,9 @@ def critical_impedance(
 
 
 def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
-    """Return critically damped impedances up to the stiffest, beyond which another pole is slower.
+    """Return critically damped impedances up to the stiffest, beyond which something slower oscillates.
+
+    A slow integral of the force law leaves a real pole that is slower, of next to no weight.
 
     Parameters
     ----------
@@ -108,13 +112,12 @@ def scan_critical(link: Link, velocity_filter_s: float) -> CriticalImpedances:
     loop = close_link(link, velocity_filter_s)
     k, d = _place(loop, link, velocity_filter_s, p)
     good = np.isfinite(k) & np.isfinite(d) & (k > 0.0)
-    poles = np.sort(np.abs(loop.eigenvalues(np.where(good, k, 0.0), np.where(good, d, 0.0))), axis=-1)
-    good &= poles[:, -1] <= np.exp(-p) * (1.0 + SAME_POLE)
+    poles = loop.eigenvalues(np.where(good, k, 0.0), np.where(good, d, 0.0))
+    slower = np.abs(poles) > np.exp(-p)[:, None] * (1.0 + SAME_POLE)
+    good &= ~np.any(slower & ((np.abs(np.imag(poles)) > REAL) | (np.abs(poles) > GROWING)), axis=-1)
     kept = np.flatnonzero(good)
-    if kept.size:  # without gaps, and while it gets stiffer
-        first = kept[0]
-        run = good[first:] & np.concatenate([[True], np.diff(k[first:]) > 0.0])
-        kept = first + np.arange(run.size if np.all(run) else int(np.argmin(run)))
+    joins = (np.diff(kept) == 1) & (np.diff(k[kept]) > 0.0)  # neighbours that get stiffer are of one branch
+    kept = max(np.split(kept, np.flatnonzero(~joins) + 1), key=len) if kept.size else kept
     return CriticalImpedances(stiffness=k[kept], damping=d[kept], rate=p[kept] / link.sample_time_s)
 
 
@@ -141,8 +144,8 @@ def find_critical(link: Link, velocity_filter_s: float, stiffness: float) -> Imp
     unit = mechanics_of(link.port.place_unit).stiffness
     if not known.size:
         raise ControlError(
-            f"stiffness = {stiffness:g} {unit}: the link is critically damped at no stiffness, its force loop having a "
-            "slower pole; give damping a number, or tune a faster force loop"
+            f"stiffness = {stiffness:g} {unit}: the link is critically damped at no stiffness, as something slower "
+            "oscillates; give damping a number, or tune a faster force loop"
         )
     if not known[0] <= stiffness <= known[-1]:
         raise ControlError(

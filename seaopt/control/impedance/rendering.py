@@ -8,7 +8,7 @@ takes, and a mass or a spring whose reactance cancels its own is that environmen
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -210,6 +210,43 @@ def render(
         band_hz=_find_band(link, outer), overshoot=_find_overshoot(loop, impedance, radius),
         called=mechanics_of(link.port.place_unit),
     )  # fmt: skip
+
+
+def add_impedance(
+    controller: Controller, plant: Plant, parameters: ParameterSet, impedance: Impedance, *, name: str = ""
+) -> Controller:
+    """Return the controller with the outer loop that renders an impedance at a plant's link.
+
+    It is stored, certified and exported with its force law.
+
+    Parameters
+    ----------
+    controller : Controller
+        Tuned, or a law of one's own (`seaopt.assess`).
+    plant, parameters
+        The actuator with its link, which moves.
+    impedance : Impedance
+        Stiffness, damping and the filter of the speed.
+    name : str
+        Of the plant, among those that are certified; the first whose link moves if left out.
+
+    Raises
+    ------
+    ControlError
+        The link does not move.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> knee, values = so.plants.rotary(), so.plants.rotary().defaults.update(N=50.0, k_s=300.0, d_l=1.0)
+    >>> force = so.tune(so.plants.rotary("locked"), values, so.ControllerSpec(measured="tau_s", bandwidth_hz=20))
+    >>> add_impedance(force, knee, values, Impedance(stiffness=40.0, damping=2.0)).outer.direction
+    1.0
+
+    """
+    require_type(impedance, Impedance, "impedance", "give an Impedance", ControlError)
+    outer = find_link(controller, plant, parameters).outer(impedance)
+    return replace(controller, outer=replace(outer, plant=name, direction=round(outer.direction, 9)))
 
 
 def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:

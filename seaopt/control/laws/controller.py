@@ -26,6 +26,7 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
@@ -47,7 +48,7 @@ from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
 from seaopt.records import PlotAccessor, record
-from seaopt.units import divide_units, unit_after
+from seaopt.units import divide_units, mechanics_of, unit_after
 
 if TYPE_CHECKING:
     import control
@@ -103,6 +104,8 @@ class Controller:
     measured : tuple of MeasuredFigures
         What the law does on every measured response that it was tuned for. Where the design plant is one, `design` is
         None, and `achieved` is the worst of the responses in its discs.
+    outer : OuterLoop or None
+        What makes the reference of a stiffness and a damping at the link (`seaopt.control.add_impedance`).
 
     """
 
@@ -125,6 +128,7 @@ class Controller:
     possible: PossibleBandwidths | None = None
     friction: FrictionMargin | None = None
     measured: tuple[MeasuredFigures, ...] = ()
+    outer: OuterLoop | None = None
 
     @property
     def design_loop(self) -> MeasuredLoop:
@@ -300,6 +304,7 @@ class Controller:
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
             "observer": self._observer_dict(),
             "heat": self._heat_dict(),
+            "impedance": None if self.outer is None else asdict(self.outer),
             "blocked_by": list(self.blocked_by),
             "largest_bandwidth_hz": self.largest_bandwidth_hz,
             "possible": None if self.possible is None else asdict(self.possible),
@@ -403,6 +408,7 @@ class Controller:
                 f"  {a.describe_margins()}",
                 *self._friction_lines(),
                 *self._force_lines(),
+                *self._outer_lines(),
                 *(f"  {line}" for line in (self.rating.describe() if self.rating is not None else ())),
                 f"  limits met with nothing to spare: {join_labels(self.active_constraints) or 'none'}"
                 if self.feasible
@@ -456,6 +462,16 @@ class Controller:
             use = "" if depth < NO_NOTCH else ": of no use, tune without it"
             lines.append(f"  notch: {f:.4g} Hz, width {width:.3g}, gain at its centre {depth:.3g}{use}")
         return lines
+
+    def _outer_lines(self) -> list[str]:
+        """Say what the outer loop renders."""
+        if self.outer is None:
+            return []
+        called = mechanics_of(self.outer.place_unit)
+        return [
+            f"  renders {self.outer.stiffness:.4g} {called.stiffness} and {self.outer.damping:.4g} {called.damping} at "
+            f"the link, the speed filtered with {1e3 * self.outer.velocity_filter_s:.3g} ms"
+        ]
 
     def _force_lines(self) -> list[str]:
         slow, fast = self.force_limit(0.0), self.force_limit(self.spec.bandwidth_hz)

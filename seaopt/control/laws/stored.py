@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, Strict, model_validator
@@ -25,6 +25,7 @@ from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
@@ -184,6 +185,18 @@ class StoredMeasured(ResultTable):
         return MeasuredFigures(**(fields | missing))
 
 
+class StoredOuterLoop(ResultTable):
+    """An outer loop of stiffness and damping."""
+
+    stiffness: Annotated[Finite, Field(ge=0.0)]
+    damping: Finite
+    velocity_filter_s: Annotated[Finite, Field(ge=0.0)]
+    direction: Finite
+    sample_time_s: Annotated[Finite, Field(gt=0.0)]
+    place_unit: Literal["m", "rad"]
+    plant: str = ""
+
+
 class StoredController(ResultTable):
     """A controller.json."""
 
@@ -203,6 +216,7 @@ class StoredController(ResultTable):
     observer: StoredObserver | None = None
     engineering: dict[str, StoredNumber] = {}
     measured_responses: list[StoredMeasured] = []
+    impedance: StoredOuterLoop | None = None
 
 
 def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -224,6 +238,9 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         raise _contradict("sample_time_s", stated)
     law = table.law.build(spec.sample_time_s)
     observer = None if table.observer is None else table.observer.build(spec.sample_time_s)
+    outer = None if table.impedance is None else OuterLoop(**table.impedance.model_dump())
+    if outer is not None and not abs(outer.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
+        raise _contradict("impedance.sample_time_s", f"is {outer.sample_time_s:g}, and the law has another")
     _check_gains(table.gains, observer, spec, law)
     for name, stated in table.engineering.items():
         expected = table.command.per_effort * table.gains.get(name, np.nan)
@@ -237,6 +254,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
         "observer": observer, "blocked_by": tuple(table.blocked_by),
         "measured": tuple(one.build() for one in table.measured_responses),
+        "outer": outer,
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
 

@@ -77,6 +77,8 @@ class OuterLoop:
         Seconds.
     place_unit : str
         Of the position: m or rad.
+    plant : str
+        The name of the plant whose link it is, where it has one.
 
     Examples
     --------
@@ -95,6 +97,14 @@ class OuterLoop:
     direction: float
     sample_time_s: float
     place_unit: str
+    plant: str = ""
+
+    @property
+    def impedance(self) -> Impedance:
+        """What it renders."""
+        return Impedance(
+            stiffness=self.stiffness, damping=self.damping, velocity_filter_s=self.velocity_filter_s
+        )  # fmt: skip
 
     @property
     def pole(self) -> float:

@@ -26,6 +26,7 @@ from seaopt.reporting.figures import fit as fits
 from seaopt.reporting.figures import log as logs
 from seaopt.reporting.figures import loop as loops
 from seaopt.reporting.figures import simulation as simulations
+from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import Panel, compose_sheet
 from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.reporting.page.chart import Chart, make_chart
@@ -261,6 +262,13 @@ def _plates_of_simulation(material: Material) -> list[Plate]:
         if simulated is not None and simulated.passivity is not None and material.controller is not None:
             panels.insert(0, certificates.impedance_panel(material.controller))
         plates.append(Plate(name="environments", part="contact", heading="", panels=tuple(panels)))
+    rendered = None if material.certificate is None else material.certificate.impedance
+    if rendered is not None:
+        panels = [region_panel(rendered.region, rendered.rendering.impedance)]
+        plates.append(Plate(
+            name="impedance_region", part="contact", heading="Stiffness and damping at the link",
+            panels=tuple(panels), text=". ".join(rendered.lines()) + ".",
+        ))  # fmt: skip
     return plates
 
 

@@ -33,6 +33,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.certificate.friction import FrictionDraws, find_nominal_margins
+from seaopt.robustness.certificate.impedance import CertifiedImpedance, certify_impedance
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -204,6 +205,8 @@ class Certificate:
         Of each model with friction: for how steep a friction stability is shown, between sliding and stuck.
     friction_draws : mapping of name to FrictionDraws
         The same over draws, of those models for which it is shown at the nominal parameters, or that have none there.
+    impedance : CertifiedImpedance or None
+        What the controller's outer loop renders, where it has one.
     remarks : tuple of str
         What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
         the bandwidth at amplitudes of use.
@@ -230,6 +233,7 @@ class Certificate:
     brackets: Mapping[str, Bracket] = field(default_factory=dict[str, Bracket])
     friction: Mapping[str, FrictionMargin] = field(default_factory=dict[str, FrictionMargin])
     friction_draws: Mapping[str, FrictionDraws] = field(default_factory=dict[str, FrictionDraws])
+    impedance: CertifiedImpedance | None = None
     remarks: tuple[str, ...] = ()
     drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
         default_factory=dict[str, Float[np.ndarray, " n"]], repr=False
@@ -397,6 +401,7 @@ class Certificate:
                     for name, one in stored.friction.items()
                     if one.draws is not None
                 },
+                impedance=certify_impedance(controller, models, parameters),
                 remarks=tuple(stored.remarks),
             )
             certificate = certificate.play_steps()
@@ -425,6 +430,7 @@ class Certificate:
             "varied": [_list_fields(varied) for varied in self.varied],
             "remarks": list(self.remarks),
             "notes": list(self.notes),
+            "impedance": None if self.impedance is None else self.impedance.to_dict(),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},
             "simulation": None if self.simulated is None else self.simulated.simulation_dict(),
@@ -529,6 +535,7 @@ class Certificate:
         lines.append(f"  {self.monte_carlo}")
         lines += [f"  {line}" for line in (self.runs.describe_steps() if self.runs is not None else [])]
         lines += [f"  {line}" for line in (self.simulated.lines() if self.simulated is not None else [])]
+        lines += [f"  impedance: {line}" for line in (self.impedance.lines() if self.impedance is not None else [])]
         for row in self.requirements:
             if not row.met:
                 lines.append(f"  NOT MET: {row.name} = {row.value:.6g}, limit {row.limit:.6g} ({row.where})")

@@ -43,10 +43,12 @@ from seaopt.robustness.certificate.certificate import (
     plant_margins,
 )
 from seaopt.robustness.certificate.friction import find_margins_at_draws, find_nominal_margins
+from seaopt.robustness.certificate.impedance import certify_impedance
 from seaopt.robustness.certificate.requirements import (
     design_requirements,
     draw_requirements,
     friction_requirements,
+    impedance_requirements,
     measured_requirements,
     plant_requirements,
 )
@@ -238,6 +240,7 @@ def certify(
         unstable=failures.unstable, over_ms=failures.over_ms, over_mt=failures.over_mt,
     )  # fmt: skip
     rubbing("friction at the draws", 0.0)
+    impedance = certify_impedance(controller, models, nominal)
     friction = find_nominal_margins(controller, models, nominal)
     friction_draws = find_margins_at_draws(
         controller, models, unknown, friction, samples, rng, required=min_friction_margin
@@ -248,12 +251,13 @@ def certify(
         *draw_requirements(monte_carlo, worst, max_failure_probability),
         *friction_requirements(friction, friction_draws, min_friction_margin),
         *(row for name, one in (measured or {}).items() for row in measured_requirements(controller, name, one)),
+        *impedance_requirements(impedance),
     )
     certificate = Certificate(
         passed=all(row.met for row in requirements), requirements=requirements, plants=figures,
         margins={name: plant_margins(controller, plant, nominal) for name, plant in plants.items()}, worst=worst,
         monte_carlo=monte_carlo, controller=controller, models=models, parameters=nominal, varied=varied,
-        brackets=brackets, friction=friction, friction_draws=friction_draws, drawn_ms=drawn_ms,
+        brackets=brackets, friction=friction, friction_draws=friction_draws, impedance=impedance, drawn_ms=drawn_ms,
         remarks=(
             *_remark_measured(controller, measured or {}), *_remark_delay(controller, parameters),
             *_remark_amplitude(controller, models, nominal),

@@ -20,6 +20,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.robustness.certificate.certificate import MIN_FRICTION_MARGIN, MonteCarlo, Requirement
 from seaopt.robustness.certificate.friction import FrictionDraws
+from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import Worst
 
@@ -126,6 +127,25 @@ def friction_requirements(
         met = bool(value >= least * (1.0 - LIMIT_ROUNDING))
         rows.append(Requirement(name=MIN_FRICTION_MARGIN, limit=least, value=value, met=met, where=where))
     return rows
+
+
+def impedance_requirements(impedance: CertifiedImpedance | None) -> list[Requirement]:
+    """Return that the link is stable by itself under the impedance asked for, and that no environment changes that."""
+    if impedance is None:
+        return []
+    found, where = impedance.rendering, f"{impedance.plant}: link"
+    unit = found.called.damping
+    breaking = "" if found.breaking is None else f"; {found.breaking.describe(found.called)}"
+    return [
+        Requirement(
+            name="impedance_stable", limit=1.0, value=found.spectral_radius, met=found.stable,
+            where=f"{where} with nothing on it",
+        ),
+        Requirement(
+            name="impedance_damper", limit=found.link_damping, value=found.needed_damper, met=found.passive,
+            where=f"{where}, {unit} that make it passive, and its own{breaking}",
+        ),
+    ]  # fmt: skip
 
 
 def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]:
