@@ -60,6 +60,7 @@ NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SAME_POLE = 1e-3  # to which poles that are equal are computed
 NO_COEFFICIENT = 1e-12  # of a polynomial that begins with 1: below this is rounding
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
+ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 
 
@@ -198,8 +199,22 @@ class Controller:
         return (
             *lifted, *vague, *self._friction_notes(), *actuation_notes(plant, self.command),
             *limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None),
-            *self._noise_notes(),
+            *self._noise_notes(), *self._slow_notes(),
         )  # fmt: skip
+
+    def _slow_notes(self) -> tuple[str, ...]:
+        """Say that a step is long in arriving, which no limit forbids and friction makes longer."""
+        band = self.achieved.bandwidth_hz
+        if self.design is None or not self.achieved.stable or not band or not np.isfinite(band):
+            return ()
+        loop, seconds = self.close(*self.design), ARRIVAL_PERIODS / band
+        left = abs(loop.measure_step_left(seconds))
+        if not np.isfinite(loop.plant.static_gain) or left < NOT_ARRIVED:
+            return ()
+        return (
+            f"a step of the reference is still {100 * left:.2g} % off after {seconds:.2g} s, {ARRIVAL_PERIODS:.0f} "
+            'periods of the bandwidth: the integral is slow, and slower with friction; give objective = "disturbance"',
+        )
 
     def _friction_notes(self) -> tuple[str, ...]:
         """Say that a friction margin was asked where there is no friction."""

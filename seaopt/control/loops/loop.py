@@ -165,6 +165,17 @@ class Loop:
         """Tell whether all of them are inside the unit circle."""
         return bool(np.max(np.abs(self.eigenvalues()), initial=0.0) < STABLE)
 
+    def measure_step_left(self, seconds: float) -> float:
+        r"""Return how far a step of the reference, of one, is from where it ends after a time; the loop is stable.
+
+        What slow poles leave is read in closed form: of :math:`x^+ = A x + B`, :math:`y = C x + D` the response is
+        :math:`G(1) - C A^k (I - A)^{-1} B` after k samples.
+        """
+        system = self.system()
+        a, b, c = system.a, system.b[:, 1], system.c[0]
+        samples = max(round(seconds / self.plant.sample_time_s), 0)
+        return float(c @ np.linalg.matrix_power(a, samples) @ np.linalg.solve(np.eye(b.size) - a, b))
+
     def grid(self) -> Float[np.ndarray, " m"]:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
         base = np.geomspace(GRID_LOWEST_HZ, self.plant.nyquist_hz, 1200)
