@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from seaopt.estimation import diagnose as diagnose
     from seaopt.estimation import fit as fit
     from seaopt.estimation import profile as profile
+    from seaopt.fleet import fit_fleet as fit_fleet
     from seaopt.frequency import MeasuredResponse as MeasuredResponse
     from seaopt.frequency import h1 as h1
     from seaopt.frequency import measure_response as measure_response
@@ -96,6 +97,7 @@ _HOME = {
     "demo_path": "seaopt.problem",
     "read_problem": "seaopt.problem",
     "write_report": "seaopt.reporting",
+    "fit_fleet": "seaopt.fleet",
     "testing": "seaopt.testing",
     "SeaoptError": "seaopt.errors",
 }
@@ -105,7 +107,7 @@ __all__ = [  # noqa: RUF022  (in the order of the data path)
     "Experiment", "Huber", "SoftL1", "OutputError", "MultipleShooting",
     "PredictionError", "Fit", "fit", "diagnose", "compare", "profile", "bootstrap", "design_experiment",
     "ControllerSpec", "Controller", "corners", "tune", "assess", "export", "Certificate", "certify", "verify",
-    "demo_path", "read_problem", "write_report", "testing", "SeaoptError",
+    "demo_path", "read_problem", "write_report", "fit_fleet", "testing", "SeaoptError",
 ]  # fmt: skip
 
 

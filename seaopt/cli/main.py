@@ -19,7 +19,8 @@ INTERRUPTED = 130  # exit code, as a shell's
 
 
 ORDER = (  # of the commands in the help: as they are used
-    "demo", "new", "inspect", "run", "fit", "tune", "certify", "report", "export", "validate", "simulate", "frf",
+    "demo", "new", "inspect", "run", "fit", "tune", "certify", "report", "export", "validate", "fleet", "simulate",
+    "frf",
 )  # fmt: skip
 
 
@@ -348,6 +349,47 @@ def export(
         name=name,
         **options,
     ):
+        raise typer.Exit(1)
+
+
+@app.command()
+def fleet(
+    problem: ProblemFile,
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="LOGS...", help="Files, 'patterns/**/*.csv', addresses (s3://...).", show_default=False),
+    ] = None,
+    output: Folder = Path("out"),
+    manifest: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A CSV file with the logs in its column log; the others say whose they are."),
+    ] = None,
+    identity: Annotated[
+        str | None,
+        typer.Option(metavar="PATTERN", help="How paths end: '{robot}/{actuator}_{run}.csv' makes three columns."),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster: tcp://HOST:PORT or tls://HOST:PORT.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Processes here; as many as cores, if left out.")
+    ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option(metavar="EXPERIMENT", help="Which says how logs are read; the first with one, if left out."),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(metavar="SECONDS", min=0.1, help="For one log.")] = 600.0,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Fit each of many logs by itself; write a table in DIR, and go on there after a stop."""
+    from seaopt.cli.fleet import run_fleet
+
+    if not run_fleet(
+        problem, logs or [], output, manifest=manifest, identity=identity, scheduler=scheduler, workers=workers,
+        like=like, time_limit_s=time_limit, json=json, quiet=quiet, verbose=verbose,
+    ):  # fmt: skip
         raise typer.Exit(1)
 
 

@@ -8,7 +8,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread, Timer
@@ -110,6 +110,72 @@ def shorten_note(text: str) -> str:
     return text if len(text) <= MOST_NOTE else text[: MOST_NOTE - 1] + "…"
 
 
+@contextmanager
+def show_progress(console: Terminal, label: str, note: Callable[[str], None]) -> Generator[Progress]:
+    """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks go to `note`, and stay.
+
+    A stage that ends in an error is not done.
+    """
+    if not console.is_terminal:
+        with _write_progress(console, label, note) as tell:
+            yield tell
+        return
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description:<22}"), BarColumn(bar_width=12), TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"), TextColumn("{task.fields[note]}", style="dim"),
+    )  # fmt: skip
+    started = time.monotonic()
+    with Bar(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(label, total=1.0, note="", left="", visible=False)
+
+        def show(text: str, share: float | None = None, /) -> None:
+            if share is None:
+                note(text)
+                return
+            left = format_left(time.monotonic() - started, share)
+            bar.update(task, completed=share, note=shorten_note(printable(text)), left=left)
+
+        timer = Timer(SHOWN_AFTER_S, lambda: bar.update(task, visible=True))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield show
+        finally:
+            timer.cancel()
+
+
+@contextmanager
+def _write_progress(console: Terminal, label: str, note: Callable[[str], None]) -> Generator[Progress]:
+    """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
+    latest, done, ended, started = "", 0.0, Event(), time.monotonic()
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def tell(text: str, share: float | None = None, /) -> None:
+        nonlocal latest, done
+        if share is None:
+            note(text)
+        else:
+            latest, done = text, share
+
+    def write_lines() -> None:
+        with suppress(OSError):  # a stderr that cannot be written is the stage's to find
+            while not ended.wait(REPORT_S):
+                spent = time.monotonic() - started
+                left = format_left(spent, done)
+                say(f"{label}, {spent:.0f} s{f', {left}' if left else ''}: {latest or 'running'}")
+
+    writer = Thread(target=write_lines, daemon=True)
+    writer.start()
+    try:
+        yield tell
+    finally:
+        ended.set()
+        writer.join()
+    say(f"{label}: {latest or 'done'}")
+
+
 class Session:
     """Runs stages for one problem and one folder; later stages read earlier ones' JSON where they did not run."""
 
@@ -176,66 +242,8 @@ class Session:
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"what was finished is in {self.folder}") from None
 
-    @contextmanager
-    def _progress(self, label: str) -> Generator[Progress]:
-        """Show a stage's progress on a terminal, with the time left; elsewhere write lines. Remarks stay.
-
-        A stage that ends in an error is not done.
-        """
-        if not self._console.is_terminal:
-            with self._write_progress(label) as tell:
-                yield tell
-            return
-        columns = (
-            SpinnerColumn(), TextColumn("{task.description:<22}"), BarColumn(bar_width=12), TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"), TextColumn("{task.fields[note]}", style="dim"),
-        )  # fmt: skip
-        started = time.monotonic()
-        with Bar(*columns, console=self._console, transient=True) as bar:
-            task = bar.add_task(label, total=1.0, note="", left="", visible=False)
-
-            def show(note: str, share: float | None = None, /) -> None:
-                if share is None:
-                    self._note(note)
-                    return
-                left = format_left(time.monotonic() - started, share)
-                bar.update(task, completed=share, note=shorten_note(printable(note)), left=left)
-
-            timer = Timer(SHOWN_AFTER_S, lambda: bar.update(task, visible=True))
-            timer.daemon = True
-            timer.start()
-            try:
-                yield show
-            finally:
-                timer.cancel()
-
-    @contextmanager
-    def _write_progress(self, label: str) -> Generator[Progress]:
-        """Write a line every REPORT_S while a stage runs, whether or not it tells anything, and one when it is done."""
-        note, done, ended, started = "", 0.0, Event(), time.monotonic()
-
-        def tell(text: str, share: float | None = None, /) -> None:
-            nonlocal note, done
-            if share is None:
-                self._note(text)
-            else:
-                note, done = text, share
-
-        def write_lines() -> None:
-            with suppress(OSError):  # a stderr that cannot be written is the stage's to find
-                while not ended.wait(REPORT_S):
-                    spent = time.monotonic() - started
-                    left = format_left(spent, done)
-                    self.say(f"{label}, {spent:.0f} s{f', {left}' if left else ''}: {note or 'running'}")
-
-        writer = Thread(target=write_lines, daemon=True)
-        writer.start()
-        try:
-            yield tell
-        finally:
-            ended.set()
-            writer.join()
-        self.say(f"{label}: {note or 'done'}")
+    def _progress(self, label: str) -> AbstractContextManager[Progress]:
+        return show_progress(self._console, label, self._note)
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Return the problem's experiments, read or made once."""

@@ -271,24 +271,45 @@ class Problem:
             There is no such experiment, or the log cannot be read as it would read it.
 
         """
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", log.stem)
+        name = name if name[:1].isalpha() else f"log_{name}"
+        table = self.choose_template(like).model_copy(update={"name": name, "log": str(log.resolve()), "slice_s": None})
+        return self._make_experiment(table, anywhere=True)
+
+    def repeat_experiment(self, log: Path, like: str | None = None) -> Experiment:
+        """Return another log of the same test as an experiment: its name, and its slice, too.
+
+        Raises
+        ------
+        SeaoptError
+            As `experiment_like`.
+
+        """
+        table = self.choose_template(like).model_copy(update={"log": str(log.resolve())})
+        return self._make_experiment(table, anywhere=True)
+
+    def choose_template(self, like: str | None = None) -> ExperimentTable:
+        """Return the experiment of a name that has a log; the first, if no name is given.
+
+        Raises
+        ------
+        ProblemError
+            There is none.
+
+        """
         tables = {table.name: table for table in self.table.experiment if table.virtual is None}
         if not tables or (like is not None and like not in tables):
             what = f'no experiment "{like}" with a log' if like else "no [[experiment]] with a log"
-            raise ProblemError(f"{self.source}: has {what} that says how to read {log}; add one")
-        first = tables[like] if like is not None else next(iter(tables.values()))
-        name = re.sub(r"[^A-Za-z0-9_-]", "_", log.stem)
-        table = first.model_copy(
-            update={"name": name if name[:1].isalpha() else f"log_{name}", "log": str(log.resolve()), "slice_s": None}
-        )
-        return self._make_experiment(table)
+            raise ProblemError(f"{self.source}: has {what} that says how to read one; add one")
+        return tables[like] if like is not None else next(iter(tables.values()))
 
-    def _make_experiment(self, table: ExperimentTable) -> Experiment:
+    def _make_experiment(self, table: ExperimentTable, *, anywhere: bool = False) -> Experiment:
         plant = self.plants[table.plant]
         if table.virtual:
             own = {name: given for name, given in table.parameters.items() if isinstance(given, float | int)}
             log = _compute_speeds(self._simulate_bench(plant, table.virtual, own), table)
         else:
-            log = self._read_log(table)
+            log = self._read_log(table, anywhere=anywhere)
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
         log = _resample(log, table).decimate(table.decimate)
@@ -334,8 +355,9 @@ class Problem:
             )
         return value
 
-    def _read_log(self, table: ExperimentTable) -> Log:
-        check_links(self.folder, list_log_files(table))
+    def _read_log(self, table: ExperimentTable, *, anywhere: bool) -> Log:
+        """Read an experiment's log; `anywhere`: one that the user named, not the file, may lie outside its folder."""
+        check_links(self.folder, [name for name in list_log_files(table) if not (anywhere and name == table.log)])
         read = {OWN + name: given for name, given in table.parameters.items() if isinstance(given, ColumnTable)}
         channels = {**table.inputs, **table.outputs, **read}
         return read_log(
@@ -460,7 +482,27 @@ def read_problem(path: Path | str) -> Problem:
     """
     require_type(path, (str, Path), "path", "give the path of a problem file", ProblemError)
     source = Path(path)
-    table = _read_table(source)
+    return make_problem(_read_table(source), str(path), source.parent)
+
+
+def make_problem(table: ProblemTable, source: str, folder: Path) -> Problem:
+    """Make the objects that a validated problem file stands for.
+
+    Parameters
+    ----------
+    table : ProblemTable
+        The file.
+    source : str
+        Its path, for messages.
+    folder : Path
+        Where relative paths of logs start.
+
+    Raises
+    ------
+    SeaoptError
+        As `read_problem`.
+
+    """
     try:
         plants = _make_plants(table.plant)
         parameters = _make_parameters(table, plants)
@@ -469,9 +511,8 @@ def read_problem(path: Path | str) -> Problem:
     except SeaoptError as error:
         raise type(error)(f"{source}: {error}") from error
     return Problem(
-        title=table.title, source=str(path), folder=source.parent, parameters=parameters, plants=plants, table=table,
-        spec=spec,
-    )  # fmt: skip
+        title=table.title, source=source, folder=folder, parameters=parameters, plants=plants, table=table, spec=spec
+    )
 
 
 def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:

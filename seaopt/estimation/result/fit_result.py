@@ -132,7 +132,8 @@ class Fit:
         if self.status != "converged":
             return f"{self.status.replace('_', ' ')}: {self.message}"
         first, *more = self.errors
-        return f"{first.where}: {first.text}" + (f" (and {len(more)} more)" if more else "")
+        where = f"{first.where}: " if first.where else ""
+        return f"{where}{first.text}" + (f" (and {len(more)} more)" if more else "")
 
     @property
     def caveat(self) -> str:

@@ -1,0 +1,124 @@
+"""Give logs to workers in batches, and take back what they return, whatever happens to a worker.
+
+A batch is about 0.1 s of work, so that handing it over costs little, and few of them are in flight, so that a million
+logs wait here and not in a scheduler. Where a worker dies, nobody knows which log it was: those that were in
+flight are tried again at the end, one at a time and alone, and one on which a worker dies twice gets the blame.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from time import monotonic, sleep
+
+from seaopt.errors import SeaoptError
+from seaopt.executors import QUEUED, count_workers
+from seaopt.fleet.logs import FleetLog
+from seaopt.fleet.plan import Plan
+from seaopt.fleet.worker import FAILED, Row, describe_limit, fit_batch
+
+BATCH_S = 0.1  # of work in a batch
+LARGEST = 1000  # logs in a batch
+DEATHS = 2  # of a worker that works on one log alone, until that log is given up
+PATIENCE_S, AGAIN_S = 120.0, 1.0  # how long, and how often, work is offered to an executor that takes none
+
+
+class Dispatcher:
+    """The logs that wait, and the batches that are in flight.
+
+    Parameters
+    ----------
+    executor : Executor
+    plan : Plan
+    logs : sequence of FleetLog
+    known : mapping of path to SHA-256
+        As in `fit_batch`.
+
+    """
+
+    def __init__(self, executor: Executor, plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> None:
+        self.executor = executor
+        self.plan = plan
+        self.known = known
+        self.waiting = deque(logs)
+        self.suspects: deque[FleetLog] = deque()
+        self.deaths: dict[str, int] = {}
+        self.flying: dict[Future[list[Row]], tuple[FleetLog, ...]] = {}
+        self.alone = False  # whether what is in flight is one suspect
+        self.log_s: float | None = None  # a log's mean time, of late
+
+    def run(self) -> Generator[list[Row]]:
+        """Yield the rows of each batch as it is done.
+
+        Raises
+        ------
+        SeaoptError
+            The executor takes no more work.
+
+        """
+        try:
+            while self.waiting or self.suspects or self.flying:
+                self._fill()
+                done, _ = wait(self.flying, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield self._take(future)
+        finally:
+            for future in self.flying:
+                future.cancel()
+
+    def _fill(self) -> None:
+        """Submit batches until enough are in flight; a suspect only where nothing else is."""
+        most = QUEUED * count_workers(self.executor)
+        self.alone = self.alone and bool(self.flying)
+        while self.waiting and len(self.flying) < most:
+            size = self._choose_size(most)
+            self._submit(tuple(self.waiting.popleft() for _ in range(size)))
+        if self.suspects and not self.waiting and not self.flying:
+            self.alone = True
+            self._submit((self.suspects.popleft(),))
+
+    def _choose_size(self, most: int) -> int:
+        if self.log_s is None:
+            return 1
+        share = -(-len(self.waiting) // most)  # the last batches end together
+        return max(1, min(int(BATCH_S / max(self.log_s, 1e-9)), LARGEST, share))
+
+    def _submit(self, batch: tuple[FleetLog, ...]) -> None:
+        known = {log.path: self.known[log.path] for log in batch if log.path in self.known}
+        started = monotonic()
+        while True:
+            try:
+                self.flying[self.executor.submit(fit_batch, self.plan, batch, known)] = batch
+                return
+            except Exception as error:  # each engine has its own; a scheduler that restarts is back in a while
+                if monotonic() - started > PATIENCE_S or isinstance(error, RuntimeError):
+                    raise SeaoptError(
+                        f"the executor takes no more work ({type(error).__name__}: {error}); start the workers again"
+                    ) from error
+                sleep(AGAIN_S)
+
+    def _take(self, future: Future[list[Row]]) -> list[Row]:
+        """Return the rows of a batch that came back; of one that did not, those of logs that are given up."""
+        batch = self.flying.pop(future)
+        try:
+            rows = future.result()
+        except (Exception, CancelledError):  # `fit_batch` raises nothing: a worker, or the way to it, was lost
+            return self._suspect(batch)
+        mean = sum(row["total_s"] for row in rows) / len(rows)
+        self.log_s = mean if self.log_s is None else 0.7 * self.log_s + 0.3 * mean
+        return rows
+
+    def _suspect(self, batch: tuple[FleetLog, ...]) -> list[Row]:
+        """Put the logs of a lost batch aside; a log that was alone for the second time gets the blame."""
+        if not self.alone:
+            self.suspects.extend(batch)
+            return []
+        (log,) = batch
+        self.deaths[log.path] = deaths = self.deaths.get(log.path, 0) + 1
+        if deaths < DEATHS:
+            self.suspects.append(log)
+            return []
+        limit = "" if self.plan.time_limit_s is None else f", or it {describe_limit(self.plan)}"
+        reason = f"the worker process died on it {deaths} times: out of memory, or a fault of compiled code{limit}"
+        return [{"log": log.path, **log.identity, "status": FAILED, "reason": reason}]

@@ -1,0 +1,117 @@
+"""What is the same for all logs of a fleet: the problem as data, and the columns of its table."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from seaopt import __version__
+from seaopt.errors import ProblemError
+from seaopt.problem import Problem
+from seaopt.problem.columns import list_log_files
+from seaopt.problem.problem import make_problem
+from seaopt.problem.schema import ProblemTable, UnknownTable
+from seaopt.records import record
+
+_PARTS = {"version", "parameters", "plant", "fit"}  # of a problem, that a fit reads besides its experiment
+
+
+@record
+class Plan:
+    """What a worker is told once: data only, no code.
+
+    Parameters
+    ----------
+    problem : str
+        The problem file as JSON, with the one experiment that says how a log is read.
+    source, folder : str
+        The problem file, for messages, and where relative paths start.
+    time_limit_s : float or None
+        For a log.
+    client : str
+        Which process asks; that one a worker must not end.
+
+    """
+
+    problem: str
+    source: str
+    folder: str
+    time_limit_s: float | None
+    client: str
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the problem."""
+        return hashlib.sha256(self.problem.encode()).hexdigest()
+
+    @property
+    def version(self) -> str:
+        """Of the package, whose results are taken up again."""
+        return __version__
+
+    def make_problem(self) -> Problem:
+        """Return the problem."""
+        table = ProblemTable.model_validate_json(self.problem)
+        return make_problem(table, self.source, Path(self.folder))
+
+
+@record
+class Columns:
+    """The columns of a fleet's table that the problem gives, in order.
+
+    Parameters
+    ----------
+    units : mapping of name to unit
+        Of the parameters and figures, each of which has a column of its standard deviation, too.
+    outputs : tuple of str
+
+    """
+
+    units: Mapping[str, str]
+    outputs: tuple[str, ...]
+
+
+def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, client: str) -> Plan:
+    """Return the plan of a fleet.
+
+    Raises
+    ------
+    ProblemError
+        No experiment says how to read a log, or it reads more files than one.
+
+    """
+    template = problem.choose_template(like)
+    if list_log_files(template) != [template.log]:
+        raise ProblemError(
+            f"{problem.source}: experiment {template.name} reads several files, and a log of a fleet is one; put its "
+            "columns into one file"
+        )
+    table = problem.table.model_dump(mode="json", by_alias=True, exclude_unset=True, include=_PARTS)
+    table["experiment"] = [template.model_dump(mode="json", by_alias=True, exclude_unset=True) | {"use": "fit"}]
+    return Plan(
+        problem=json.dumps(table), source=problem.source, folder=str(problem.folder.resolve()),
+        time_limit_s=time_limit_s, client=client,
+    )  # fmt: skip
+
+
+def list_columns(problem: Problem) -> Columns:
+    """Return the columns that a plan's problem gives."""
+    template = problem.choose_template()
+    plant = problem.plants[template.plant]
+    units = {
+        name: problem.parameters[name].unit
+        for name in problem.parameters.free_names
+        if name in plant.parameters and name not in template.parameters
+    }
+    units |= {name: plant.parameter_unit(name) for name, given in template.parameters.items() if _is_free(given)}
+    units |= {"delay_s": "s"} if _is_free(template.delay_s) else {}
+    units |= {f"gain_{name}": "-" for name, given in template.gain.items() if _is_free(given)}
+    units |= {name: unit for name, (_, unit) in plant.derived_values().items() if name not in units}
+    return Columns(units=units, outputs=tuple(template.outputs))
+
+
+def _is_free(given: Any) -> bool:
+    return isinstance(given, UnknownTable) and (given.free if given.free is not None else given.prior_std is not None)

@@ -1,0 +1,168 @@
+"""The result of a fleet: its table, how many are met, and how its parameters spread."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+from jaxtyping import Float
+
+from seaopt.fleet.worker import FAILED, MET, NOT_MET
+from seaopt.formatting import format_count, format_number, format_table, html_text
+from seaopt.records import record
+
+FLEET_SCHEMA = "seaopt/fleet/1"
+
+
+@record
+class Spread:
+    """A parameter or figure over the logs that are met and identify it.
+
+    Parameters
+    ----------
+    name, unit : str
+    logs : int
+    median, low, high : float
+        Of the values: their median, and what a tenth of them lie below and above.
+    std : float
+        Median of the stated standard deviations.
+
+    """
+
+    name: str
+    unit: str
+    logs: int
+    median: float
+    low: float
+    high: float
+    std: float
+
+
+@record(eq=False, repr=False)
+class Fleet:
+    """What `fit_fleet` returns; ``print(fleet)`` is a summary.
+
+    Parameters
+    ----------
+    rows : polars.DataFrame
+        A row a log, in order of their paths: log, identity, status ("met", "not met", "failed"), reason, values and
+        standard deviations, figures of the outputs, findings, times, hashes.
+    units : mapping of name to unit
+        Of the columns of parameters and figures.
+    identity : tuple of str
+        Columns that say whose log it is.
+    unchanged : int
+        How many were done before.
+
+    """
+
+    rows: pl.DataFrame
+    units: Mapping[str, str]
+    identity: tuple[str, ...] = ()
+    unchanged: int = 0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many logs are met, not met, and failed."""
+        counts = Counter(self.rows["status"])
+        return {name: counts[name] for name in (MET, NOT_MET, FAILED)}
+
+    @property
+    def met(self) -> bool:
+        """Whether every log is."""
+        return self.counts[MET] == len(self.rows)
+
+    @property
+    def verdict(self) -> str:
+        """What to say of it in one line."""
+        counts = self.counts
+        if self.met:
+            return f"{format_count(len(self.rows), 'log')}, all met"
+        bad = [f"{counts[name]} {name}" for name in (NOT_MET, FAILED) if counts[name]]
+        return f"{counts[NOT_MET] + counts[FAILED]} of {format_count(len(self.rows), 'log')} not met: {', '.join(bad)}"
+
+    @property
+    def reasons(self) -> tuple[tuple[str, int, str], ...]:
+        """Why logs are not met: each reason without what differs from log to log, how many, and one of the logs."""
+        bad = self.rows.filter(pl.col("status") != MET)
+        return count_reasons(zip(*(bad[name].to_list() for name in ("log", "reason", "findings")), strict=True))
+
+    @property
+    def spreads(self) -> tuple[Spread, ...]:
+        """How parameters and figures spread over the logs that are met."""
+        met = self.rows.filter(pl.col("status") == MET)
+        spreads = (_spread(name, unit, met) for name, unit in self.units.items() if name in met.columns)
+        return tuple(spread for spread in spreads if spread is not None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of fleet.json (schema seaopt/fleet/1)."""
+        return {
+            "schema": FLEET_SCHEMA, "met": self.met, "logs": len(self.rows), "counts": self.counts,
+            "reasons": [{"reason": text, "logs": count, "example": log} for text, count, log in self.reasons],
+            "units": dict(self.units), "identity": list(self.identity),
+            "spreads": {
+                one.name: {
+                    "unit": one.unit, "logs": one.logs, "median": one.median, "p10": one.low, "p90": one.high,
+                    "median_std": one.std,
+                } for one in self.spreads
+            },
+        }  # fmt: skip
+
+    def __repr__(self) -> str:
+        lines = [f"Fleet: {self.verdict}"]
+        lines += [f"  {count} x {text} ({log})" for text, count, log in self.reasons[:10]]
+        return "\n".join([*lines, *(f"  {line}" for line in tabulate_spreads(self.spreads))])
+
+    _repr_html_ = html_text
+
+
+HEAD, ALIGN = ("parameter", "unit", "logs", "median", "10 %", "90 %", "std of one"), "<<>>>>>"
+
+
+def list_cells(spreads: Sequence[Spread]) -> list[list[str]]:
+    """Return the rows of a table of spreads."""
+    return [
+        [one.name, one.unit, str(one.logs), *map(format_number, (one.median, one.low, one.high, one.std))]
+        for one in spreads
+    ]
+
+
+def tabulate_spreads(spreads: Sequence[Spread]) -> list[str]:
+    """Return the lines of a table of spreads."""
+    return format_table(list_cells(spreads), HEAD, ALIGN) if spreads else []
+
+
+def count_reasons(
+    rows: Iterable[tuple[str, str | None, Sequence[Mapping[str, Any]] | None]],
+) -> tuple[tuple[str, int, str], ...]:
+    """Return the kinds of reasons, the most frequent first, with how many logs have each and one of them.
+
+    Reasons of one kind of finding at one place are one, whatever their figures; so are errors that differ in the
+    log's name alone.
+    """
+    counts, examples = Counter[str](), dict[str, tuple[str, str]]()
+    for log, reason, findings in rows:
+        errors = [one for one in findings or () if one["severity"] == "error"]
+        text = (reason or "").replace(log, "LOG")
+        kind = f"{errors[0]['kind']} {errors[0]['where']}" if errors else text
+        counts[kind] += 1
+        examples.setdefault(kind, (text, log))
+    return tuple((examples[kind][0], count, examples[kind][1]) for kind, count in counts.most_common())
+
+
+def _spread(name: str, unit: str, met: pl.DataFrame) -> Spread | None:
+    values, stds = select_known(met, name)
+    if not values.size:
+        return None
+    low, median, high = np.quantile(values, (0.1, 0.5, 0.9)).tolist()
+    return Spread(name=name, unit=unit, logs=values.size, median=median, low=low, high=high, std=float(np.median(stds)))
+
+
+def select_known(rows: pl.DataFrame, name: str) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the values of a parameter and their standard deviations, of the rows that identify it."""
+    values, stds = (rows[column].cast(pl.Float64).to_numpy() for column in (name, f"{name}_std"))
+    known = np.isfinite(values) & np.isfinite(stds)
+    return values[known], stds[known]

@@ -1,0 +1,173 @@
+"""The same fit over many logs, wherever they lie and whichever of them fail."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import NoneType
+from typing import Any
+
+import polars as pl
+
+from seaopt.errors import LogError, SeaoptError, require_number, require_type
+from seaopt.executors import Processes
+from seaopt.files import check_folder, write_json
+from seaopt.fleet.dispatch import Dispatcher
+from seaopt.fleet.logs import FleetLog, find_logs
+from seaopt.fleet.plan import list_columns, make_plan
+from seaopt.fleet.result import Fleet
+from seaopt.fleet.table import Table, find_done, make_schema
+from seaopt.fleet.worker import FAILED, MET, NOT_MET, UNCHANGED, name_process
+from seaopt.problem import Problem, read_problem
+from seaopt.progress import Progress, ignore
+
+TIME_LIMIT_S = 600.0
+
+
+def fit_fleet(
+    problem: Problem | Path | str,
+    logs: Sequence[str | Path | FleetLog],
+    folder: Path | str | None = None,
+    *,
+    executor: Executor | None = None,
+    like: str | None = None,
+    identity: str | None = None,
+    time_limit_s: float | None = TIME_LIMIT_S,
+    progress: Progress = ignore,
+) -> Fleet:
+    """Fit each of many logs by itself, as one experiment of a problem says.
+
+    Parameters
+    ----------
+    problem : Problem, or path of a problem file
+        Its plant, parameters and [fit]; its experiment with a log says how each is read, with slice, offsets, sigma.
+    logs : sequence of str, Path or FleetLog
+        Files, patterns such as ``"logs/**/*.csv"``, addresses that fsspec opens, or what `read_manifest` returns.
+    folder : Path or str, optional
+        Where the table is, and stays: logs that are done there, with the same content, problem and version, are not
+        fitted again, those that failed are. In memory only, if left out.
+    executor : Executor, optional
+        Any of `concurrent.futures`, whose workers see the same files: `seaopt.executors.Processes()` if left out, or
+        what `seaopt.executors.connect_dask` yields.
+    like : str, optional
+        The experiment that says how logs are read; the first with a log if left out.
+    identity : str, optional
+        As in `find_logs`: ``"{robot}/{actuator}_{run}.csv"``.
+    time_limit_s : float or None
+        For one log; None for none.
+    progress : callable, optional
+        Called with what is done and the share of it (`seaopt.progress.Progress`).
+
+    Returns
+    -------
+    Fleet
+        Of these logs, one row each.
+
+    Raises
+    ------
+    SeaoptError
+        There are no logs; the problem does not say how to read one; the table cannot be written (what is written
+        stays, and the same call goes on from there); the executor takes no more work.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> import seaopt as so
+    >>> from seaopt.bench import PAPER_STAND
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = (folder / "stand.toml").write_text('''
+    ... schema = 1
+    ... parameters = { J = { value = 2e-6, free = true }, b_r = { value = 2e-4, free = true } }
+    ... plant.stand.kind = "high_impedance"
+    ... [[experiment]]
+    ... name = "test"
+    ... plant = "stand"
+    ... log = "first.csv"
+    ... time = "time [s]"
+    ... inputs = { I = "I [A]" }
+    ... outputs = { F1 = "F1 [N]" }
+    ... ''')
+    >>> plant, truth, cells = so.plants.high_impedance(), so.plants.thor(), so.Sensors(noise_std={"F1": 2.0})
+    >>> for n in (1, 2):
+    ...     log = so.virtual_log(plant, truth, PAPER_STAND, duration_s=5, rate_hz=400, seed=n, sensors=cells)
+    ...     _ = so.write_log(log, folder / f"joint{n}.csv")
+    >>> with ThreadPoolExecutor(1) as executor:
+    ...     fleet = so.fit_fleet(folder / "stand.toml", [folder / "joint*.csv"], executor=executor,
+    ...                          identity="{joint}.csv")
+    >>> fleet.counts, fleet.rows["joint"].to_list()
+    ({'met': 2, 'not met': 0, 'failed': 0}, ['joint1', 'joint2'])
+
+    """
+    problem = problem if isinstance(problem, Problem) else read_problem(problem)
+    require_type(executor, (Executor, NoneType), "executor", "give a concurrent.futures.Executor")
+    if time_limit_s is not None and not require_number(time_limit_s, "time_limit_s") > 0.0:
+        raise SeaoptError(f"time_limit_s = {time_limit_s:g} leaves no time; give seconds above zero, or None")
+    chosen = _choose_logs(logs, identity)
+    plan = make_plan(problem, like, time_limit_s, name_process())
+    columns, names = list_columns(plan.make_problem()), list(chosen[0].identity)
+    schema = make_schema(columns, names)
+    _check_names(names, make_schema(columns, ()))
+    with ExitStack() as stack:
+        if folder is None:
+            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="seaopt-fleet-")))
+        else:
+            place = Path(folder)
+            check_folder(place)
+        table = Table(place, schema, plan)
+        stack.callback(table.close)
+        if executor is None:
+            executor = Processes()
+            stack.callback(executor.shutdown, cancel_futures=True)
+        table.relabel(names, chosen)
+        unchanged = _fit_all(table, executor, chosen, progress)
+        rows = table.read().filter(pl.col("log").is_in([log.path for log in chosen])).select(*schema)
+        result = Fleet(rows=rows, units=columns.units, identity=tuple(names), unchanged=unchanged)
+        if folder is not None:
+            made_from = {"problem_sha256": plan.digest, "version": plan.version}
+            write_json(place / "fleet.json", result.to_dict() | made_from)
+    return result
+
+
+def _choose_logs(logs: Sequence[str | Path | FleetLog], identity: str | None) -> tuple[FleetLog, ...]:
+    """Return the logs with their identities."""
+    given = [logs] if isinstance(logs, str | Path) else list(logs)
+    listed = tuple(log for log in given if isinstance(log, FleetLog))
+    if not listed:
+        return find_logs([log for log in given if not isinstance(log, FleetLog)], identity)
+    if len(listed) < len(given) or identity is not None:
+        raise LogError("logs has some that are FleetLog, with identities of their own; give all so, without identity")
+    if len({log.path for log in listed}) < len(listed) or len({tuple(log.identity) for log in listed}) > 1:
+        raise LogError("logs has one twice, or identities of different names; give each once, with the same names")
+    return listed
+
+
+def _check_names(identity: Sequence[str], schema: dict[str, Any]) -> None:
+    taken = [name for name in identity if name in schema]
+    if taken:
+        raise LogError(f'identity has a column "{taken[0]}", which the table has for something else; rename it')
+
+
+def _fit_all(table: Table, executor: Executor, logs: Sequence[FleetLog], progress: Progress) -> int:
+    """Fit what is not done, and write it; return how many logs were done before."""
+    known = find_done(table.read(), table.plan)
+    counts = dict.fromkeys((MET, NOT_MET, FAILED, UNCHANGED), 0)
+    try:
+        for batch in Dispatcher(executor, table.plan, logs, known).run():
+            table.add([row for row in batch if row["status"] != UNCHANGED])
+            for row in batch:
+                counts[row["status"]] += 1
+            done = sum(counts.values())
+            bad = "".join(f", {counts[name]} {name}" for name in (NOT_MET, FAILED) if counts[name])
+            progress(f"{done} of {len(logs)} logs{bad}", done / len(logs))
+    except BaseException:
+        with suppress(SeaoptError):  # of a full disk the first error tells
+            table.flush()
+        raise
+    table.flush()
+    if len(table.parts()) > 1:
+        table.merge()
+    return counts[UNCHANGED]

@@ -1,0 +1,214 @@
+"""What a worker does: fit a batch of logs, one after another, and return a row for each.
+
+A log that cannot be read or fitted is a row with its reason. One that takes longer than the time limit is interrupted,
+by a signal in a process's main thread, by an exception in another one; where neither gets through, in compiled code or
+on a dead network drive, the worker process ends itself, which the client notices.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from seaopt.errors import SeaoptError
+from seaopt.estimation import Fit, fit
+from seaopt.fleet.logs import FleetLog, open_local
+from seaopt.fleet.plan import Plan
+from seaopt.problem import Problem
+
+Row = dict[str, Any]
+MET, NOT_MET, FAILED, UNCHANGED = "met", "not met", "failed", "unchanged"
+GRACE_S = 5.0  # after the time limit, until the process is ended
+ENDED = 1  # its exit code
+
+
+class _TimeLimitError(BaseException):
+    """A log took too long. Code that handles every Exception must not handle this."""
+
+
+def name_process() -> str:
+    """Return what no other process of the cluster is called."""
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+def fit_batch(plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> list[Row]:
+    """Return a row for each log.
+
+    Parameters
+    ----------
+    plan : Plan
+        The same for all.
+    logs : sequence of FleetLog
+        The batch.
+    known : mapping of path to SHA-256
+        The contents that are fitted already; a log that still has it is not fitted again.
+
+    Returns
+    -------
+    list of dict
+        With status "met", "not met", "failed" or "unchanged".
+
+    """
+    return [_fit_log(plan, log, known.get(log.path)) for log in logs]
+
+
+@lru_cache(maxsize=4)
+def _load(plan: Plan) -> Problem:
+    return plan.make_problem()
+
+
+def _fit_log(plan: Plan, log: FleetLog, known: str | None) -> Row:
+    """Return a log's row."""
+    started = time.perf_counter()
+    row: Row = {"log": log.path, **log.identity}
+    try:
+        _load(plan)  # once, and not in the log's time
+        with _limit_time(plan):
+            row |= _describe_fit(plan, log, known)
+    except SeaoptError as error:
+        row |= {"status": FAILED, "reason": str(error)}
+    except _TimeLimitError:
+        row |= {"status": FAILED, "reason": describe_limit(plan)}
+    except MemoryError:
+        row |= {"status": FAILED, "reason": f"{log.path}: does not fit in the worker's memory"}
+    except Exception as error:  # whatever is wrong with one log, the others go on
+        row |= {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
+    return row | {"total_s": time.perf_counter() - started}
+
+
+def describe_limit(plan: Plan) -> str:
+    """Return the reason of a log that took too long."""
+    return f"takes longer than the time limit of {plan.time_limit_s:g} s; shorten it, or raise the limit"
+
+
+def _describe_fit(plan: Plan, log: FleetLog, known: str | None) -> Row:
+    problem = _load(plan)
+    with open_local(log.path) as (path, digest):
+        if digest == known:
+            return {"status": UNCHANGED}
+        row: Row = {"log_sha256": digest}
+        try:
+            experiment = problem.repeat_experiment(path)
+            fitted = fit(
+                [experiment], problem.parameters, alternatives=tuple(problem.plants.values()), **problem.fit_options
+            )
+        except SeaoptError as error:
+            return row | {"status": FAILED, "reason": str(error)}
+    return row | describe(fitted, experiment.name)
+
+
+def describe(fitted: Fit, name: str) -> Row:
+    """Return a fit as a row: values, standard deviations and units of its unknowns and figures, verdict and findings.
+
+    Parameters
+    ----------
+    fitted : Fit
+        Of one experiment.
+    name : str
+        Of its experiment, which the names of what is of this log alone begin with.
+
+    """
+    row: Row = {"status": MET if fitted.met else NOT_MET, "reason": None if fitted.met else fitted.verdict}
+    for parameter in fitted.parameters.values():
+        if parameter.free:
+            own = parameter.name.removeprefix(f"{name}.")
+            row |= {own: parameter.value, f"{own}_std": parameter.std}
+    nuisance = fitted.nuisance[name]
+    for key, std in nuisance.std.items():
+        value = nuisance.delay_s if key == "delay_s" else nuisance.gain[key.removeprefix("gain.")]
+        row |= {key.replace(".", "_"): value, f"{key.replace('.', '_')}_std": std}
+    for key, figure in fitted.derived.items():
+        own = key.removeprefix(f"{name}.")
+        row |= {own: figure.value, f"{own}_std": figure.std}
+    for output, one in fitted.outputs[name].items():
+        row |= {f"fit_percent_{output}": one.fit_percent, f"rms_residual_{output}": one.rms_residual}
+    findings = [
+        {"severity": one.severity, "kind": one.kind, "where": one.where, "text": one.text} for one in fitted.findings
+    ]
+    return row | {
+        "findings": findings, "fit_status": fitted.status, "samples": fitted.samples, "iterations": fitted.iterations,
+        "fit_s": fitted.wall_s,
+    }  # fmt: skip
+
+
+@contextmanager
+def _limit_time(plan: Plan) -> Generator[None]:
+    """Interrupt what takes longer than the plan's time limit; end the process where that does not help."""
+    if plan.time_limit_s is None:
+        yield
+        return
+    interrupt = _interrupt_by_signal if _may_signal() else _interrupt_thread
+    may_end = name_process() != plan.client
+    with _end_process(plan.time_limit_s + GRACE_S) if may_end else nullcontext(), interrupt(plan.time_limit_s):
+        yield
+
+
+@contextmanager
+def _end_process(seconds: float) -> Generator[None]:
+    """End this process after so many seconds, whoever has Python's lock; of several threads, one that needs it."""
+    if threading.current_thread() is threading.main_thread():
+        with Path(os.devnull).open("w") as nowhere:
+            faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
+            try:
+                yield
+            finally:
+                faulthandler.cancel_dump_traceback_later()
+        return
+    end = threading.Timer(seconds, os._exit, [ENDED])
+    end.daemon = True
+    end.start()
+    try:
+        yield
+    finally:
+        end.cancel()
+
+
+def _may_signal() -> bool:
+    return threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+
+
+def _stop(*_: Any) -> None:
+    raise _TimeLimitError
+
+
+@contextmanager
+def _interrupt_by_signal(seconds: float) -> Generator[None]:
+    """Raise in this, the main thread after so many seconds; it ends waiting for files, too."""
+    before = signal.signal(signal.SIGALRM, _stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@contextmanager
+def _interrupt_thread(seconds: float) -> Generator[None]:
+    """Raise in this thread after so many seconds, at its next line of Python."""
+    thread, lock, over = threading.get_ident(), threading.Lock(), False
+
+    def interrupt() -> None:
+        with lock:  # not after the log is done, when this thread has gone on to something else
+            if not over:
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(_TimeLimitError))
+
+    timer = threading.Timer(seconds, interrupt)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        with lock:
+            over = True

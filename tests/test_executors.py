@@ -1,0 +1,65 @@
+"""Executors: order and bounded queue of the map, and processes that come back after one of them dies."""
+
+from __future__ import annotations
+
+import os
+import time
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+
+import pytest
+
+from seaopt.errors import SeaoptError
+from seaopt.executors import QUEUED, Processes, connect_dask, count_workers, map_ordered
+
+
+class Counting(Executor):
+    """Works at once, and counts what is submitted."""
+
+    _max_workers = 3
+
+    def __init__(self):
+        self.submitted = 0
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.submitted += 1
+        future = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def late(k):
+    time.sleep(0.02 * (k % 3))
+    return k
+
+
+def test_results_come_in_order_whoever_is_first():
+    with ThreadPoolExecutor(4) as threads:
+        assert list(map_ordered(late, range(20), threads)) == list(range(20))
+    assert list(map_ordered(late, range(4))) == list(range(4))
+
+
+def test_few_are_in_flight():
+    executor = Counting()
+    results = map_ordered(abs, iter(range(1000)), executor)
+    next(results)
+    assert executor.submitted == QUEUED * count_workers(executor) == 6
+
+
+def test_a_number_of_workers_is_checked():
+    with pytest.raises(SeaoptError, match="workers = 0"):
+        Processes(0)
+
+
+def test_processes_go_on_after_a_death():
+    with Processes(1) as executor:
+        first = executor.submit(os.getpid).result()
+        with pytest.raises(BrokenExecutor):
+            executor.submit(os._exit, 3).result()
+        again = executor.submit(os.getpid).result()
+    assert os.getpid() not in (first, again) and first != again
+
+
+def test_a_scheduler_that_is_not_there_is_said():
+    pytest.importorskip("distributed")
+    with pytest.raises(SeaoptError, match="does not answer"), connect_dask("tcp://127.0.0.1:9", timeout_s=0.5):
+        pass
