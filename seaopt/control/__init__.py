@@ -7,6 +7,7 @@ from seaopt.control.given.pid_forms import drive_pid, ideal_pid, parallel_pid
 from seaopt.control.impedance.critical_damping import critical_impedance
 from seaopt.control.impedance.region import ImpedanceRegion, passive_region
 from seaopt.control.impedance.rendering import Rendering, add_impedance, render
+from seaopt.control.impedance.scorecard import Score, Scorecard, scorecard
 from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.passivity import Passivity, passivity, passivity_rows
@@ -38,8 +39,8 @@ __all__ = [
     "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "Frontier", "Gains", "GateState", "GivenLaw",
     "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep",
     "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate", "Rendering", "RunnableLaw",
-    "SampledLoop", "TransferFunction", "add_impedance", "assess", "close_loop", "command_of", "corners",
-    "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export", "export_mpc", "force_mpc",
-    "ideal_pid", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity", "passivity_rows", "read_law",
-    "realise", "render", "run_loop", "runnable", "sample", "sweep", "tune",
+    "SampledLoop", "Score", "Scorecard", "TransferFunction", "add_impedance", "assess", "close_loop", "command_of",
+    "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise", "estimator", "export", "export_mpc",
+    "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid", "passive_region", "passivity", "passivity_rows",
+    "read_law", "realise", "render", "run_loop", "runnable", "sample", "scorecard", "sweep", "tune",
 ]  # fmt: skip

@@ -8,8 +8,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from seaopt.control import Controller, ForceMPC
+from seaopt.control import Controller, ForceMPC, Scorecard, scorecard
 from seaopt.control.deploy.export import export
+from seaopt.control.impedance.scorecard import HEADS
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.control.laws.verdict import list_design_figures
 from seaopt.errors import SeaoptError, require_type
@@ -313,6 +314,7 @@ def _render(
         coupled=material.coupled, simulated=None if certificate is None else certificate.simulated,
         limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
         units={} if controller is None else name_gain_units(controller.command),
+        card=_score(controller), card_heads=HEADS,
         header=None if controller is None else write_header(controller),
         forces=_describe_forces(controller), swinging=_swings(certificate),
         requirements=[] if certificate is None else group_requirements(certificate),
@@ -320,6 +322,16 @@ def _render(
         logs=[(one, one.log.quality) for one in experiments],
         provenance=describe_provenance(experiments, files, command),
     )  # fmt: skip
+
+
+def _score(controller: Controller | None) -> Scorecard | None:
+    """Return the score of a controller on its design plant; None where that has no port, or is not known."""
+    if controller is None or controller.design is None:
+        return None
+    try:
+        return scorecard({controller.structure: controller})
+    except SeaoptError:
+        return None
 
 
 def list_reasons(material: Material) -> list[str]:
