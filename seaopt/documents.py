@@ -20,7 +20,9 @@ from seaopt.errors import FileError, SeaoptError, suggestion
 EXAMPLES = {"float": "1.0", "int": "1", "bool": "true", "string": '"..."'}  # of a kind of value
 MAX_SHOWN = 60  # characters of a wrong value that a message repeats
 # In a place of pydantic's these name what a value was tried as, and are no keys of the file.
-UNION_BRANCH = re.compile(r"\w*Table|float|int|bool|str|(literal|dict|tuple|list)\[.*|(function|constrained)-.*")
+UNION_BRANCH = re.compile(
+    r"\w*Table|Stored\w+|float|int|bool|str|(literal|dict|tuple|list)\[.*|(function|constrained)-.*"
+)
 
 Number = Annotated[float, Strict()]
 Whole = Annotated[int, Strict()]

@@ -39,19 +39,20 @@ class CompiledLaw:
             )  # fmt: skip; the last three are there with a gate
 
         self.law, self.library = Law(), ctypes.CDLL(str(library))
-        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, real]
+        read = controller.law.d.size - 1
+        self.library.law_step.argtypes = [ctypes.POINTER(Law), real, *[real] * read]
         self.library.law_step.restype = real
-        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, real, real]
+        self.library.law_reset.argtypes = [ctypes.POINTER(Law), real, *[real] * read, real]
         self.library.law_init(ctypes.byref(self.law))
 
-    def step(self, reference, measurement):
-        return self.library.law_step(ctypes.byref(self.law), float(reference), float(measurement))
+    def step(self, reference, *measurements):
+        return self.library.law_step(ctypes.byref(self.law), float(reference), *map(float, measurements))
 
     def reset(self, *values):
         self.library.law_reset(ctypes.byref(self.law), *values)
 
     def run(self, references, measurements):
-        return np.array([self.step(*pair) for pair in zip(references, measurements, strict=True)])
+        return np.array([self.step(r, *np.ravel(y)) for r, y in zip(references, measurements, strict=True)])
 
 
 class CompiledMPC:

@@ -93,7 +93,7 @@ def show_controller(console: Terminal, controller: Controller) -> None:
     spec = controller.spec
     delay = format_count(controller.delay_samples, "sample")
     heading(
-        console, "Controller", f"{controller.structure} on {spec.measured}, {spec.sample_rate_hz:g} Hz, {delay} late"
+        console, "Controller", f"{controller.structure} on {spec.regulated}, {spec.sample_rate_hz:g} Hz, {delay} late"
     )
     units, command = name_gain_units(controller.command), controller.engineering
     gains = [

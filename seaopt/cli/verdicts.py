@@ -96,7 +96,7 @@ def spell_cure(name: str, value: float) -> str:
 def judge_controller(controller: Controller, sweep: str) -> StageVerdict:
     """Return the verdict on a tuned controller; `sweep` is the command that tunes at a range of bandwidths."""
     spec = controller.spec
-    name = f"Controller: {controller.structure} on {spec.measured}, {spec.bandwidth_hz:g} Hz"
+    name = f"Controller: {controller.structure} on {spec.regulated}, {spec.bandwidth_hz:g} Hz"
     if controller.feasible:
         on = " on measured points" if controller.design is None else ""
         return StageVerdict(met=True, text=f"{name}, every limit met{on}")

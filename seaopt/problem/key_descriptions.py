@@ -223,7 +223,7 @@ KEYS: dict[str, dict[str, str]] = {
     },
     "ControllerTable": {
         "plant": 'The plant that it is designed on; or "frf:NAME", the frequency response of the experiment NAME.',
-        "measured": "The output that is regulated.",
+        "measured": "The output that is regulated; or a list, it and what else is fed back, such as the motor's speed.",
         "structure": "pid_dob adds a disturbance observer.",
         "notch": "Whether there is one, or which.",
         "reference_weights": '"tuned": of how the reference enters; "error", "measurement": fixed.',

@@ -16,6 +16,7 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_log
 from seaopt.control import ControllerSpec, Notch
 from seaopt.control import draw as draw_values
+from seaopt.control.loops.sampled_plant import list_names
 from seaopt.documents import check_table
 from seaopt.errors import FileError, ProblemError, SeaoptError, UnitError, require_type, suggestion
 from seaopt.estimation import (
@@ -158,7 +159,8 @@ class Problem:
         if isinstance(source, Fit) and experiment.name in source.nuisance:
             known = source.nuisance[experiment.name].delay_s
         return measure_response(
-            experiment.plant, experiment.log, asked.measured, name=experiment.name, confidence=asked.frf_confidence,
+            experiment.plant, experiment.log, list_names(asked.measured)[0], name=experiment.name,
+            confidence=asked.frf_confidence,
             clock=Clock(period=experiment.log.period, hold=experiment.hold, delay_s=known),
         )  # fmt: skip
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
-from seaopt.control.loops.sampled_plant import DELAY
-from seaopt.errors import ProblemError, SeaoptError, UnitError, suggestion
+from seaopt.control.loops.sampled_plant import DELAY, find_signals, list_names
+from seaopt.errors import ControlError, ProblemError, SeaoptError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.columns import check_inside
@@ -128,7 +128,7 @@ def _check_names(place: str, names: Iterable[str], known: Iterable[str]) -> None
 def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     if table.controller is None:
         return
-    measured = table.controller.measured
+    measured, *others = list_names(table.controller.measured)
     named = [table.controller.plant, *table.controller.robust_to]
     named += table.robustness.plants if table.robustness else []
     named += [table.impedance.plant] if table.impedance else []
@@ -144,6 +144,10 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
                 f'plant.{name}, which has {", ".join(known)}; write measured = "{_nearest(measured, known)}" in '
                 "[controller]"
             )
+        try:
+            find_signals(plants[name], tuple(others))
+        except ControlError as error:
+            raise ProblemError(f"controller.{error}") from error
 
 
 def _check_link(table: ProblemTable, plants: Mapping[str, Plant]) -> None:

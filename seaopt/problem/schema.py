@@ -393,7 +393,7 @@ class ControllerTable(_Strict):
     """What is asked of the controller."""
 
     plant: PlantOrResponse
-    measured: str = "F1"
+    measured: str | tuple[str, ...] = "F1"
     structure: Literal["pd", "pid", "pid_dob"] = "pid"
     notch: Flag | NotchTable = False
     reference_weights: Literal["tuned", "error", "measurement"] = "tuned"

@@ -19,6 +19,7 @@ from seaopt.control import (
     tune,
 )
 from seaopt.control.laws.delay import settle_delay
+from seaopt.control.loops.sampled_plant import list_names
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.frequency import MeasuredResponse
@@ -172,12 +173,16 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
         raise ProblemError(
             f"{problem.source}: has no [controller], whose limits a law is measured against; add one: bandwidth_hz = 30"
         )
-    if given.measured not in (None, problem.spec.measured):
+    measured = problem.spec.measured if given.measured is None else given.measured
+    regulated = list_names(measured)[0]
+    if regulated != problem.spec.regulated:
         raise ProblemError(
-            f"the law measures {given.measured}, and [controller] of {problem.source} {problem.spec.measured}; "
-            f'correct one of them: measured = "{given.measured}"'
+            f"the law measures {regulated}, and [controller] of {problem.source} {problem.spec.regulated}; "
+            f'correct one of them: measured = "{regulated}"'
         )
-    spec = replace(problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, delay_samples=given.delay_samples)
+    spec = replace(
+        problem.spec, sample_rate_hz=1.0 / given.law.sample_time_s, delay_samples=given.delay_samples, measured=measured
+    )
     if problem.designs_on_response:
         raise ProblemError(
             f"{problem.source}: a law of one's own is measured on a model, and [controller] is designed on "
@@ -185,7 +190,7 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
         )
     design, values = problem.design_plant, problem.values(source)
     _, robust_to = list_plants(problem, source)
-    law = given.to_effort(command_of(design, values, spec.measured).per_effort)
+    law = given.to_effort(command_of(design, values, spec.regulated).per_effort)
     controller = assess(design, values, law, spec, robust_to, draws=problem.draws(source))
     return add_outer_loop(problem, controller, source)
 

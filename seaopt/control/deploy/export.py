@@ -25,6 +25,7 @@ from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
 from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.sampled_plant import list_names
 from seaopt.errors import ControlError, FileError, require_type
 from seaopt.files import write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
@@ -236,7 +237,7 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
     command = stored["command"]
     return {
         "structure": _strip_markup(stored["structure"]),
-        "measured": _strip_markup(stored["spec"].measured),
+        "measured": _strip_markup(", ".join(_list_signals(stored))),
         "effort": stored["command"].mechanics.word,
         "command": {name: _strip_markup(getattr(command, name)) for name in ("word", "unit", "effort_unit")},
         "symbol": command.symbol,
@@ -260,6 +261,10 @@ def _describe(stored: Mapping[str, Any], law: RunnableLaw) -> dict[str, Any]:
         },
         "max_held": law.gate.max_held if law.gate is not None else 0,
     }
+
+
+def _list_signals(stored: Mapping[str, Any]) -> tuple[str, ...]:
+    return stored["reads"] or list_names(stored["spec"].measured)
 
 
 def _strip_markup(text: str) -> str:
@@ -287,19 +292,37 @@ def _numbers(
     def row(values: Iterable[float]) -> str:
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
-    rest, transfer_functions = law.rest(), stored["law"].transfer_functions()
+    per_reference, per_measurement = law.rest()
+    transfer_functions = stored["law"].transfer_functions()
+    b, d, rest = (
+        np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
+    )
+    others = [_strip_markup(name) for name in _list_signals(stored)[1:]]
     units = name_gain_units(stored["command"])
     largest = float(LARGEST_NUMBER[precision])
     return {
         "a": [row(values) for values in law.a] or [number(0.0)],
         "b_reference": row(law.b_reference),
-        "b_measurement": row(law.b_measurement),
+        "b_measurement": row(b[0]),
         "c": row(law.c),
         "d_reference": number(law.d_reference),
-        "d_measurement": number(law.d_measurement),
+        "d_measurement": number(float(d[0, 0])),
         "anti_windup": row(law.anti_windup),
-        "rest_reference": row(rest[0]),
-        "rest_measurement": row(rest[1]),
+        "rest_reference": row(per_reference),
+        "rest_measurement": row(rest[0]),
+        "more": [
+            {
+                "output": name,
+                "NAME": name.upper(),
+                "symbol": f"read_{name}",
+                "argument": f"{name}_given",
+                "minus": f" - C_{name} {name}",
+                "b": row(b[i]),
+                "d": number(float(d[i, 0])),
+                "rest": row(rest[i]),
+            }
+            for i, name in enumerate(map(_identifier, others), start=1)
+        ],
         "effort_limit": number(min(law.force_limit_N, largest)),
         "command_limit": number(min(law.current_limit_A, largest)),
         "per_effort": number(law.per_effort),
@@ -324,7 +347,11 @@ def _numbers(
         "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
-            for key, tf in zip(("reference", "measurement"), transfer_functions, strict=True)
+            for key, tf in zip(
+                ("reference", "measurement", *(f"measurement_{_identifier(name)}" for name in others)),
+                transfer_functions,
+                strict=True,
+            )
         ],
     }
 

@@ -11,6 +11,7 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.sampled_plant import find_signals, list_names
 from seaopt.control.tuning.tuner import RobustTo, describe_law, make_task
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
@@ -37,7 +38,7 @@ def assess(
     plant, params
         The design plant, and its parameters, as in `tune`.
     law : Law or a python-control system
-        From reference and measured to effort: `Law.from_state_space`, `Law.from_transfer_functions`,
+        From reference and each measured signal to effort: `Law.from_state_space`, `Law.from_transfer_functions`,
         `seaopt.control.parallel_pid`, `ideal_pid`, or what `Law.from_control` takes. A law to the command itself (A) is
         divided by the command for one unit of effort: `law.scaled(1/command_of(plant, params, measured).per_effort)`.
     spec : ControllerSpec
@@ -70,8 +71,14 @@ def assess(
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
     require_plant(plant, "plant", ControlError)
     given = law if isinstance(law, Law) else Law.from_control(law)
-    if given.d.size != 2:
-        raise ControlError(f"law reads {given.d.size - 1} signals; give one of reference and one measured signal")
+    names, signals = list_names(spec.measured), find_signals(plant, spec.measured)
+    if given.d.size != 1 + len(names):
+        raise ControlError(
+            f"law reads {given.d.size - 1} signals, and measured = {list(names)} names {len(names)}; give one of the "
+            "reference and of each signal, or name them all in measured"
+        )
+    for column, (name, signal) in enumerate(zip(names, signals, strict=True), start=1):
+        given = given if name == signal else given.differenced(column)
     if abs(given.sample_time_s * spec.sample_rate_hz - 1.0) > SAME_RATE:
         raise ControlError(
             f"law has a sample time of {given.sample_time_s:g} s, and the specification sample_rate_hz = "

@@ -14,6 +14,7 @@ from seaopt.control.given.pid_forms import Integral, ideal_pid, parallel_pid
 from seaopt.control.laws.stored import Finite, StoredTransferFunction
 from seaopt.control.laws.structures import AGREES, COMPARED
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.sampled_plant import Measured
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Whole, check_table
 from seaopt.errors import ControlError, FileError
@@ -36,7 +37,7 @@ class GivenLaw:
         From reference and measured to effort; or to the command, where `to_command`.
     delay_samples : int
         Whole samples from measurement to output, besides the hold.
-    measured : str or None
+    measured : str, tuple of str or None
         What it measures; None where the file does not say.
     to_command : bool
         Whether it gives the command (A, V, duty) itself.
@@ -47,7 +48,7 @@ class GivenLaw:
 
     law: Law
     delay_samples: int
-    measured: str | None = None
+    measured: Measured | None = None
     to_command: bool = False
     per_effort: float | None = None
 
@@ -122,7 +123,7 @@ class LawFile(_Strict):
     measured: list[str] | str | None = None
     law: _StateSpace | None = None
     reference: StoredTransferFunction | None = None
-    measurement: StoredTransferFunction | None = None
+    measurement: StoredTransferFunction | list[StoredTransferFunction] | None = None
     pid: _Pid | None = None
     command: _Command = _Command()
     # Of a controller.json; none of them is the law.
@@ -154,18 +155,23 @@ class LawFile(_Strict):
             raise ValueError("should have both of reference and measurement, each with num and den")
         if (self.pid is not None) == (self.law is not None or self.reference is not None):
             raise ValueError("should have law (A, B, C, D), or reference and measurement (num, den), or pid (gains)")
-        if isinstance(self.measured, list) and len(self.measured) != 1:
-            raise ValueError("should name one measured signal")
+        if isinstance(self.measured, list) and not self.measured:
+            raise ValueError("should name what is measured")
         return self
 
     def build(self, source: str) -> GivenLaw:
         """Return the law."""
         ts = self.sample_time_s or 1.0 / (self.sample_rate_hz or 1.0)
-        measured = self.measured[0] if isinstance(self.measured, list) else self.measured
+        names = (self.measured,) if isinstance(self.measured, str) else tuple(self.measured or ())
+        measured = (names[0] if len(names) == 1 else names) if names else None
         try:
             law = self._build_law(source, ts)
         except ControlError as error:
             raise FileError(f"{source}: {error}") from error
+        if names and law.d.size != 1 + len(names):
+            raise FileError(
+                f"{source}: the law reads {law.d.size - 1} signals, and measured names {len(names)}; name each"
+            )
         return GivenLaw(
             law=law, delay_samples=self.delay_samples, measured=measured, to_command=self.output == "command",
             per_effort=self.command.per_effort,
@@ -174,21 +180,26 @@ class LawFile(_Strict):
     def _build_law(self, source: str, ts: float) -> Law:
         if self.pid is not None:
             return self.pid.build(ts)
-        fractions = None
+        fractions: list[tuple[str, TransferFunction]] = []
         if self.reference is not None and self.measurement is not None:
-            fractions = [_normalise(source, name, getattr(self, name)) for name in ("reference", "measurement")]
+            read = self.measurement if isinstance(self.measurement, list) else [self.measurement]
+            named = [("reference", self.reference), *(("measurement", one) for one in read)]
+            fractions = [(name, _normalise(source, name, one)) for name, one in named]
         if self.law is None:
-            assert fractions is not None
-            return Law.from_transfer_functions(fractions[0], fractions[1], ts)
+            return Law.from_transfer_functions(fractions[0][1], [one for _, one in fractions[1:]], ts)
+        inputs = max(len(self.law.D[0]) if self.law.D else 0, 2)
         a, b, c, d = (
-            _make_matrix(source, name, getattr(self.law, name), len(self.law.A)) for name in ("A", "B", "C", "D")
+            _make_matrix(source, name, getattr(self.law, name), len(self.law.A), inputs)
+            for name in ("A", "B", "C", "D")
         )
         law = Law.from_state_space(a, b, c[0], d[0], ts)
         f = COMPARED / ts
-        for name, fraction, response in zip(
-            ("reference", "measurement"), fractions or (), (law.reference_response(f), law.measurement_response(f)),
-            strict=False,
-        ):  # fmt: skip
+        if fractions and len(fractions) != inputs:
+            raise FileError(
+                f"{source}: measurement has {len(fractions) - 1} entries, and law reads {inputs - 1} signals"
+            )
+        read = (law.reference_response(f), *law.feedback_responses(f))
+        for (name, fraction), response in zip(fractions, read, strict=False):
             if np.any(np.abs(fraction.response(f, ts) - response) > AGREES * np.max(np.abs(response))):
                 raise FileError(f"{source}: {name} is not what law gives; leave one of them out")
         return law
@@ -202,7 +213,8 @@ def read_law(path: Path | str) -> GivenLaw:
     path : path
         A file with sample_time_s or sample_rate_hz, delay_samples, and one of ``law`` (A, B, C, D from reference and
         measured to effort), ``reference`` and ``measurement`` (num and den in ascending powers of 1/z: effort =
-        reference F_ref - measurement F), and ``pid`` (gains of `parallel_pid` or `ideal_pid`, by ``form``). With
+        reference F_ref - measurement F; of several signals a list, one for each name in ``measured``), and ``pid``
+        (gains of `parallel_pid` or `ideal_pid`, by ``form``). With
         ``output = "command"`` the law gives the command itself (A, V, a duty).
 
     Raises
@@ -232,9 +244,9 @@ def _normalise(source: str, name: str, fraction: StoredTransferFunction) -> Tran
     return TransferFunction(num=num / den[0], den=den / den[0])
 
 
-def _make_matrix(source: str, name: str, rows: list[list[float]], states: int) -> np.ndarray:
+def _make_matrix(source: str, name: str, rows: list[list[float]], states: int, inputs: int) -> np.ndarray:
     """Return a matrix of the law; refuse one whose shape does not fit."""
-    shape = {"A": (states, states), "B": (states, 2), "C": (1, states), "D": (1, 2)}[name]
+    shape = {"A": (states, states), "B": (states, inputs), "C": (1, states), "D": (1, inputs)}[name]
     if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
         raise FileError(f"{source}: law.{name} is not a matrix of {shape[0]} x {shape[1]}")
     return np.array(rows, dtype=float).reshape(shape)

@@ -72,7 +72,7 @@ class Link:
     def held(self) -> DigitalPlant:
         """Return the sampled plant from motor force to the measured one with the link held."""
         a, b, c, d = self.port.link_held()
-        parts = hold(a[None], b[None], c[None], np.array([d]), self.sample_time_s, np.array([self.port.delay_s]))
+        parts = hold(a[None], b[None], c[:1], d[:1], self.sample_time_s, np.array([self.port.delay_s]))
         return DigitalPlant(
             a=parts[0][0], b=parts[1][0], c=parts[2][0], d=float(parts[3][0]), sample_time_s=self.sample_time_s,
             delay_samples=self.delay_samples, static_gain=np.nan,
@@ -108,7 +108,12 @@ def find_link(controller: Controller, plant: Plant, params: ParameterSet) -> Lin
             f"plant {plant.name} holds its link, so that no impedance can be rendered there; give a plant whose link "
             'moves: moving_output, two_link or rotary(link="free")'
         )
-    measured, per_effort = controller.spec.measured, controller.command.per_effort
+    measured, per_effort = controller.spec.regulated, controller.command.per_effort
+    if len(controller.signals) > 1:
+        raise ControlError(
+            f"the law reads {', '.join(controller.signals)}, and the outer loop is computed for laws that read one "
+            "signal; tune a pd, pid or pid_dob for it"
+        )
     sliding = take_sliding(plant, params)
     port = port_of(sliding, params, measured, per_effort)
     linear, _ = linearise_sets(sliding, [sliding.complete(params)], str(plant.port.motion), per_effort)

@@ -27,7 +27,7 @@ from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.loops.sampled_plant import DigitalPlant, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
 from seaopt.formatting import (
@@ -107,6 +107,8 @@ class Controller:
         None, and `achieved` is the worst of the responses in its discs.
     outer : OuterLoop or None
         What makes the reference of a stiffness and a damping at the link (`seaopt.control.add_impedance`).
+    reads : tuple of str
+        The outputs that the law reads, one for each of its columns; those of the specification where it is empty.
 
     """
 
@@ -130,6 +132,12 @@ class Controller:
     friction: FrictionMargin | None = None
     measured: tuple[MeasuredFigures, ...] = ()
     outer: OuterLoop | None = None
+    reads: tuple[str, ...] = ()
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The outputs that the law reads, the regulated one first; a speed's encoder in its place."""
+        return self.reads or list_names(self.spec.measured)
 
     @property
     def design_loop(self) -> MeasuredLoop:
@@ -170,7 +178,7 @@ class Controller:
 
     @property
     def measurement(self) -> TransferFunction:
-        """C_y of F_m = C_r F_ref - C_y F_meas: the law multiplied out, for reading."""
+        """C_y of F_m = C_r F_ref - C_y F_meas: the law multiplied out, for reading; of the regulated output."""
         return self.law.transfer_functions()[1]
 
     @property
@@ -229,7 +237,7 @@ class Controller:
             return ()
         return (
             f"the derivative is hardly filtered (T_f = {T_f:.2g} s), for nothing was asked of it: 1 "
-            f"{self.command.reference_unit} of noise on {self.spec.measured} makes up to "
+            f"{self.command.reference_unit} of noise on {self.spec.regulated} makes up to "
             f"{self.achieved.noise_gain:.3g} {called.unit} of motor "
             f"{called.word}; give max_noise_gain",
         )
@@ -264,7 +272,7 @@ class Controller:
         return sample(
             plant,
             params,
-            self.spec.measured,
+            self.signals,
             self.command.per_effort,
             self.sample_time_s,
             self.delay_samples,
@@ -299,17 +307,17 @@ class Controller:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/2)."""
-        reference, measurement = self.law.transfer_functions()
+        reference, *measurements = ({"num": one.num, "den": one.den} for one in self.law.transfer_functions())
         return {
             "schema": CONTROLLER_SCHEMA,
             "structure": self.structure,
             "gains": dict(self.gains),
             "sample_time_s": self.sample_time_s,
             "delay_samples": self.delay_samples,
-            "measured": [self.spec.measured],
+            "measured": list(self.signals),
             "law": self.law.to_dict(),
-            "reference": {"num": reference.num, "den": reference.den},
-            "measurement": {"num": measurement.num, "den": measurement.den},
+            "reference": reference,
+            "measurement": measurements[0] if len(measurements) == 1 else measurements,
             "command": {field.name: getattr(self.command, field.name) for field in fields(Command)},
             "spec": self.spec.to_dict() | {"robust_to": list(self.robust_to)},
             "achieved": _list_achieved(self.achieved)
@@ -372,10 +380,11 @@ class Controller:
         )  # fmt: skip
         gain, spec = stored["command"].per_effort, stored["spec"]
         sliding = take_sliding(plant, params)
-        sampled = sample(sliding, params, spec.measured, gain, stored["sample_time_s"], stored["delay_samples"])
+        reads = stored["reads"] or list_names(spec.measured)
+        sampled = sample(sliding, params, reads, gain, stored["sample_time_s"], stored["delay_samples"])
         achieved = Loop(plant=sampled, law=stored["law"]).figures()
         (loop,) = make_friction_loops(
-            plant, [params], spec.measured, gain, stored["delay_samples"], stored["law"]
+            plant, [params], reads, gain, stored["delay_samples"], stored["law"]
         )  # fmt: skip
         friction = None if loop is None else friction_margin(loop)
         check_achieved(content.get("achieved"), _list_achieved(achieved))
@@ -552,7 +561,8 @@ def _format_allowed(row: DesignFigure) -> str:
 def _list_achieved(figures: LoopFigures) -> dict[str, Any]:
     """Return the figures of the loop that controller.json states."""
     values = {field.name: getattr(figures, field.name) for field in fields(LoopFigures)}
-    return {name: value for name, value in values.items() if name not in _NOT_ACHIEVED}
+    left_out = _NOT_ACHIEVED if figures.other_noise_gains else (*_NOT_ACHIEVED, "other_noise_gains")
+    return {name: value for name, value in values.items() if name not in left_out}
 
 
 def count_filter_samples(law: Law) -> float:

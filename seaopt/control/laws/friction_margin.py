@@ -61,5 +61,5 @@ def take_friction_out(
 ) -> list[FrictionLoop | None]:  # fmt: skip
     """Return `make_friction_loops` of a controller."""
     return make_friction_loops(
-        plant, sets, controller.spec.measured, controller.command.per_effort, controller.delay_samples, controller.law
+        plant, sets, controller.signals, controller.command.per_effort, controller.delay_samples, controller.law
     )

@@ -184,7 +184,7 @@ def passivity(
         raise ControlError(
             f"low_hz = {low_hz:g}, high_hz = {high:g} is not a band; give 0 < low < high <= {0.5 / ts:g} Hz"
         )
-    port = port_of(take_sliding(plant, params), params, controller.spec.measured, controller.command.per_effort)
+    port = port_of(take_sliding(plant, params), params, controller.signals, controller.command.per_effort)
     law = controller.law
     impedance, angle = _make_curves(port, law, ts, controller.delay_samples)
     f = add_minima(angle, add_minima(lambda x: np.real(impedance(x)), _make_grid(port, law, ts, low_hz, high)))
@@ -252,7 +252,7 @@ def passivity_rows(
         condition is quadratic in the gains.
 
     """
-    port = port_of(plant, params, spec.measured, per_effort)
+    port = port_of(plant, params, spec.regulated, per_effort)
     loop, unit = weigh_passivity(port, spec.sample_time_s, spec.loop_delay_samples, f)
     return np.real(unit[:, None] * np.conj(loop[:, None] * basis)), -np.real(unit)
 
@@ -261,10 +261,10 @@ def is_held_stable(port: PortModel, law: Law, sample_time_s: float, delay_sample
     """Tell whether nothing grows in the sampled loop with link 2 held."""
     a, b, c, d = port.link_held()
     delay_s = np.array([port.delay_s])
-    a, b, c, d = hold(a[None], b[None], c[None], np.array([d]), sample_time_s, delay_s)
+    a, b, c, d = hold(a[None], b[None], c[None], d[None], sample_time_s, delay_s)
     plant = DigitalPlant(
-        a=a[0], b=b[0], c=c[0], d=float(d[0]), sample_time_s=sample_time_s, delay_samples=delay_samples,
-        static_gain=np.nan,
+        a=a[0], b=b[0], c=c[0, 0], d=float(d[0, 0]), sample_time_s=sample_time_s, delay_samples=delay_samples,
+        static_gain=np.nan, others=(c[0, 1:], d[0, 1:]),
     )  # fmt: skip
     poles = Loop(plant=plant, law=law).eigenvalues()
     return bool(np.max(np.abs(poles), initial=0.0) <= GROWING)
@@ -274,7 +274,7 @@ def _make_curves(port: PortModel, law: Law, sample_time_s: float, delay_samples:
     """Return Z and Re Z/abs(Z) as functions of frequency."""
 
     def impedance(f: Frequencies) -> Response:
-        return port.response(f).impedance(law.measurement_response(f) * hold_response(f, sample_time_s, delay_samples))
+        return port.response(f).impedance(law.feedback_responses(f) * hold_response(f, sample_time_s, delay_samples))
 
     def angle(f: Frequencies) -> Frequencies:
         z = impedance(f)

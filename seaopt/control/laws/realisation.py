@@ -47,6 +47,7 @@ from seaopt.records import record
 from seaopt.units import name_command, show_command
 
 Vector = Float[np.ndarray, " n"]
+Reading = float | Float[np.ndarray, " y"]  # of the measured signal, or of several, the regulated one first
 
 
 @record(eq=False)
@@ -87,7 +88,9 @@ class RunnableLaw:
     Parameters
     ----------
     a, b_reference, b_measurement, c, d_reference, d_measurement
-        Matrices, shapes (n, n), (n,), (n,), (n,) and numbers; the first `integrators` states are the integrators.
+        Matrices, shapes (n, n), (n,), (n,), (n,) and numbers; the first `integrators` states are the integrators. Of
+        several measured signals b_measurement and d_measurement have a column for each, (n, y) and (y,), and every
+        measurement below is an array of them.
     anti_windup : array, shape (n,)
         K of the module's docstring.
     integrators : int
@@ -111,10 +114,10 @@ class RunnableLaw:
 
     a: Float[np.ndarray, "n n"]
     b_reference: Vector
-    b_measurement: Vector
+    b_measurement: Float[np.ndarray, "n ..."]
     c: Vector
     d_reference: float
-    d_measurement: float
+    d_measurement: float | Float[np.ndarray, " y"]
     anti_windup: Vector
     integrators: int
     tracking_time_s: float | None
@@ -124,6 +127,11 @@ class RunnableLaw:
     gate: PlausibilityGate | None = None
     command: tuple[str, str] = ("I", "A")
     heat: HeatGuard | None = None
+
+    @property
+    def measured(self) -> int:
+        """How many signals it reads."""
+        return int(np.size(self.d_measurement))
 
     @property
     def force_limit_N(self) -> float:
@@ -141,16 +149,16 @@ class RunnableLaw:
             f"{1 / self.sample_time_s:.6g} Hz, {limit}"
         )
 
-    def rest(self) -> tuple[Vector, Vector]:
+    def rest(self) -> tuple[Vector, Float[np.ndarray, "n ..."]]:
         """Return x per reference and per measurement (counted negative) at rest, integrators zero."""
         m, n = self.integrators, self.c.size
-        out = np.zeros((2, n))
+        out = np.zeros((n, 1 + self.measured))
         inner = np.eye(n - m) - self.a[m:, m:]
-        out[:, m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]])).T
-        return out[0], out[1]
+        out[m:] = np.linalg.solve(inner, np.column_stack([self.b_reference[m:], self.b_measurement[m:]]))
+        return out[:, 0], out[:, 1:].reshape(self.b_measurement.shape)
 
     def reset(
-        self, reference: float = 0.0, measurement: float | None = None, current_A: float = 0.0,
+        self, reference: float = 0.0, measurement: Reading | None = None, current_A: float = 0.0,
         heat: tuple[float, float] = COLD,
     ) -> LawState:  # fmt: skip
         """Return the state at rest under constant inputs, with the integrator set to continue from a current.
@@ -165,26 +173,40 @@ class RunnableLaw:
             An input is not finite, the measurement is outside the gate's range, or the current is above the limit.
 
         """
-        for name, value in (("reference", reference), ("measurement", measurement), ("current_A", current_A)):
-            if value is not None:
-                require_number(value, name, ControlError)
-        seen = GateState()
-        if self.gate is not None and measurement is not None:
-            seen = self.gate.start(measurement)
-        measurement = 0.0 if measurement is None else measurement
-        if not (math.isfinite(reference) and math.isfinite(measurement)):
-            raise ControlError(f"reference = {reference:g}, measurement = {measurement:g}: give finite numbers")
+        for name, value in (("reference", reference), ("current_A", current_A)):
+            require_number(value, name, ControlError)
+        seen, known = GateState(), measurement is not None
+        measurement = self._check_measurement(measurement)
+        if self.gate is not None and known:
+            seen = self.gate.start(float(np.ravel(measurement)[0]))
+        if not (math.isfinite(reference) and np.all(np.isfinite(measurement))):
+            given = measurement if isinstance(measurement, np.ndarray) else f"{measurement:g}"
+            raise ControlError(f"reference = {reference:g}, measurement = {given}: give finite numbers")
         if not abs(current_A) <= self.current_limit_A:
             limit = show_command(self.current_limit_A, *self.command)
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
         per_reference, per_measurement = self.rest()
-        x = per_reference * reference - per_measurement * measurement
+        x = per_reference * reference - np.dot(per_measurement, measurement)
         if self.integrators:
-            force = float(self.c @ x) + self.d_reference * reference - self.d_measurement * measurement
-            x[0] = current_A / self.per_effort - force
+            x[0] = current_A / self.per_effort - self._find_force(x, reference, measurement)
         return LawState(x=x, current_A=current_A, gate=seen, heat=heat)
 
-    def step(self, state: LawState, reference: float, measurement: float) -> tuple[float, LawState]:
+    def _check_measurement(self, measurement: Reading | None) -> Reading:
+        """Return what was measured at rest: zero where it is left out, else as many numbers as there are signals."""
+        if self.measured == 1:
+            return 0.0 if measurement is None else require_number(measurement, "measurement", ControlError)
+        values = np.zeros(self.measured) if measurement is None else np.asarray(measurement, dtype=float)
+        if values.shape != (self.measured,):
+            raise ControlError(
+                f"measurement has the shape {values.shape}; give {self.measured} numbers, one per signal"
+            )
+        return values
+
+    def _find_force(self, x: Vector, reference: float, measurement: Reading) -> float:
+        """Return the effort, not limited."""
+        return float(self.c @ x) + self.d_reference * reference - float(np.dot(self.d_measurement, measurement))
+
+    def step(self, state: LawState, reference: float, measurement: Reading) -> tuple[float, LawState]:
         """Return the command (a current in A, as a rule) of this sample, and the next state.
 
         A sample with a number that is not finite, in its inputs or in what would follow, is not used: the last command
@@ -198,18 +220,21 @@ class RunnableLaw:
         current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
         return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
 
-    def _decide(self, state: LawState, reference: float, measurement: float, limit_A: float) -> tuple[float, LawState]:
+    def _decide(
+        self, state: LawState, reference: float, measurement: Reading, limit_A: float
+    ) -> tuple[float, LawState]:
         """Return the command within a limit, and the next state."""
         seen, most = state.gate, limit_A / self.per_effort
         if self.gate is not None:
-            measurement, seen = self.gate.screen(seen, measurement)
+            regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]))
+            measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
             if seen.fault:
                 current = self.gate.ramp(state.current_A, self.sample_time_s)
                 return current, LawState(x=state.x, current_A=current, held=state.held, gate=seen)
         with np.errstate(all="ignore"):
-            force = float(self.c @ state.x) + self.d_reference * reference - self.d_measurement * measurement
+            force = self._find_force(state.x, reference, measurement)
             applied = min(max(force, -most), most)
-            x = self.a @ state.x + self.b_reference * reference - self.b_measurement * measurement
+            x = self.a @ state.x + self.b_reference * reference - np.dot(self.b_measurement, measurement)
             x += self.anti_windup * (applied - force)
         if not (math.isfinite(force) and np.all(np.isfinite(x))):
             return state.current_A, LawState(x=state.x, current_A=state.current_A, held=state.held + 1, gate=seen)
@@ -220,14 +245,15 @@ class RunnableLaw:
     def run(
         self,
         references: Float[np.ndarray, " samples"],
-        measurements: Float[np.ndarray, " samples"],
+        measurements: Float[np.ndarray, "samples ..."],
         state: LawState | None = None,
     ) -> tuple[Float[np.ndarray, " samples"], LawState]:
         """Return the commands of a sequence of samples, and the last state; it starts from zero if not given."""
         state = self.reset() if state is None else state
         out = np.zeros(references.size)
         for i, (reference, measurement) in enumerate(zip(references, measurements, strict=True)):
-            out[i], state = self.step(state, float(reference), float(measurement))
+            read = float(measurement) if self.measured == 1 else measurement
+            out[i], state = self.step(state, float(reference), read)
         return out, state
 
 
@@ -288,7 +314,7 @@ def realise(
     law: Law, *, per_effort: float = 1.0, current_limit_A: float | None = None, tracking_time_s: float | None = None,
     gate: PlausibilityGate | None = None, command: tuple[str, str] = ("I", "A"), heat: HeatGuard | None = None,
 ) -> RunnableLaw:  # fmt: skip
-    """Return a law of one measured signal with limit and anti-windup.
+    """Return a law with limit and anti-windup.
 
     Parameters
     ----------
@@ -337,10 +363,10 @@ def realise(
     return RunnableLaw(
         a=law.a,
         b_reference=law.b[:, 0].copy(),
-        b_measurement=-law.b[:, 1],
+        b_measurement=-law.b[:, 1] if law.d.size == 2 else -law.b[:, 1:],
         c=law.c,
         d_reference=float(law.d[0]),
-        d_measurement=-float(law.d[1]),
+        d_measurement=-float(law.d[1]) if law.d.size == 2 else -law.d[1:],
         anti_windup=np.array([math.comb(m, j) * share**j for j in range(1, m + 1)] + [0.0] * (law.c.size - m)),
         integrators=m,
         tracking_time_s=tracking if m else None,

@@ -10,6 +10,7 @@ from seaopt.control.laws.command import Command
 from seaopt.control.laws.limits import BY_NAME, FIELDS, GIVEN_LAW_LIMITS, LIMITS, Limit
 from seaopt.control.laws.structures import CUSTOM, REFERENCE_WEIGHTS, STRUCTURES, Notch, ReferenceWeights, Structure
 from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
+from seaopt.control.loops.sampled_plant import Measured, list_names
 from seaopt.errors import ControlError, suggestion
 from seaopt.frequency import MeasuredResponse
 from seaopt.records import record
@@ -28,8 +29,8 @@ class ControllerSpec:
 
     Parameters
     ----------
-    measured : str
-        The output that is fed back, F1 as a rule.
+    measured : str or tuple of str
+        The output that is fed back, F1 as a rule; or several, the regulated one first.
     bandwidth_hz : float
         Lowest frequency at which abs(F/F_ref) is 3 dB below its value at 0 Hz, on the design plant.
     bandwidth_range_hz : (low, high)
@@ -86,7 +87,7 @@ class ControllerSpec:
 
     """
 
-    measured: str = "F1"
+    measured: Measured = "F1"
     bandwidth_hz: float = 30.0
     bandwidth_range_hz: tuple[float, float] = (15.0, 60.0)
     structure: Structure = "pid"
@@ -111,6 +112,7 @@ class ControllerSpec:
     reserve: float = 0.005
 
     def __post_init__(self) -> None:
+        self._check_measured()
         self._check_types()
         low, high = self.bandwidth_range_hz
         if not 0.0 < low < high:
@@ -147,6 +149,15 @@ class ControllerSpec:
                 f"sample more than four times as fast: sample_rate_hz = {10.0 * self.bandwidth_hz:g}"
             )
         self._check_limits()
+
+    def _check_measured(self) -> None:
+        measured: Any = self.measured
+        names = list_names(measured) if isinstance(measured, str | tuple) else ()
+        if not names or not all(isinstance(name, str) and name for name in names) or len({*names}) < len(names):
+            raise ControlError(
+                f'measured = {measured!r} is not an output, nor several; give a name such as "F1", or a tuple of '
+                "different ones, the regulated first"
+            )
 
     def _check_types(self) -> None:
         if isinstance(self.delay_samples, bool) or not isinstance(self.delay_samples, int | None):
@@ -199,6 +210,11 @@ class ControllerSpec:
                 raise ControlError(f"notch.{name} = {value!r} is not above 0 and up to {top[name]:g}")
 
     @property
+    def regulated(self) -> str:
+        """The output that is regulated, the first of what is measured."""
+        return list_names(self.measured)[0]
+
+    @property
     def loop_delay_samples(self) -> int:
         """Whole samples of delay that a loop is closed with: as given, or 1."""
         return 1 if self.delay_samples is None else self.delay_samples
@@ -242,7 +258,7 @@ class ControllerSpec:
         Raises
         ------
         ControlError
-            The response is of another output, or of another input; or as `sample_measured`.
+            The response is of another output than all that is measured, or of another input; or as `sample_measured`.
 
         """
         for what, own, other in (

@@ -26,6 +26,7 @@ from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMa
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.measured.figures import MeasuredFigures
 from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.documents import Flag, ResultTable, Whole, check_table
 from seaopt.errors import ControlError, FileError
@@ -68,7 +69,7 @@ class StoredLaw(ResultTable):
     def build(self, sample_time_s: float) -> Law:
         """Return the law."""
         n, k = len(self.A), len(self.D[0]) if self.D else 0
-        shapes = {"A": (n, n), "B": (n, k), "C": (1, n), "D": (1, 2)}
+        shapes = {"A": (n, n), "B": (n, k), "C": (1, n), "D": (1, max(k, 2))}
         matrices: dict[str, np.ndarray] = {}
         for name, shape in shapes.items():
             rows = getattr(self, name)
@@ -135,6 +136,7 @@ class StoredSpec(ResultTable):
     model_config = ConfigDict(extra="allow", frozen=True)
     bandwidth_range_hz: tuple[Finite, Finite]
     passive_band_hz: tuple[Finite, Finite] | None = None
+    measured: str | tuple[str, ...] = "F1"
     robust_to: list[str] = []
 
 
@@ -205,8 +207,9 @@ class StoredController(ResultTable):
     sample_time_s: Finite
     delay_samples: Whole
     law: StoredLaw
+    measured: list[str] | None = None
     reference: StoredReading
-    measurement: StoredReading
+    measurement: StoredReading | list[StoredReading]
     command: StoredCommand
     spec: StoredSpec
     feasible: Flag
@@ -237,6 +240,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         stated = f"is {table.sample_time_s:g}, which is not 1/spec.sample_rate_hz = {spec.sample_time_s:g}"
         raise _contradict("sample_time_s", stated)
     law = table.law.build(spec.sample_time_s)
+    reads = _check_measured(table, spec, law)
     observer = None if table.observer is None else table.observer.build(spec.sample_time_s)
     outer = None if table.impedance is None else OuterLoop(**table.impedance.model_dump())
     if outer is not None and not abs(outer.sample_time_s * spec.sample_rate_hz - 1.0) < 1e-9:
@@ -252,11 +256,22 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
         "structure": spec.structure, "gains": table.gains, "sample_time_s": table.sample_time_s,
         "delay_samples": table.delay_samples, "command": _build_command(table.command), "spec": spec,
         "feasible": table.feasible, "robust_to": robust_to, "active_constraints": tuple(table.active_constraints),
-        "observer": observer, "blocked_by": tuple(table.blocked_by),
+        "observer": observer, "reads": reads, "blocked_by": tuple(table.blocked_by),
         "measured": tuple(one.build() for one in table.measured_responses),
         "outer": outer,
         "possible": None if table.possible is None else PossibleBandwidths(**table.possible.model_dump()),
     }  # fmt: skip
+
+
+def _check_measured(table: StoredController, spec: ControllerSpec, law: Law) -> tuple[str, ...]:
+    """Return the outputs that the law reads, where they are not those of the specification; refuse another number."""
+    names = list_names(spec.measured)
+    reads = names if table.measured is None else tuple(table.measured)
+    if len(reads) != len(names) or reads[0] != names[0]:
+        raise _contradict("measured", f"is {list(reads)}, and spec.measured {list(names)}")
+    if law.d.size != 1 + len(reads):
+        raise _contradict("law", f"has {law.d.size} inputs, and reference and measured are {1 + len(reads)}")
+    return () if reads == names else reads
 
 
 def _build_command(stored: StoredCommand) -> Command:
@@ -306,10 +321,15 @@ def _check_reading(table: StoredController, law: Law) -> None:
     """Refuse transfer functions that are not the law multiplied out."""
     f = COMPARED / law.sample_time_s
     q = np.exp(-2j * np.pi * COMPARED)
-    for name, tf, expected in (
-        ("reference", table.reference.build(), law.reference_response(f)),
-        ("measurement", table.measurement.build(), law.measurement_response(f)),
-    ):
+    measurements = table.measurement if isinstance(table.measurement, list) else [table.measurement]
+    if len(measurements) != law.d.size - 1:
+        raise _contradict("measurement", f"has {len(measurements)} entries, and the law reads {law.d.size - 1} signals")
+    read = [("reference", table.reference.build(), law.reference_response(f))]
+    read += [
+        ("measurement", one.build(), response)
+        for one, response in zip(measurements, law.feedback_responses(f), strict=True)
+    ]
+    for name, tf, expected in read:
         num, den = (np.polynomial.polynomial.polyval(q, p) for p in (tf.num, tf.den))
         # C den = num, to the rounding of either polynomial's coefficients.
         rounding = ROUNDINGS * (np.sum(np.abs(tf.num)) + np.sum(np.abs(tf.den)) * np.abs(expected))

@@ -18,7 +18,9 @@ At :math:`\theta = \omega T` in :math:`[0, \pi]` it acts on the aliases :math:`\
     \qquad b_l^* = G_y(j\omega_l)/T
 
 with :math:`G_v` from friction effort to velocity, :math:`G_{vm}` from motor effort to velocity, :math:`G_y` from
-friction effort to the measured force, the hold :math:`h(s) = (1 - e^{-sT})/s`, :math:`z = e^{j\theta}`, and
+friction effort to the measured force (:math:`K G_y` of several measured signals is
+:math:`\sum_i C_i G_{y_i}/(1 + L)`: the command is one, and so the rank is the same), the hold
+:math:`h(s) = (1 - e^{-sT})/s`, :math:`z = e^{j\theta}`, and
 :math:`K = C_y/(1 + P z^{-d} C_y)`. The Hermitian part of :math:`M (H + \kappa^{-1})` is a block-diagonal
 :math:`D_k`, the Hermitian part of :math:`M(j\omega_k) (G_v(j\omega_k) + \kappa^{-1})`, and
 :math:`\tfrac12 (a b^* + b a^*)` of rank two, a multiplied by M. With
@@ -207,14 +209,15 @@ def _respond(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> _Re
     """Return G_v, a (without M) and b at angles; a per unit of K without the feedback."""
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
     orders = np.arange(-ALIASES, ALIASES + 1)
-    seen = np.vstack([root[:, None] * loop.velocity, loop.measured])  # phi = slope v: the slope of phi / root is 1
-    response = loop.respond(theta, orders, seen)
+    rows, through = loop.sensed
+    seen = np.vstack([root[:, None] * loop.velocity, rows])  # phi = slope v: the slope of phi / root is 1
+    response, ports = loop.respond(theta, orders, seen), len(root)
     by_friction = root * response.by_friction
-    gain = loop.feedback(theta)[:, None, None] if feedback else 1.0
+    gains = loop.feedback(theta) if feedback else np.ones((len(rows), theta.size))
+    read = by_friction[..., ports:, :] + through * root
     return _Responses(
-        theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :-1, :],
-        command=-gain * response.by_motor[..., :-1],
-        sensed=np.conj(by_friction[..., -1, :] + loop.through * root),
+        theta=theta, s=1j * (theta[:, None] + 2 * np.pi * orders) / period, mobility=by_friction[..., :ports, :],
+        command=-response.by_motor[..., :ports], sensed=np.conj(np.einsum("ym,mkyp->mkp", gains, read)),
         tail=polygamma(1, ALIASES + 1 + theta / (2 * np.pi)) + polygamma(1, ALIASES + 1 - theta / (2 * np.pi)),
         order=ALIASES + theta / (2 * np.pi),
     )  # fmt: skip

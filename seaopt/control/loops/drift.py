@@ -47,15 +47,15 @@ class _Drift:
 
 
 @memo
-def leave_out_drift(plant: Plant, measured: str) -> Plant:
+def leave_out_drift(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
     """Return the plant without the motion that neither it nor a fed-back output depends on; often the plant itself.
 
     Parameters
     ----------
     plant : Plant
         Friction that remembers where it bent holds a link: such a plant is returned as it is.
-    measured : str
-        The output that is fed back.
+    measured : str or tuple of str
+        The output that is fed back, or all that are.
 
     Returns
     -------
@@ -72,13 +72,14 @@ def leave_out_drift(plant: Plant, measured: str) -> Plant:
     True
 
     """
-    if remembers(plant) or measured not in plant.outputs:
+    names = {measured} if isinstance(measured, str) else {*measured}
+    if remembers(plant) or not names <= plant.outputs.keys():
         return plant
     drift = _find_drift(plant)
     if drift is None:
         return plant
     rest = _take_out(plant, drift)
-    return leave_out_drift(rest, measured) if measured in rest.outputs else plant
+    return leave_out_drift(rest, measured) if names <= rest.outputs.keys() else plant
 
 
 def _look(plant: Plant) -> list[tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "_ n"], Any]]:

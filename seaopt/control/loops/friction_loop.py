@@ -14,7 +14,14 @@ from jaxtyping import Complex, Float, Int
 
 from seaopt.control.loops.drift import leave_out_drift
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.sampled_plant import DigitalPlant, find_rest, linearise_sets, sample_linear
+from seaopt.control.loops.sampled_plant import (
+    DigitalPlant,
+    Measured,
+    find_rest,
+    find_rows,
+    linearise_sets,
+    sample_linear,
+)
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import (
@@ -42,9 +49,9 @@ class FrictionLoop:
     friction : array, shape (n, p)
         The effect of each friction effort in the direction of its velocity.
     velocity, measured : arrays, shapes (p, n) and (n,)
-        The velocities that friction acts on, and the fed-back output.
+        The velocities that friction acts on, and the regulated output.
     through : array, shape (p,)
-        The effect of each friction effort on the output itself.
+        The effect of each friction effort on that output itself.
     slopes : array, shape (p,)
         The steepest slope of each friction curve, N s/m (N m s/rad).
     plant : DigitalPlant
@@ -59,6 +66,8 @@ class FrictionLoop:
         Some link is.
     remembers : bool
         Some friction has bristles, and is no curve of its velocity.
+    others : (measured, through), optional
+        Of further outputs that the law reads, shapes (k, n) and (k, p).
 
     """
 
@@ -75,6 +84,13 @@ class FrictionLoop:
     linear: bool = True
     linearised: bool = False
     remembers: bool = False
+    others: tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k p"]] | None = None
+
+    @property
+    def sensed(self) -> tuple[Float[np.ndarray, "y n"], Float[np.ndarray, "y p"]]:
+        """Rows of the states, and what friction does at once, of every output that the law reads."""
+        rows, through = self.others or (np.zeros((0, self.measured.size)), np.zeros((0, self.through.size)))
+        return np.vstack([self.measured, rows]), np.vstack([self.through, through])
 
     @property
     def obstacle(self) -> str:
@@ -83,7 +99,7 @@ class FrictionLoop:
             return "the plant is not linear besides its friction"
         if self.remembers:
             return "friction with bristles is no curve of its velocity"
-        if np.any(self.through * self.slopes):  # a sampled jump has no bounded gain
+        if np.any(self.sensed[1] * self.slopes):  # a sampled jump has no bounded gain
             return "friction acts on the measured output itself"
         return ""
 
@@ -117,11 +133,11 @@ class FrictionLoop:
             drive = drive * np.exp(-s * self.delay_s)
         return FrictionResponse(by_friction=response[..., :-1], by_motor=response[..., -1] * drive[..., None])
 
-    def feedback(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def feedback(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
         """Return K, the motor command per measured output that comes from elsewhere, with the loop closed."""
         f = theta / (2 * np.pi * self.plant.sample_time_s)
-        law = self.law.measurement_response(f)
-        return law / (1.0 + self.plant.response(f) * law)
+        law = self.law.feedback_responses(f)
+        return law / (1.0 + np.sum(self.plant.responses(f) * law, axis=0))
 
 
 @record(eq=False)
@@ -166,7 +182,7 @@ def transfer(
 
 
 def make_friction_loops(
-    plant: Plant, sets: Sequence[ParameterSet], measured: str, per_effort: float, delay_samples: int, law: Law
+    plant: Plant, sets: Sequence[ParameterSet], measured: Measured, per_effort: float, delay_samples: int, law: Law
 ) -> list[FrictionLoop | None]:
     """Return, per set of parameters, the sliding loop with what friction has above its flattest slope taken out.
 
@@ -176,8 +192,8 @@ def make_friction_loops(
         With its friction.
     sets : sequence of ParameterSet
         All with the same conditions among them.
-    measured : str
-        The output that is fed back.
+    measured : str or tuple of str
+        The output that is fed back, or several, the regulated one first.
     per_effort : float
         The command that the law's effort becomes, per unit.
     delay_samples : int
@@ -198,7 +214,9 @@ def make_friction_loops(
     if not np.any(spans) and not np.any(held):
         return [None] * len(sets)
     sliding = friction_states(plant)[SLIDING]
-    blocks, delays = linearise_sets(sliding, values, measured, per_effort)
+    names = (measured,) if isinstance(measured, str) else measured
+    rows = find_rows(plant, names)
+    blocks, delays = linearise_sets(sliding, values, names, per_effort)
     sampled = sample_linear(blocks, delays, law.sample_time_s, delay_samples)
     loops: list[FrictionLoop | None] = []
     for k, (each, span, stiffness) in enumerate(zip(values, spans, held, strict=True)):
@@ -207,9 +225,10 @@ def make_friction_loops(
         linear, linearised = _check_linear(sliding, x, each.vector)
         remembers = bool(np.any(stiffness))
         loops.append(None if not np.any(span) and not remembers else FrictionLoop(
-            a=blocks[0][k], motor=blocks[1][k], measured=blocks[2][k], friction=on_states, velocity=velocity,
-            through=on_outputs[list(plant.outputs).index(measured)], slopes=span, plant=sampled[k],
+            a=blocks[0][k], motor=blocks[1][k], measured=blocks[2][k][0], friction=on_states, velocity=velocity,
+            through=on_outputs[rows[0]], slopes=span, plant=sampled[k],
             law=law, delay_s=float(delays[k]), linear=linear, linearised=linearised, remembers=remembers,
+            others=(blocks[2][k][1:], on_outputs[rows[1:]]),
         ))  # fmt: skip
     return loops
 

@@ -3,6 +3,8 @@ r"""A control law as one discrete state space, from (reference, measured) to eff
 .. math:: x^+ = A x + B \begin{bmatrix} r \\ y \end{bmatrix}, \qquad
           u = C x + D \begin{bmatrix} r \\ y \end{bmatrix} = C_r r - C_y y .
 
+y may be several signals, the first the regulated one: :math:`C_y y = \sum_i C_i y_i`.
+
 The first m states are a chain of accumulators, :math:`x_j^+ = x_j + x_{j+1} + \dots`, read at its head:
 
 .. math:: u = \sum_{j=1}^{m} g_j w^j + \text{(a stable rest)}, \qquad w = \frac{1}{z-1},
@@ -18,6 +20,7 @@ once, so that they keep their digits down to 0 Hz.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -106,8 +109,12 @@ class Law:
         return self.responses(f)[0]
 
     def measurement_response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
-        """Return C_y at frequencies in Hz."""
+        """Return C_y of the first measured signal at frequencies in Hz."""
         return -self.responses(f)[1]
+
+    def feedback_responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
+        """Return C_y of every measured signal at frequencies in Hz."""
+        return -self.responses(f)[1:]
 
     def evaluate(self, from_one: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
         """Return u per reference and per measured signal at z = 1 + from_one."""
@@ -139,8 +146,8 @@ class Law:
             sample_time_s=self.sample_time_s,
         )  # fmt: skip
 
-    def transfer_functions(self) -> tuple[TransferFunction, TransferFunction]:
-        """Return C_r and C_y multiplied out over one denominator, for reading: they say less than the law does."""
+    def transfer_functions(self) -> tuple[TransferFunction, ...]:
+        """Return C_r and each C_y multiplied out over one denominator, for reading: they say less than the law does."""
         m = self.integrators
         a, b, c = self.rest
         difference = np.array([1.0, -1.0])
@@ -148,7 +155,7 @@ class Law:
         slow = np.real(np.poly(a)) if c.size else np.ones(1)
         den = np.convolve(powers[m], slow)
         out: list[TransferFunction] = []
-        for column, sign in ((0, 1.0), (1, -1.0)):
+        for column, sign in enumerate([1.0] + [-1.0] * (self.d.size - 1)):
             num = np.zeros(den.size)
             over = (np.real(np.poly(a - np.outer(b[:, column], c))) - slow) if c.size else np.zeros(1)
             num += np.convolve(powers[m], over + self.d[column] * slow)
@@ -156,7 +163,7 @@ class Law:
                 term = np.convolve(np.convolve(np.eye(1, j + 1, k=j)[0], powers[m - j]), slow)
                 num += self.b[j - 1, column] * term
             out.append(TransferFunction(num=sign * num, den=den))
-        return out[0], out[1]
+        return tuple(out)
 
     def to_control(self) -> control.StateSpace:
         """Return the law as python-control's `StateSpace`, inputs reference and measured, output effort."""
@@ -198,7 +205,7 @@ class Law:
         if a.shape != (n, n) or b.shape != (n, k) or c.shape != (n,) or d.shape != (k,) or k < 2:
             raise ControlError(
                 f"law: A, B, C and D have the shapes {a.shape}, {b.shape}, {c.shape} and {d.shape}; give (n, n), "
-                "(n, 2), (n,) and (2,), the columns being reference and measured"
+                "(n, 2), (n,) and (2,), the columns being reference and measured, or one more for each further signal"
             )
         if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
             raise ControlError("law: A, B, C or D has a number that is not finite; correct it")
@@ -219,8 +226,8 @@ class Law:
         Parameters
         ----------
         system : control.TransferFunction or control.StateSpace
-            With a sample time. Of one input it acts on the error r - y; of two, they are the reference and what is
-            measured, the second with its own sign (`to_control`).
+            With a sample time. Of one input it acts on the error r - y; of two and more, they are the reference and
+            what is measured, the latter with their own signs (`to_control`).
 
         Raises
         ------
@@ -243,19 +250,34 @@ class Law:
         ts = system.dt
         if ts is None or isinstance(ts, bool) or not ts > 0.0:
             raise ControlError(f"law has dt = {ts}; sample it first: control.sample_system(law, sample_time_s)")
-        if system.noutputs != 1 or system.ninputs not in (1, 2):
+        if system.noutputs != 1 or system.ninputs < 1:
             raise ControlError(
                 f"law has {system.ninputs} inputs and {system.noutputs} outputs; give one output, and the error or "
                 "(reference, measured) as inputs"
             )
         if isinstance(system, control.TransferFunction):
             parts = [_in_delay(system.num[0][i], system.den[0][i]) for i in range(system.ninputs)]
-            first, second = parts if len(parts) == 2 else (parts[0], replace(parts[0], num=-parts[0].num))
-            return cls.from_transfer_functions(first, replace(second, num=-second.num), float(ts))
+            first, *others = parts if len(parts) > 1 else (parts[0], replace(parts[0], num=-parts[0].num))
+            return cls.from_transfer_functions(first, [replace(one, num=-one.num) for one in others], float(ts))
         b, d = np.asarray(system.B), np.asarray(system.D)[0]
         if system.ninputs == 1:
             b, d = np.hstack([b, -b]), np.concatenate([d, -d])
         return cls.from_state_space(np.asarray(system.A), b, np.asarray(system.C)[0], d, float(ts))
+
+    def differenced(self, column: int) -> Law:
+        r"""Return the law that reads a position where this one reads its speed, in a column of b.
+
+        An encoder gives positions, and a drive has the speed from two of them a sample apart,
+        :math:`v_k = (\theta_k - \theta_{k-1})/T_s`: half a sample late, and rounded to one step of the encoder per
+        sample. As a part of the law that is in every figure and every simulation.
+        """
+        n, ts = self.c.size, self.sample_time_s
+        a, b = np.zeros((n + 1, n + 1)), np.vstack([self.b, np.zeros(self.d.size)])
+        a[:n, :n], a[:n, n] = self.a, -self.b[:, column] / ts
+        b[:n, column], b[n, column] = self.b[:, column] / ts, 1.0
+        d = self.d.copy()
+        d[column] /= ts
+        return Law.from_state_space(a, b, np.append(self.c, -self.d[column] / ts), d, ts)
 
     def scaled(self, factor: float) -> Law:
         """Return the law with its output times a factor; the chain is read as before."""
@@ -263,9 +285,10 @@ class Law:
 
     @classmethod
     def from_transfer_functions(
-        cls, reference: TransferFunction, measurement: TransferFunction, sample_time_s: float
-    ) -> Law:
-        """Return the balanced law u = C_r r - C_y y of two transfer functions, for laws that are given as such.
+        cls, reference: TransferFunction, measurement: TransferFunction | Sequence[TransferFunction],
+        sample_time_s: float,
+    ) -> Law:  # fmt: skip
+        """Return the balanced law u = C_r r - C_y y of transfer functions, one C_y for each measured signal.
 
         Raises
         ------
@@ -280,27 +303,32 @@ class Law:
         1
 
         """
-        parts = [split(name, tf) for name, tf in (("reference", reference), ("measurement", measurement))]
+        measurements = [measurement] if isinstance(measurement, TransferFunction) else list(measurement)
+        given = {"reference": reference} | {
+            f"measurement {number}" if len(measurements) > 1 else "measurement": one
+            for number, one in enumerate(measurements, start=1)
+        }
+        parts = [split(name, tf) for name, tf in given.items()]
         m = max(part.chain.size for part in parts)
-        chain = np.zeros((m, 2))
+        chain = np.zeros((m, len(parts)))
         for column, part in enumerate(parts):
             chain[: part.chain.size, column] = part.chain
-        through = np.array([reference.num[0], -measurement.num[0]], dtype=float)
+        sign = np.array([1.0] + [-1.0] * len(measurements))
+        through = sign * np.array([tf.num[0] for tf in given.values()], dtype=float)
         a, b, c = realise_rest(parts)
-        sign = np.array([1.0, -1.0])
         law = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s).balanced()
-        for name, tf, response in (
-            ("reference", reference, law.reference_response), ("measurement", measurement, law.measurement_response),
-        ):  # fmt: skip
-            check_same_response(name, tf, response, sample_time_s)
+        for column, (name, tf) in enumerate(given.items()):
+            check_same_response(
+                name, tf, lambda f, column=column: sign[column] * law.responses(f)[column], sample_time_s
+            )
         return law
 
 
 def _equalise(chain: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
-    """Return the chain's gains with those of reference and measurement alike where only rounding sets them apart."""
+    """Return the chain's gains with those of reference and regulated signal alike where only rounding parts them."""
     out = chain.copy()
     for row in out:
-        if row.size == 2 and abs(row[0] + row[1]) <= EQUAL_GAINS * abs(row[0]):
+        if abs(row[0] + row[1]) <= EQUAL_GAINS * abs(row[0]):
             row[1] = -row[0]
     return out
 
@@ -343,8 +371,9 @@ def _power(polynomial: Float[np.ndarray, " n"], exponent: int) -> Float[np.ndarr
     return out
 
 
-def make_static_law(gain: float, sample_time_s: float) -> Law:
-    """Return the law that feeds back a gain of the error and nothing else."""
+def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law:
+    """Return the law that feeds back a gain of the error and nothing else, of so many signals."""
     return Law(
-        a=np.zeros((0, 0)), b=np.zeros((0, 2)), c=np.zeros(0), d=np.array([gain, -gain]), sample_time_s=sample_time_s
-    )
+        a=np.zeros((0, 0)), b=np.zeros((0, 1 + measured)), c=np.zeros(0),
+        d=np.array([gain, -gain] + [0.0] * (measured - 1)), sample_time_s=sample_time_s,
+    )  # fmt: skip

@@ -1,7 +1,9 @@
 r"""The closed loop of a digital controller and a sampled plant, and the figures that describe it.
 
 With :math:`L = C_y P z^{-d}`: :math:`S = 1/(1+L)`, :math:`T_r = P z^{-d} C_r / (1 + L)` from reference to force,
-:math:`C_y S` from sensor noise to motor force. Stability is decided by the eigenvalues of plant, hold, delay and
+:math:`C_y S` from sensor noise to motor force. Where a law reads several signals, :math:`L = \sum_i C_i P_i z^{-d}` is
+the loop broken at the command, where it is scalar: S, T and all margins are those there, and there is a noise gain
+:math:`C_i S` for every signal. Stability is decided by the eigenvalues of plant, hold, delay and
 controller together, never by a frequency grid; an unstable loop has no margins (zero) and infinite peaks. Peaks and
 crossings come from the eigenvalues of level sets (`response`, `peaks`), so that none is missed, however narrow.
 """
@@ -72,6 +74,8 @@ class LoopFigures:
         Symmetric disk margin, 2 / peak of abs(S - T) (Seiler, Packard, Gahinet 2020).
     noise_gain : float
         Peak of abs(F_m / noise on F), N/N.
+    other_noise_gains : tuple of float
+        The same of the further signals that the law reads, effort per unit of each.
 
     """
 
@@ -92,6 +96,7 @@ class LoopFigures:
     delay_margin_s: float | None
     disk_margin: float
     noise_gain: float
+    other_noise_gains: tuple[float, ...] = ()
 
     @property
     def delay_margin_ms(self) -> float | None:
@@ -123,7 +128,7 @@ class Loop:
 
     def open_loop(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return L at frequencies in Hz."""
-        return self.plant.response(f) * self.law.measurement_response(f)
+        return np.sum(self.plant.responses(f) * self.law.feedback_responses(f), axis=0)
 
     def sensitivity(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return S = 1/(1 + L)."""
@@ -131,14 +136,13 @@ class Loop:
 
     def tracking(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Return F/F_ref."""
-        reference, measurement = self.law.responses(f)
-        plant = self.plant.response(f)
-        return plant * reference / (1.0 - plant * measurement)
+        plant = self.plant.responses(f)
+        reference, *measured = self.law.responses(f)
+        return plant[0] * reference / (1.0 - np.sum(plant * np.array(measured), axis=0))
 
     def noise(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
-        """Return -F_m/noise = C_y S."""
-        measurement = self.law.measurement_response(f)
-        return measurement / (1.0 + self.plant.response(f) * measurement)
+        """Return -F_m/noise = C_y S, the noise being on the first measured signal."""
+        return self.law.measurement_response(f) / (1.0 + self.open_loop(f))
 
     def system(self) -> ClosedLoop:
         """Return plant, hold, delay and controller as one system."""
@@ -147,14 +151,19 @@ class Loop:
     def to_control(self) -> control.StateSpace:
         """Return the closed loop as python-control's `StateSpace`: from noise and reference to measured and effort.
 
-        What is measured includes the noise; the delay between the two is inside.
+        What is measured includes the noise; the delay between the two is inside. Where several signals are measured it
+        is from a disturbance of the command, the reference and each signal's noise to command, effort and the first.
         """
         import control  # deferred: slow to import
 
-        system = self.system()
+        system, measured = self.system(), self.law.d.size - 1
+        inputs, outputs = ["noise", "reference"], ["measured", "effort"]
+        if measured > 1:
+            inputs = ["disturbance", "reference", *(f"noise{number}" for number in range(1, measured + 1))]
+            outputs = ["command", "effort", "measured1"]
         return control.StateSpace(
-            system.a, system.b, system.c, system.d, self.plant.sample_time_s,
-            inputs=["noise", "reference"], outputs=["measured", "effort"], name="loop",
+            system.a, system.b, system.c, system.d, self.plant.sample_time_s, inputs=inputs, outputs=outputs,
+            name="loop",
         )  # fmt: skip
 
     def eigenvalues(self) -> Complex[np.ndarray, " n"]:
@@ -201,10 +210,11 @@ class Loop:
                 sensitivity_bandwidth_hz=0.0, ms=np.inf, mt=np.inf, ms_hz=np.nan, reference_peak=np.inf,
                 droop_db=np.inf, return_hz=None,
                 gain_margin_db=0.0, phase_margin_deg=0.0, delay_margin_s=0.0, disk_margin=0.0, noise_gain=np.inf,
+                other_noise_gains=(np.inf,) * (self.law.d.size - 2),
             )  # fmt: skip
         extremes = find_extremes(system)
         per_hz = 2 * np.pi * self.plant.sample_time_s
-        (ms, mt, skew, noise, reference), ms_at = extremes.peaks, extremes.at[0]
+        (ms, mt, skew, noise, reference, *others), ms_at = extremes.peaks, extremes.at[0]
         crossovers, slow, below = extremes.crossovers, extremes.sensitivity_edges, extremes.bandwidth_edges
         least = find_least(system, TRACKING, DROOP_BAND * (float(below[0]) if below.size else np.pi))
         quiet = abs(extremes.ends[0, 0]) < HALF_POWER
@@ -227,6 +237,7 @@ class Loop:
             delay_margin_s=_least(extremes.delays * self.plant.sample_time_s),
             disk_margin=2.0 / float(skew),
             noise_gain=float(noise),
+            other_noise_gains=tuple(map(float, others)),
         )
 
     def _find_return(self, bandwidth_hz: float, static: float) -> float | None:

@@ -79,20 +79,26 @@ def split(name: str, tf: TransferFunction) -> SplitLaw:
 
 def realise_rest(
     parts: list[SplitLaw],
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Return Y/R of both in observer form, each of its input: on shared states where R is the same, else side by side.
+) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+    """Return Y/R of all in observer form, each of its input: on shared states where R is the same, else side by side.
 
     The direct terms, Y at q = 0, are left out.
     """
-    one, other = parts
-    groups = [((0, one), (1, other))] if np.array_equal(one.den, other.den) else [((0, one),), ((1, other),)]
+    groups: list[list[tuple[int, SplitLaw]]] = []
+    for numbered in enumerate(parts):
+        alike = (group for group in groups if np.array_equal(group[0][1].den, numbered[1].den))
+        group = next(alike, None)
+        if group is None:
+            groups.append([numbered])
+        else:
+            group.append(numbered)
     blocks: list[Float[np.ndarray, "_ _"]] = []
-    drives: list[Float[np.ndarray, "_ 2"]] = []
+    drives: list[Float[np.ndarray, "_ k"]] = []
     for group in groups:
         den = group[0][1].den
         n = max(p.size for _, part in group for p in (part.rest, den)) - 1
         column = np.pad(den, (0, n + 1 - den.size))[1:]
-        a, b = np.eye(n, k=1), np.zeros((n, 2))
+        a, b = np.eye(n, k=1), np.zeros((n, len(parts)))
         a[:, :1] -= column[:, None]
         for input_number, part in group:
             b[:, input_number] = np.pad(part.rest, (0, n + 1 - part.rest.size))[1:] - part.rest[0] * column

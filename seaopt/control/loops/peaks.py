@@ -18,7 +18,6 @@ from seaopt.records import record
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PROOF = 1e-7
 COARSE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
-CURVE_COUNT = 5
 SENSITIVITY, TRACKING = 0, 4
 REFINED_PER_CURVE = 3  # local maxima of each curve that are refined before the proof
 MAX_PROOF_ROUNDS = 20
@@ -34,9 +33,9 @@ class Extremes:
     Parameters
     ----------
     peaks, at
-        Largest values of S, T, S - T, C_y S and F/F_ref, and the angles where.
+        Largest values of S, T, S - T, C_y S and F/F_ref, of further measured signals C_y S, and the angles where.
     ends
-        The five curves at 0 and pi, shape (5, 2).
+        The curves at 0 and pi, shape (c, 2).
     static : float
         abs(F/F_ref) at 0; zero where a zero of the plant leaves nothing but rounding.
     crossovers, crossover_phases
@@ -50,9 +49,9 @@ class Extremes:
 
     """
 
-    peaks: Float[np.ndarray, " 5"]
-    at: Float[np.ndarray, " 5"]
-    ends: Complex[np.ndarray, "5 2"]
+    peaks: Float[np.ndarray, " c"]
+    at: Float[np.ndarray, " c"]
+    ends: Complex[np.ndarray, "c 2"]
     static: float
     crossovers: Float[np.ndarray, " k"]
     crossover_phases: Float[np.ndarray, " k"]
@@ -183,13 +182,13 @@ def _gain_factors(
     return factors[crossing], turns[crossing]
 
 
-def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:
+def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return the largest values on a coarse grid and at the poles, the best of each curve refined."""
     modes = np.abs(np.angle(system.poles))
     theta = np.unique(np.concatenate([COARSE_ANGLES, modes[modes > 1e-9]]))
     values, slopes = np.abs(system.curves(theta)), system.slopes(theta)
     best = np.argmax(values, axis=1)
-    peaks, at = values[np.arange(CURVE_COUNT), best], theta[best]
+    peaks, at = values[np.arange(best.size), best], theta[best]
     curve, cell = np.nonzero((slopes[:, :-1] > 0.0) & (slopes[:, 1:] < 0.0))
     height = np.maximum(values[curve, cell], values[curve, cell + 1])
     order = np.lexsort((-height, curve))
@@ -199,9 +198,9 @@ def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " 5"], Float
 
 
 def _climb(
-    system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curve: Indices,
+    system: ClosedLoop, peaks: Float[np.ndarray, " c"], at: Float[np.ndarray, " c"], curve: Indices,
     low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"],
-) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:  # fmt: skip
     """Return the peaks with the local maxima between `low` and `high`, where slopes change sign, taken in."""
     if not curve.size:
         return peaks, at
@@ -213,7 +212,7 @@ def _climb(
     top = find_zeros(slope, low, high, slope(low, every), slope(high, every), 1e-8)
     value = np.abs(system.curves(top)[curve, every])
     peaks, at = peaks.copy(), at.copy()
-    for k in range(CURVE_COUNT):
+    for k in range(peaks.size):
         own = np.flatnonzero(curve == k)
         if own.size and value[own].max() > peaks[k]:
             best = own[np.argmax(value[own])]
@@ -222,9 +221,9 @@ def _climb(
 
 
 def _prove(
-    system: ClosedLoop, peaks: Float[np.ndarray, " 5"], at: Float[np.ndarray, " 5"], curves: Int[np.ndarray, " c"],
+    system: ClosedLoop, peaks: Float[np.ndarray, " c"], at: Float[np.ndarray, " c"], curves: Int[np.ndarray, " k"],
     edges: list[Float[np.ndarray, " _"]],
-) -> tuple[Float[np.ndarray, " 5"], Float[np.ndarray, " 5"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:  # fmt: skip
     """Return the peaks, raised until no arc of the level set just above them holds a larger value.
 
     Raises

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.sampled_plant import DELAY, read_conditions
-from seaopt.errors import ControlError, suggestion
+from seaopt.control.loops.sampled_plant import DELAY, Measured, find_rows, read_conditions
+from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.plants.motor.thermal import freeze_heat
@@ -21,21 +21,34 @@ NOT_AFFINE = 1e-6  # Delta of this share of its terms, and more, makes the condi
 
 @record(eq=False)
 class PortResponse:
-    """G_11, G_12, G_21, G_22 of the module's docstring at some frequencies; `feedback` is the fed-back force."""
+    """G_11, G_12, G_21, G_22 of the module's docstring at some frequencies; what is fed back has a row each."""
 
-    motor_to_feedback: Response
-    motion_to_feedback: Response
+    motor_to_read: Complex[np.ndarray, "y m"]
+    motion_to_read: Complex[np.ndarray, "y m"]
     motor_to_port: Response
     motion_to_port: Response
 
     @property
-    def determinant(self) -> Response:
-        """Delta."""
-        return self.motor_to_feedback * self.motion_to_port - self.motion_to_feedback * self.motor_to_port
+    def motor_to_feedback(self) -> Response:
+        """G_11, of the regulated force."""
+        return self.motor_to_read[0]
 
-    def impedance(self, law: Response) -> Response:
-        """Return Z under F_m = -law F."""
-        return (self.motion_to_port + self.determinant * law) / (1.0 + self.motor_to_feedback * law)
+    @property
+    def motion_to_feedback(self) -> Response:
+        """G_12, of the regulated force."""
+        return self.motion_to_read[0]
+
+    @property
+    def determinant(self) -> Complex[np.ndarray, "y m"]:
+        """Delta, of every fed-back signal."""
+        return self.motor_to_read * self.motion_to_port - self.motion_to_read * self.motor_to_port
+
+    def impedance(self, law: Complex[np.ndarray, "... m"]) -> Response:
+        """Return Z under F_m = - sum of law_i y_i; of one signal the law may be a vector."""
+        law = np.atleast_2d(law)
+        return (self.motion_to_port + np.sum(self.determinant * law, axis=0)) / (
+            1.0 + np.sum(self.motor_to_read * law, axis=0)
+        )
 
 
 @record(eq=False)
@@ -56,6 +69,8 @@ class PortModel:
         Of the motor, besides the controller's.
     place_unit : str
         Of the port's motion: m or rad.
+    others : array, shape (k, n + 2), optional
+        Further signals that the law reads, as `feedback`.
 
     """
 
@@ -68,6 +83,12 @@ class PortModel:
     mass: float
     delay_s: float = 0.0
     place_unit: str = LINEAR.place
+    others: Float[np.ndarray, "k m"] | None = None
+
+    @property
+    def read(self) -> Float[np.ndarray, "y m"]:
+        """Every signal that the law reads, of x, F_m and F_e."""
+        return self.feedback[None] if self.others is None else np.vstack([self.feedback, self.others])
 
     def response(self, f: Frequencies) -> PortResponse:
         """Return the responses to motor force and to motion, F_e being what that motion takes.
@@ -83,12 +104,12 @@ class PortModel:
         causes[:n, 0], causes[n, 1] = self.motor, 1.0
         x = np.linalg.solve(inner, np.broadcast_to(causes.astype(complex), (f.size, n + 1, 2)))
         taken = x[:, n]
-        read = np.einsum("i,mij->mj", self.feedback[:n], x[:, :n]) + self.feedback[n + 1] * taken
-        read[:, 0] += self.feedback[n]
+        read = np.einsum("yi,mij->ymj", self.read[:, :n], x[:, :n]) + self.read[:, n + 1, None, None] * taken
+        read[:, :, 0] += self.read[:, n, None]
         late = np.exp(-s * self.delay_s)
         return PortResponse(
-            motor_to_feedback=read[:, 0] * late,
-            motion_to_feedback=read[:, 1],
+            motor_to_read=read[:, :, 0] * late,
+            motion_to_read=read[:, :, 1],
             motor_to_port=taken[:, 0] * late,
             motion_to_port=taken[:, 1] - s * self.mass,
         )
@@ -98,16 +119,19 @@ class PortModel:
         poles = self._poles()
         return np.abs(np.imag(poles)) / (2 * np.pi), np.abs(np.real(poles)) / (2 * np.pi)
 
-    def link_held(self) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"], float]:
-        """Return (a, b, c, d) from motor force to the fed-back one with link 2 at rest, what cannot move left out."""
+    def link_held(
+        self,
+    ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"], Float[np.ndarray, "y k"], Float[np.ndarray, " y"]]:
+        """Return (a, b, c, d) from motor force to what is fed back with link 2 at rest, what cannot move left out."""
         n, at = self.motor.size, self.force[self.speed]
         taken, pulled = -self.a[self.speed] / at, -self.motor[self.speed] / at  # F_e of x and of F_m
         a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pulled
-        c, d = self.feedback[:n] + self.feedback[n + 1] * taken, self.feedback[n] + self.feedback[n + 1] * pulled
+        read, of_motor, of_force = self.read[:, :n], self.read[:, n], self.read[:, n + 1]
+        c, d = read + np.outer(of_force, taken), of_motor + of_force * pulled
         moving = np.arange(n) != self.speed
         while np.any(still := moving & ~np.any(a[:, moving], axis=1) & (b == 0.0)):
             moving &= ~still
-        return a[moving][:, moving], b[moving], c[moving], float(d)
+        return a[moving][:, moving], b[moving], c[:, moving], d
 
     def _poles(self) -> Complex[np.ndarray, " n"]:
         """Return the poles with link 2 at rest."""
@@ -146,7 +170,7 @@ def probe_of(plant: Plant) -> Plant:
     return freeze_heat(plant.port.probe())
 
 
-def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float) -> PortModel:
+def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: float) -> PortModel:
     """Return a plant's port, driven by the command for an effort.
 
     Raises
@@ -157,23 +181,22 @@ def port_of(plant: Plant, params: ParameterSet, measured: str, per_effort: float
     """
     probe = probe_of(plant)
     values = probe.complete(params)
-    if measured not in probe.outputs:
-        raise ControlError(
-            f'measured = "{measured}" is not an output of {probe.name}; {suggestion(measured, probe.outputs)}'
-        )
+    rows = find_rows(probe, (measured,) if isinstance(measured, str) else measured)
     a, b, c, d = state_space(probe, values)
     port = bare_port(probe)
-    external, row = list(probe.inputs).index(port.effort), list(probe.outputs).index(measured)
+    external = list(probe.inputs).index(port.effort)
+    read = np.column_stack([c[rows], per_effort * d[rows, 0], d[rows, external]])
     return PortModel(
         a=a,
         motor=per_effort * b[:, 0],
         force=b[:, external].copy(),
-        feedback=np.concatenate([c[row], [per_effort * d[row, 0], d[row, external]]]),
+        feedback=read[0],
         speed=list(probe.states).index(port.rate),
         place=list(probe.states).index(port.coordinate),
         mass=values[port.inertia].value,
         delay_s=read_conditions(plant, params).get(DELAY, 0.0),
         place_unit=probe.states[port.coordinate],
+        others=read[1:] if len(read) > 1 else None,
     )
 
 
@@ -224,7 +247,7 @@ def weigh_passivity(
     response = port.response(f)
     g11, g22 = response.motor_to_feedback, response.motion_to_port
     size = np.abs(g11 * g22) + np.abs(response.motion_to_feedback * response.motor_to_port)
-    if np.any(np.abs(response.determinant) > NOT_AFFINE * size):
+    if np.any(np.abs(response.determinant[0]) > NOT_AFFINE * size):
         raise ControlError(
             "the force at the port does not follow from the measured one alone (an elastic screw between them), so "
             "that passivity is not affine in the gains; leave the constraint out and read the band that is reported"

@@ -7,10 +7,14 @@ Plant, hold, delay and controller together are
     m = C_m x + D_m n + D_{mr} F_\mathrm{ref}, \qquad u = C_u x + \dots
 
 with sensor noise :math:`n`, measured force :math:`m = y + n` and motor force :math:`u`. Its transfer functions are
-:math:`S` (n to m), :math:`T = 1 - S`, :math:`C_y S` (n to -u) and :math:`T_r` (reference to force). They are computed
-in a Schur basis of the balanced system, where :math:`zI - A` is triangular: one back substitution serves all
-frequencies, no pole of plant or controller on the circle (an integrator) has to be avoided, and repeated ones do no
-harm.
+:math:`S` (n to m), :math:`T = 1 - S`, :math:`C_y S` (n to -u) and :math:`T_r` (reference to force). Of a law with
+several measured signals the loop is broken at the command, where it is scalar, :math:`L = \sum_i C_i P_i`: with a
+disturbance w that adds to the command, :math:`S` is from w to w + u, and :math:`C_i S` from the noise :math:`n_i` to
+-u; of one signal S is the same at both places.
+
+They are computed in a Schur basis of the balanced system, where :math:`zI - A` is triangular: one back substitution
+serves all frequencies, no pole of plant or controller on the circle (an integrator) has to be avoided, and repeated
+ones do no harm.
 
 A function :math:`\Phi(z) = \overline{G} G - \gamma^2` on the circle is zero where :math:`|G| = \gamma`. With
 :math:`\lambda = z (A^T \lambda + C^T C x + C^T D u)` the zeros are eigenvalues of a symplectic pencil in
@@ -50,40 +54,70 @@ Indices = Int[np.ndarray, " m"]
 Indexed = Callable[[Float[np.ndarray, " m"], Indices], Float[np.ndarray, " m"]]
 
 
+@record
+class Curve:
+    """A transfer function that a loop is judged by: factor G + offset, G from one input to one output."""
+
+    output: int
+    input: int
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+# S, T, S - T, C_y S and F/F_ref, of the inputs noise and reference and the outputs measured and effort.
+CURVES_OF_ONE = (Curve(output=0, input=0), Curve(output=0, input=0, factor=-1.0, offset=1.0),
+                 Curve(output=0, input=0, factor=2.0, offset=-1.0), Curve(output=1, input=0, factor=-1.0),
+                 Curve(output=0, input=1))  # fmt: skip
+
+
+def list_curves(measured: int) -> tuple[Curve, ...]:
+    """Return S, T, S - T, C_y S and F/F_ref, and of further measured signals C_y S each.
+
+    Of several signals the inputs are w, reference and one noise each; the outputs command, effort and regulated force.
+    """
+    if measured == 1:
+        return CURVES_OF_ONE
+    noise = [Curve(output=1, input=2 + number, factor=-1.0) for number in range(measured)]
+    return (*CURVES_OF_ONE[:3], noise[0], Curve(output=2, input=1), *noise[1:])
+
+
 @record(eq=False)
 class ClosedLoop:
-    """A closed loop from (noise, reference) to (measured force, motor force), balanced.
+    """A closed loop from (noise, reference) to (measured force, motor force), balanced; or of `list_curves`.
 
     Parameters
     ----------
     a, b, c, d
-        Shapes (n, n), (n, 2), (2, n) and (2, 2).
+        Shapes (n, n), (n, i), (o, n) and (o, i).
     triangle, right, left
         The complex Schur form of `a`, and `b` and `c` in its basis.
     opened
         The poles of plant and law, which are the zeros of S.
     blocks
         The matrices of plant and law whose eigenvalues those are, but for the law's integrators.
+    table
+        Its curves.
 
     """
 
     a: Float[np.ndarray, "n n"]
-    b: Float[np.ndarray, "n 2"]
-    c: Float[np.ndarray, "2 n"]
-    d: Float[np.ndarray, "2 2"]
+    b: Float[np.ndarray, "n i"]
+    c: Float[np.ndarray, "o n"]
+    d: Float[np.ndarray, "o i"]
     triangle: Complex[np.ndarray, "n n"]
-    right: Complex[np.ndarray, "n 2"]
-    left: Complex[np.ndarray, "2 n"]
+    right: Complex[np.ndarray, "n i"]
+    left: Complex[np.ndarray, "o n"]
     opened: Complex[np.ndarray, " n"]
     blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
+    table: tuple[Curve, ...] = CURVES_OF_ONE
 
     @property
     def poles(self) -> Complex[np.ndarray, " n"]:
         """The eigenvalues of `a`."""
         return np.diag(self.triangle)
 
-    def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "5 m"]:
-        """Return S, T, S - T, C_y S and F/F_ref at angles (rad) on the unit circle."""
+    def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
+        """Return S, T, S - T, C_y S, F/F_ref and what else is in the table at angles (rad) on the unit circle."""
         return self._combine(self._solve(np.exp(1j * theta), self.right[:, :, None]), direct=True)
 
     def sensitivity(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
@@ -100,7 +134,7 @@ class ClosedLoop:
         plant, rest = (_resolution(block) for block in self.blocks)
         return np.concatenate([plant, np.zeros(self.opened.size - plant.size - rest.size), rest])
 
-    def slopes(self, theta: Float[np.ndarray, " m"]) -> Float[np.ndarray, "5 m"]:
+    def slopes(self, theta: Float[np.ndarray, " m"]) -> Float[np.ndarray, "k m"]:
         """Return half the derivative of -1/abs(curve)^2 along the angle.
 
         It has the sign of the curve's own slope, and about a resonance it is close to a straight line.
@@ -112,31 +146,31 @@ class ClosedLoop:
         size = np.maximum(values.real**2 + values.imag**2, 1e-150)
         return (values.real * turned.real + values.imag * turned.imag) / size**2
 
-    def _solve(self, z: Complex[np.ndarray, " m"], rhs: Complex[np.ndarray, "n 2 k"]) -> Complex[np.ndarray, "n 2 m"]:
+    def _solve(self, z: Complex[np.ndarray, " m"], rhs: Complex[np.ndarray, "n i k"]) -> Complex[np.ndarray, "n i m"]:
         """Return (zI - A)^-1 rhs in the Schur basis, by back substitution."""
-        n = self.triangle.shape[0]
-        x = np.zeros((n, 2, z.size), dtype=complex)
-        flat = x.reshape(n, 2 * z.size)
+        n, inputs = self.right.shape
+        x = np.zeros((n, inputs, z.size), dtype=complex)
+        flat = x.reshape(n, inputs * z.size)
         for i in range(n - 1, -1, -1):
             known = self.triangle[i, i + 1 :] @ flat[i + 1 :]
-            x[i] = (rhs[i] + known.reshape(2, -1)) / (z - self.triangle[i, i])
+            x[i] = (rhs[i] + known.reshape(inputs, -1)) / (z - self.triangle[i, i])
         return x
 
-    def _combine(self, x: Complex[np.ndarray, "n 2 m"], direct: bool) -> Complex[np.ndarray, "5 m"]:
-        """Return the five transfer functions of a state, with or without their direct terms."""
-        n, _, count = x.shape
-        out = (self.left @ x.reshape(n, 2 * count)).reshape(2, 2, count)
-        through = self.d if direct else np.zeros((2, 2))
-        one = 1.0 if direct else 0.0
-        s, t = out[0, 0] + through[0, 0], (one - through[0, 0]) - out[0, 0]
-        return np.array([s, t, s - t, -out[1, 0] - through[1, 0], out[0, 1] + through[0, 1]])
+    def _combine(self, x: Complex[np.ndarray, "n i m"], direct: bool) -> Complex[np.ndarray, "k m"]:
+        """Return the transfer functions of a state, with or without their direct terms."""
+        n, inputs, count = x.shape
+        out = (self.left @ x.reshape(n, inputs * count)).reshape(self.left.shape[0], inputs, count)
+        through = [self.d[one.output, one.input] * one.factor + one.offset if direct else 0.0 for one in self.table]
+        return np.array([
+            one.factor * out[one.output, one.input] + more for one, more in zip(self.table, through, strict=True)
+        ])  # fmt: skip
 
     def modulus(self, curve: int, level: float) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where abs(curve) = level."""
-        row, column, factor, offset = ((0, 0, 1, 0), (0, 0, -1, 1), (0, 0, 2, -1), (1, 0, -1, 0), (0, 1, 1, 0))[curve]
-        c = self.c[row] * (factor / level)
-        d = (self.d[row, column] * factor + offset) / level
-        return self._pencil(self.b[:, column], (np.outer(c, c), c * d), (d * c, 1.0, d * d - 1.0))
+        one = self.table[curve]
+        c = self.c[one.output] * (one.factor / level)
+        d = (self.d[one.output, one.input] * one.factor + one.offset) / level
+        return self._pencil(self.b[:, one.input], (np.outer(c, c), c * d), (d * c, 1.0, d * d - 1.0))
 
     def equal(self) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where abs(L) = 1, that is 2 Re S = 1."""
@@ -169,32 +203,40 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
     from scipy.linalg import matrix_balance, schur
 
     ap, bp, cp, dp = plant
-    sign = np.array([1.0, -1.0])
-    ak, bk, ck, dk = law.a, law.b * sign, law.c, law.d * sign
-    # u and m = y + n satisfy u = c_k x_k + d_r r - d_y m, m = c_p x_p + d_p u + n.
+    ak, bk, ck, dk = law.a, -law.b[:, 1:], law.c, -law.d[1:]
+    cp, dp, measured = np.atleast_2d(cp), np.atleast_1d(dp), dk.size
+    # u and m = y + n satisfy u = c_k x_k + d_r r - d_y m, m = c_p x_p + d_p (u + w) + n; inputs w, r and every n.
     n, m = bp.size, ck.size
-    loop = 1.0 / (1.0 + dp * dk[1])
-    c_u = np.concatenate([-dk[1] * cp, ck]) * loop
-    d_u = np.array([-dk[1], dk[0]]) * loop
-    c_m = np.concatenate([cp, np.zeros(m)]) + dp * c_u
-    d_m = np.array([1.0, 0.0]) + dp * d_u
-    a, b = np.zeros((n + m, n + m)), np.zeros((n + m, 2))
+    loop = 1.0 / (1.0 + float(dk @ dp))
+    c_u = np.concatenate([-dk @ cp, ck]) * loop
+    d_u = np.concatenate([[-float(dk @ dp), law.d[0]], -dk]) * loop
+    to_command = np.eye(1, 2 + measured)[0]
+    c_m = np.hstack([cp, np.zeros((measured, m))]) + np.outer(dp, c_u)
+    d_m = np.eye(measured, 2 + measured, k=2) + np.outer(dp, d_u + to_command)
+    a, b = np.zeros((n + m, n + m)), np.zeros((n + m, 2 + measured))
     a[:n, :n], a[n:, n:] = ap, ak
     a[:n] += np.outer(bp, c_u)
-    a[n:] -= np.outer(bk[:, 1], c_m)
-    b[:n], b[n:] = np.outer(bp, d_u), -np.outer(bk[:, 1], d_m)
-    b[n:, 1] += bk[:, 0]
-    c, d = np.stack([c_m, c_u]), np.stack([d_m, d_u])
+    a[n:] -= bk @ c_m
+    b[:n], b[n:] = np.outer(bp, d_u + to_command), -bk @ d_m
+    b[n:, 1] += law.b[:, 0]
+    if measured == 1:  # noise, reference; measured, effort
+        b, c, d = b[:, [2, 1]], np.stack([c_m[0], c_u]), np.stack([d_m[0], d_u])[:, [2, 1]]
+    else:
+        c, d = np.stack([c_u, c_u, c_m[0]]), np.stack([d_u + to_command, d_u, d_m[0]])
+    table = list_curves(measured)
     opened = np.full(n + m, np.inf + 0j)
-    whole = np.block([[a, b], [c, np.zeros((2, 2))]])
+    side = max(b.shape[1], c.shape[0])
+    whole = np.zeros((n + m + side, n + m + side))
+    whole[: n + m, : n + m + b.shape[1]], whole[n + m : n + m + len(c), : n + m] = np.hstack([a, b]), c
     if not np.max(np.abs(whole)) < LARGEST_ENTRY:
         gone = np.diag(opened)
         return ClosedLoop(
-            a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, law.rest[0])
+            a=a, b=b, c=c, d=d, triangle=gone, right=b + 0j, left=c + 0j, opened=opened, blocks=(ap, law.rest[0]),
+            table=table,
         )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):  # of scales too far apart for doubles
         scale = np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0])
-        scale = scale[: n + m] / np.sqrt(scale[-2] * scale[-1])
+        scale = scale[: n + m] / np.prod(scale[n + m :]) ** (1.0 / side)
         balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
     if all(np.all(np.isfinite(matrix)) for matrix in balanced):
         a, b, c = balanced
@@ -202,7 +244,7 @@ def close(plant: StateSpace, law: Law) -> ClosedLoop:
     opened = np.concatenate([np.linalg.eigvals(ap), law.poles]).astype(complex)
     return ClosedLoop(
         a=a, b=b, c=c, d=d, triangle=triangle, right=basis.conj().T @ b, left=c @ basis, opened=opened,
-        blocks=(ap, law.rest[0]),
+        blocks=(ap, law.rest[0]), table=table,
     )  # fmt: skip
 
 

@@ -32,13 +32,18 @@ from seaopt.plants.plant import dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.units import factor
 
-StateSpace = tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]
+# Of one measured output c is a vector and d a number; of several they have a row each.
+StateSpace = tuple[
+    Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "... n"], float | Float[np.ndarray, " y"]
+]  # fmt: skip
 LinearPlants = tuple[
-    Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k n"], Float[np.ndarray, " k"]
+    Float[np.ndarray, "k n n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k ... n"], Float[np.ndarray, "k ..."]
 ]  # fmt: skip
 SampledPlants = tuple[
-    Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, " k"]
+    Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k ... m"],
+    Inexact[np.ndarray, "k ..."],
 ]  # fmt: skip
+Measured = str | tuple[str, ...]  # one output by its name, or several, the regulated one first
 
 DELAY = "delay_s"
 MAPPED = 512  # plants in one call of CasADi
@@ -53,13 +58,15 @@ class DigitalPlant:
     Parameters
     ----------
     a, b, c, d
-        Matrices, shapes (n, n), (n,), (n,) and a number.
+        Matrices, shapes (n, n), (n,), (n,) and a number: y is the regulated output.
     sample_time_s : float
         Seconds.
     delay_samples : int
         From measurement to output, besides the hold.
     static_gain : float
         y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
+    others : (c, d), optional
+        Of further outputs that a law reads, shapes (k, n) and (k,).
 
     """
 
@@ -70,38 +77,56 @@ class DigitalPlant:
     sample_time_s: float
     delay_samples: int
     static_gain: float
+    others: tuple[Float[np.ndarray, "k n"], Float[np.ndarray, " k"]] | None = None
 
     @property
     def nyquist_hz(self) -> float:
         """Half the sample rate."""
         return 0.5 / self.sample_time_s
 
+    @property
+    def sensed(self) -> tuple[Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]:
+        """Rows c and numbers d of every output, the regulated one's first."""
+        c, d = self.others or (np.zeros((0, self.c.size)), np.zeros(0))
+        return np.vstack([self.c, c]), np.concatenate([[self.d], d])
+
     def response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
-        """Return P(z) z^-delay at frequencies in Hz."""
+        """Return P(z) z^-delay at frequencies in Hz, of the regulated output."""
+        x, late = self._respond(f)
+        return (x @ self.c + self.d) * late
+
+    def responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
+        """Return P(z) z^-delay at frequencies in Hz, of every output."""
+        x, late = self._respond(f)
+        return np.array([(x @ c + d) * late for c, d in zip(*self.sensed, strict=True)])
+
+    def _respond(self, f: Float[np.ndarray, " m"]) -> tuple[Complex[np.ndarray, "m n"], Complex[np.ndarray, " m"]]:
+        """Return the states per command that has come through its delay, and that delay."""
         z = np.exp(2j * np.pi * f * self.sample_time_s)
         n = self.b.size
         inner = z[:, None, None] * np.eye(n) - self.a
         x = np.linalg.solve(inner, np.broadcast_to(self.b[:, None].astype(complex), (f.size, n, 1)))[:, :, 0]
-        return (x @ self.c + self.d) * z**-self.delay_samples
+        return x, z**-self.delay_samples
 
     def delayed(self) -> StateSpace:
         """Return a state-space model with the delay as states."""
         k, n = self.delay_samples, self.b.size
+        sensed, through = (self.c, self.d) if self.others is None else self.sensed
         if k == 0:
-            return self.a, self.b, self.c, self.d
+            return self.a, self.b, sensed, through
         a = np.zeros((n + k, n + k))
         a[:n, :n], a[:n, n + k - 1] = self.a, self.b
         for i in range(1, k):
             a[n + i, n + i - 1] = 1.0
         b = np.zeros(n + k)
         b[n] = 1.0
-        c = np.concatenate([self.c, np.zeros(k)])
-        c[n + k - 1] = self.d
-        return a, b, c, 0.0
+        c = np.zeros((*sensed.shape[:-1], n + k))
+        c[..., :n], c[..., n + k - 1] = sensed, through
+        return a, b, c, 0.0 * through
 
 
 def sample(
-    plant: Plant, params: ParameterSet, measured: str, gain: float, sample_time_s: float, delay_samples: int
+    plant: Plant, params: ParameterSet, measured: Measured, gain: float, sample_time_s: float, delay_samples: int
 ) -> DigitalPlant:
     """Return the digital plant from motor force to a measured force, linearised at rest.
 
@@ -109,8 +134,8 @@ def sample(
     ----------
     plant, params
         The plant; its first input is what the controller commands. `params` may hold conditions too.
-    measured : str
-        The output that is fed back.
+    measured : str or tuple of str
+        The output that is fed back; or several, the regulated one first.
     gain : float
         A/N: the current that the controller commands for a motor force.
     sample_time_s : float
@@ -129,7 +154,7 @@ def sample(
 
 
 def linearise_sets(
-    plant: Plant, sets: Sequence[CompletedParameters], measured: str, gain: float
+    plant: Plant, sets: Sequence[CompletedParameters], measured: Measured, gain: float
 ) -> tuple[LinearPlants, Float[np.ndarray, " k"]]:
     """Return what `linearise` does at k sets of parameters with the same conditions among them, and their delays (s).
 
@@ -149,13 +174,19 @@ def sample_linear(
     plants: LinearPlants, delay_s: Float[np.ndarray, " k"], sample_time_s: float, delay_samples: int
 ) -> list[DigitalPlant]:
     """Return the digital plants of k linear ones and their delays, seconds besides the whole samples."""
-    static = [_compute_static_gain(a, b, c, float(d)) for a, b, c, d in zip(*plants, strict=True)]
+    several = plants[2].ndim == 3
+
+    def regulated(values: Any) -> Any:
+        return values[0] if several else values
+
+    static = [_compute_static_gain(a, b, regulated(c), float(regulated(d))) for a, b, c, d in zip(*plants, strict=True)]
     return [
         DigitalPlant(
-            a=a, b=b, c=c, d=float(d), sample_time_s=sample_time_s, delay_samples=delay_samples, static_gain=gain
+            a=a, b=b, c=regulated(c), d=float(regulated(d)), sample_time_s=sample_time_s, delay_samples=delay_samples,
+            static_gain=gain, others=(c[1:], d[1:]) if several and len(c) > 1 else None,
         )
         for a, b, c, d, gain in zip(*hold(*plants, sample_time_s, delay_s), static, strict=True)
-    ]
+    ]  # fmt: skip
 
 
 def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:
@@ -214,9 +245,12 @@ def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
 
 
 def linearise(
-    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float
-) -> LinearPlants:
+    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]], measured: Measured,
+    gain: float,
+) -> LinearPlants:  # fmt: skip
     """Return (a, b, c, d) from motor force to a measured output of k plants, one column of parameters each.
+
+    Of several outputs c and d have a row for each.
 
     Raises
     ------
@@ -228,13 +262,68 @@ def linearise(
     """
     refuse_samples(plant)
     plant = leave_out_drift(freeze_heat(plant), measured)
-    if measured not in plant.outputs:
-        raise ControlError(
-            f'measured = "{measured}" is not an output of {plant.name}; {suggestion(measured, plant.outputs)}'
-        )
-    row = list(plant.outputs).index(measured)
+    row = find_rows(plant, measured)
     a, b, c, d = _evaluate_jacobians(plant, *_solve_rest(_let_slide(plant), p, at), p)
     return a, b[:, :, 0] * gain, c[:, row], d[:, row, 0] * gain
+
+
+def list_names(measured: Measured) -> tuple[str, ...]:
+    """Return what is measured as names, the regulated output first."""
+    return (measured,) if isinstance(measured, str) else tuple(measured)
+
+
+def find_signals(plant: Plant, measured: Measured) -> tuple[str, ...]:
+    """Return the outputs that a law reads for what is measured: of a motor's speed that is no output, its position.
+
+    Parameters
+    ----------
+    plant : Plant
+        The design plant, whose `sensing` states which position has which speed.
+    measured : str or tuple of str
+        The regulated output, and what else is measured.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output, and no encoder for it.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> find_signals(so.plants.rotary(link="locked"), ("tau_s", "thetad_m"))
+    ('tau_s', 'theta_m')
+
+    """
+    return tuple(_find_signal(plant, name) for name in list_names(measured))
+
+
+def _find_signal(plant: Plant, name: str) -> str:
+    sensing = plant.sensing
+    if name in plant.outputs:
+        return name
+    if sensing is not None and name == sensing.motor_speed:
+        encoder = sensing.motor_position
+        if encoder is not None and encoder in plant.outputs:
+            return encoder
+    raise ControlError(f'measured = "{name}" is not an output of {plant.name}; {suggestion(name, plant.outputs)}')
+
+
+def find_rows(plant: Plant, measured: Measured) -> Any:
+    """Return which of a plant's outputs are measured: a number, or a list of several.
+
+    Raises
+    ------
+    ControlError
+        The plant has no such output.
+
+    """
+    names = list(plant.outputs)
+    for name in (measured,) if isinstance(measured, str) else measured:
+        if name not in names:
+            raise ControlError(
+                f'measured = "{name}" is not an output of {plant.name}; {suggestion(name, plant.outputs)}'
+            )
+    return names.index(measured) if isinstance(measured, str) else [names.index(name) for name in measured]
 
 
 def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " nu"]]:
@@ -300,12 +389,12 @@ def _solve_rest(
 
 def differentiate_linearisation(
     plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]],
-    dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: str, gain: float,
+    dp: Float[np.ndarray, "np k"], dat: Mapping[str, Float[np.ndarray, " k"]], measured: Measured, gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:  # fmt: skip
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
     plant = leave_out_drift(freeze_heat(plant), measured)
     sliding = _let_slide(plant)
-    row, names = list(plant.outputs).index(measured), list(plant.states)
+    row, names = find_rows(plant, measured), list(plant.states)
     x, u = _solve_rest(sliding, p, at)
     a, b, c, d = _evaluate_jacobians(plant, x, u, p)
     dx, du = np.zeros_like(x), np.zeros_like(u)
@@ -383,8 +472,8 @@ def _turn_function(plant: Plant) -> Any:
 
 
 def hold(
-    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], c: Inexact[np.ndarray, "k n"],
-    d: Inexact[np.ndarray, " k"], sample_time_s: float, delay_s: Inexact[np.ndarray, " k"],
+    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], c: Inexact[np.ndarray, "k ... n"],
+    d: Inexact[np.ndarray, "k ..."], sample_time_s: float, delay_s: Inexact[np.ndarray, " k"],
 ) -> SampledPlants:  # fmt: skip
     """Return k plants behind a zero-order hold and their delays; earlier commands are states behind the plant's.
 
@@ -401,17 +490,18 @@ def hold(
     count, n, chain = a.shape[0], a.shape[1], int(whole.max()) + 1
     rows = np.arange(count)
     drive = np.zeros((count, n, chain + 1), dtype=newer.dtype)  # column i: the command i samples ago
-    through = np.zeros((count, chain + 1), dtype=d.dtype)
+    through = np.zeros((*d.shape, chain + 1), dtype=d.dtype)
     drive[rows, :, whole] = newer
     drive[rows, :, whole + 1] += gamma - newer
-    through[rows, np.where(np.real(rest) > 0.0, whole + 1, whole)] = d  # the output is read before the command changes
+    # The output is read before the command changes.
+    through[rows, ..., np.where(np.real(rest) > 0.0, whole + 1, whole)] = d
     big = np.zeros((count, n + chain, n + chain), dtype=drive.dtype)
     late = np.zeros((count, n + chain), dtype=drive.dtype)
     big[:, :n, :n], big[:, :n, n:] = whole_period, drive[:, :, 1:]
     late[:, :n], late[:, n] = drive[:, :, 0], 1.0
     for i in range(1, chain):
         big[:, n + i, n + i - 1] = 1.0
-    return big, late, np.concatenate([c, through[:, 1:]], axis=1), through[:, 0]
+    return big, late, np.concatenate([c, through[..., 1:]], axis=-1), through[..., 0]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a plant far off may overflow: the loop is then not stable

@@ -10,7 +10,7 @@ typedef struct {
     long n, substeps;          /* samples; steps of the coarse solution in a sample, the fine one takes twice as many */
     double t0, period, late_s; /* after late_s of a sample the current `late` follows that of u */
     const double *p, *c, *lag; /* parameters, the law's numbers, which of the commands are in force */
-    const double *r, *w, *e;   /* n, n, n x NE */
+    const double *r, *w, *e;   /* n, n x NW, n x NE */
     double *x, *z;             /* in and out */
     double *peak, *error, *size; /* NY, NX, NX: largest |y| over all fine steps, |fine - coarse| and |x| */
     double *y, *applied, *states; /* n x NY, n, n x NX */
@@ -53,7 +53,7 @@ static void run(const seaopt_loop_args *a) {
     memcpy(z, a->z, NZ * sizeof *z);
     for (long k = 0; k < a->n; k++) {
         double t = a->t0 + k * a->period;
-        arg[0] = &t; arg[1] = x; arg[2] = z; arg[3] = a->e + k * NE; arg[4] = a->r + k; arg[5] = a->w + k;
+        arg[0] = &t; arg[1] = x; arg[2] = z; arg[3] = a->e + k * NE; arg[4] = a->r + k; arg[5] = a->w + k * NW;
         arg[6] = a->p; arg[7] = a->c; arg[8] = a->lag;
         res[0] = after; res[1] = u; res[2] = newer; res[3] = a->y + k * NY;
         seaopt_sample(arg, res, iw, work, 0);

@@ -275,11 +275,17 @@ def _result(loop: SampledLoop, job: Job, arrays: LoopArrays, error: float, subst
     )
 
 
-def _noise(loop: SampledLoop, params: Sequence[CompletedParameters], n: int, seed: int) -> Rows:
-    std = np.array([loop.sensors.combine_errors(loop.plant, values, loop.measured)[0] for values in params])
+def _noise(
+    loop: SampledLoop, params: Sequence[CompletedParameters], n: int, seed: int
+) -> Float[np.ndarray, "runs n y"]:
+    """Return the noise of every measured output; that of further ones is drawn after the first."""
+    std = np.array([
+        [loop.sensors.combine_errors(loop.plant, values, name)[0] for name in loop.signals] for values in params
+    ])  # fmt: skip
     if not np.any(std):
-        return np.zeros((len(params), n))
-    return std[:, None] * np.random.default_rng(seed).normal(size=n)
+        return np.zeros((len(params), n, len(loop.signals)))
+    rng = np.random.default_rng(seed)
+    return std[:, None, :] * np.column_stack([rng.normal(size=n) for _ in loop.signals])
 
 
 def _external(plant: Plant, signals: Mapping[str, Float[np.ndarray, " n"]], n: int) -> Float[np.ndarray, "n ne"]:

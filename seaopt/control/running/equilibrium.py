@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.laws.realisation import Reading, RunnableLaw
 from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
@@ -93,13 +93,14 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
         if not (np.any(x) or np.any(u)):
             continue
         y = np.array(observe(x, u, values.vector)).ravel()
-        force = float(y[names.index(loop.measured)])
-        inner, reference = _law_at_rest(law, force, float(u[0]), plant, loop.measured)
+        read = y[[names.index(name) for name in loop.signals]]
+        force = float(read[0])
+        inner, reference = _law_at_rest(law, read if law.measured > 1 else force, float(u[0]), plant, loop.regulated)
         z[run] = np.concatenate([inner, np.full(loop.waiting, u[0])])
         figures[run] = reference, force, u[0], y[-1]
     reference, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
-    unit = plant.outputs[loop.measured]
+    unit = plant.outputs[loop.regulated]
     return Equilibrium(
         state=state, reference=reference, force=force, current_A=current, energy_J=energy, unit=unit,
         command=name_input(plant),
@@ -107,12 +108,14 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
 
 
 def _law_at_rest(
-    law: RunnableLaw, force: float, current_A: float, plant: Plant, measured: str
+    law: RunnableLaw, read: Reading, current_A: float, plant: Plant, measured: str
 ) -> tuple[Float[np.ndarray, " n"], float]:
-    """Return the law's state and the reference at which it commands a current, unlimited, under a constant force."""
+    """Return the law's state and the reference at which it commands a current, unlimited, under constant readings."""
     n = law.c.size
     left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
-    right = np.append(-law.b_measurement * force, current_A / law.per_effort + law.d_measurement * force)
+    right = np.append(
+        -np.dot(law.b_measurement, read), current_A / law.per_effort + float(np.dot(law.d_measurement, read))
+    )
     try:
         rest = np.linalg.solve(left, right)
     except np.linalg.LinAlgError:
@@ -120,7 +123,7 @@ def _law_at_rest(
     if not np.all(np.isfinite(rest)):
         raise ControlError(
             f"no reference makes the law command the {show_command(current_A, *name_input(plant))} that rest takes at "
-            f"{force:.4g} {plant.outputs[measured]}; its "
+            f"{float(np.ravel(read)[0]):.4g} {plant.outputs[measured]}; its "
             "reference path is blocked at 0 Hz"
         )
     return rest[:-1], float(rest[-1])

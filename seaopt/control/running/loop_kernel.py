@@ -41,7 +41,7 @@ class Job:
     """
 
     reference: Rows
-    noise: Rows
+    noise: Float[np.ndarray, "runs n y"]
     external: Float[np.ndarray, "n ne"]
     p: Float[np.ndarray, "runs np"]
     lag: Float[np.ndarray, "runs w"]
@@ -92,21 +92,21 @@ def _describe_device(sensors: Sensors, name: str) -> tuple[_Device, list[float]]
 class _Structure:
     """What the functions of a loop depend on besides its plant; all else is data."""
 
-    measured: str
+    measured: tuple[str, ...]
     law_states: int
     waiting: int
     rounds_current: bool
-    device: _Device
+    devices: tuple[_Device, ...]  # one per measured output
     encoders: tuple[tuple[str, _Device], ...]  # with errors, of those that the reading is computed from
     limits_current: bool
     sticks: bool
 
 
 def _structure_of(loop: SampledLoop) -> _Structure:
-    sensors, name = loop.sensors, loop.measured
+    sensors, names = loop.sensors, loop.signals
     return _Structure(
-        measured=name, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
-        device=_describe_device(sensors, name)[0],
+        measured=names, law_states=loop.law.c.size, waiting=loop.waiting, rounds_current=bool(loop.current_step_A),
+        devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
         limits_current=math.isfinite(loop.law.current_limit_A), sticks=loop.sticks,
     )  # fmt: skip
@@ -117,10 +117,11 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 
     `u` holds the current in force at first, `late` is the one after it.
     """
-    n, queue = structure.law_states, structure.waiting
-    z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w")
-    e, devices = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("devices", 3, 1 + len(structure.encoders))
-    c = ca.vertcat(ca.SX.sym("c", n * n + 4 * n + 6), ca.vec(devices))
+    n, queue, measured = structure.law_states, structure.waiting, len(structure.measured)
+    z, r, w = ca.SX.sym("z", n + queue), ca.SX.sym("r"), ca.SX.sym("w", measured)
+    e, devices = ca.SX.sym("e", len(plant.inputs) - 1), ca.SX.sym("devices", 3, measured + len(structure.encoders))
+    numbers = ca.SX.sym("c", n * n + (3 + measured) * n + 5 + measured)
+    c = ca.vertcat(numbers, ca.vec(devices))
     observe = _observe(plant, structure.sticks)
     lag, behind = ca.SX.sym("lag", 2 * (queue + 1)), ca.reshape(z[n:], queue, 1)
     first, second = lag[: queue + 1], lag[queue + 1 :]
@@ -128,19 +129,20 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
     outputs = dict(
         zip(plant.outputs, ca.vertsplit(observe(plant.t, plant.x, ca.vertcat(waiting, e), plant.p)), strict=False)
     )
-    reading = outputs[structure.measured] + w
-    weights = weigh_encoders(plant, structure.measured)
-    for number, (name, encoder) in enumerate(structure.encoders, 1):
-        reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
-    size = n * n
-    a = ca.reshape(c[:size], n, n)
-    b_r, b_y, out, windup = (ca.reshape(c[size + i * n : size + (i + 1) * n], n, 1) for i in range(4))
-    d_r, d_y, limit, gain, step, most = ca.vertsplit(c[size + 4 * n : size + 4 * n + 6])
-    reading = structure.device.read(reading, devices[:, 0])
-    x = ca.reshape(z[:n], n, 1)
-    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - d_y * reading
+    readings: list[Any] = []
+    for column, (signal, device) in enumerate(zip(structure.measured, structure.devices, strict=True)):
+        reading, weights = outputs[signal] + w[column], weigh_encoders(plant, signal)
+        for number, (name, encoder) in enumerate(structure.encoders, measured):
+            if name in weights:
+                reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
+        readings.append(device.read(reading, devices[:, column]))
+    read = ca.vertcat(*readings)
+    sizes = [n * n, n, measured * n, n, n, 1, measured, 1, 1, 1, 1]
+    a, b_r, b_y, out, windup, d_r, d_y, limit, gain, step, most = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
+    a, b_y, x = ca.reshape(a, n, n), ca.reshape(b_y, n, measured), ca.reshape(z[:n], n, 1)
+    force = ca.densify(ca.mtimes(out.T, x)) + d_r * r - ca.dot(d_y, read)
     limited = ca.fmin(ca.fmax(force, -limit), limit) if structure.limits_current else force
-    after = ca.mtimes(a, x) + b_r * r - b_y * reading + windup * (limited - force)
+    after = ca.mtimes(a, x) + b_r * r - ca.mtimes(b_y, read) + windup * (limited - force)
     current = gain * limited
     if structure.rounds_current:
         current = step * ca.floor(current / step + 0.5)
@@ -156,10 +158,12 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
     law = loop.law
     limit, most = (law.force_limit_N, loop.most_A) if math.isfinite(law.current_limit_A) else (0.0, 0.0)
-    numbers = [law.d_reference, law.d_measurement, limit, law.per_effort, loop.current_step_A, most]
-    for name in (loop.measured, *loop.encoders):
+    numbers = [law.d_reference, *np.ravel(law.d_measurement), limit, law.per_effort, loop.current_step_A, most]
+    for name in (*loop.signals, *loop.encoders):
         numbers += _describe_device(loop.sensors, name)[1]
-    return np.concatenate([law.a.ravel("F"), law.b_reference, law.b_measurement, law.c, law.anti_windup, numbers])
+    return np.concatenate(
+        [law.a.ravel("F"), law.b_reference, law.b_measurement.ravel("F"), law.c, law.anti_windup, numbers]
+    )
 
 
 def _observe(plant: Plant, sticks: bool) -> Any:
@@ -207,7 +211,7 @@ def make_kernel(loop: SampledLoop) -> Callable[[Job, int], LoopArrays]:
 
 def _source(plant: Plant, structure: _Structure, sample: ca.Function, advance: ca.Function) -> str:
     constants = {
-        "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1,
+        "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": len(structure.measured),
         "NY": len(channel_names(plant)), "NZ": structure.law_states + structure.waiting, "INSTANT": INSTANT,
     }  # fmt: skip
     template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
@@ -268,13 +272,16 @@ def _run_interpreted(loop: SampledLoop, job: Job, substeps: int, c: Float[np.nda
             np.repeat(constant[:, None], chunk, axis=1)
             for constant in (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
         ]
-        signals = np.vstack([times, job.external.T, job.reference[run], job.noise[run]])
+        signals = np.vstack([times, job.external.T, job.reference[run], job.noise[run].T])
+        split_at = len(signals) - job.noise.shape[2]
         for first in range(0, n, chunk):
             count = min(chunk, n - first)
             piece = signals[:, np.minimum(np.arange(first, first + chunk), n - 1)]  # the last one is filled up
             after, y, applied, states = (
                 np.array(part)[:, :count]
-                for part in chain(state, piece[:1], piece[1:-2], piece[-2:-1], piece[-1:], *shared)
+                for part in chain(
+                    state, piece[:1], piece[1 : split_at - 1], piece[split_at - 1 : split_at], piece[split_at:], *shared
+                )
             )
             rows = slice(first, first + count)
             arrays.y[run, rows], arrays.applied[run, rows], arrays.states[run, rows] = y.T, applied[0], states.T
@@ -301,8 +308,10 @@ def _period_function(
     sample, advance, _ = _kernel(plant, structure)
     sizes = [len(plant.states), structure.law_states + structure.waiting, len(channel_names(plant))]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
-    t, r, w, late_s = (ca.MX.sym(name) for name in ("t", "r", "w", "late_s"))
-    e, p, c, lag = (ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("p", 6), ("c", 7), ("lag", 8)))
+    t, r, late_s = (ca.MX.sym(name) for name in ("t", "r", "late_s"))
+    e, w, p, c, lag = (
+        ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("w", 5), ("p", 6), ("c", 7), ("lag", 8))
+    )
     x, z, peak, error, size = ca.vertsplit(state, np.cumsum([0, *sizes, sizes[0], sizes[0]]).tolist())
     after, u, late, y = sample(t, x, z, e, r, w, p, c, lag)
     newer = ca.vertcat(late, e)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control.laws.realisation import RunnableLaw
+from seaopt.control.loops.sampled_plant import Measured
 from seaopt.errors import SimulationError, suggestion
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick
@@ -30,8 +31,8 @@ class SampledLoop:
         Its first input is what the law commands, the motor current as a rule.
     law : RunnableLaw
         As exported.
-    measured : str
-        The output that is fed back.
+    measured : str or tuple of str
+        The output that is fed back, or the outputs that the law reads, the regulated one first.
     delay_samples : int
         Whole samples from measurement to output, besides the hold.
     sensors : Sensors
@@ -55,7 +56,7 @@ class SampledLoop:
 
     plant: Plant
     law: RunnableLaw
-    measured: str
+    measured: Measured
     delay_samples: int
     sensors: Sensors = field(default_factory=Sensors)
     current_step_A: float = 0.0
@@ -64,10 +65,15 @@ class SampledLoop:
 
     def __post_init__(self) -> None:
         plant = self.plant
-        if self.measured not in plant.outputs:
+        for name in self.signals:
+            if name not in plant.outputs:
+                raise SimulationError(
+                    f'measured = "{name}" is not an output of {plant.name}; ' + suggestion(name, plant.outputs)
+                )
+        if len(self.signals) != self.law.measured:
             raise SimulationError(
-                f'measured = "{self.measured}" is not an output of {plant.name}; '
-                + suggestion(self.measured, plant.outputs)
+                f"measured = {list(self.signals)} are {len(self.signals)} outputs, and the law reads "
+                f"{self.law.measured}; give as many"
             )
         if self.law.gate is not None:
             raise SimulationError("law has a plausibility gate, which this simulation leaves out; use close_loop")
@@ -81,7 +87,7 @@ class SampledLoop:
             if not getattr(self, what) >= 0.0:
                 raise SimulationError(f"{what} = {getattr(self, what):g} is negative; give zero or more")
         for what in ("noise_std", "quantisation", "saturation"):
-            for name in (self.measured, *self.encoders):
+            for name in (*self.signals, *self.encoders):
                 if not getattr(self.sensors, what).get(name, 0.0) >= 0.0:
                     raise SimulationError(f"{what} of {name} is negative; give zero or more")
         if self.current_step_A and not self.most_A:
@@ -90,19 +96,30 @@ class SampledLoop:
                 f"current_step_A = {self.current_step_A:g} is above the limit of {limit}, so that every command but "
                 "zero is; give the amplifier's step"
             )
-        row = plant.output[list(plant.outputs).index(self.measured)]
-        if self.delay_samples == 0 and ca.depends_on(row, plant.u[0]):
-            raise SimulationError(
-                f"{self.measured} of {plant.name} contains the present command, which a law without delay sets from "
-                "it; give delay_samples = 1 or more, or measure another output"
-            )
+        for name in self.signals if self.delay_samples == 0 else ():
+            if ca.depends_on(plant.output[list(plant.outputs).index(name)], plant.u[0]):
+                raise SimulationError(
+                    f"{name} of {plant.name} contains the present command, which a law without delay sets from "
+                    "it; give delay_samples = 1 or more, or measure another output"
+                )
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The outputs that the law reads, the regulated one first."""
+        return (self.measured,) if isinstance(self.measured, str) else self.measured
+
+    @property
+    def regulated(self) -> str:
+        """The first of them."""
+        return self.signals[0]
 
     @property
     def encoders(self) -> tuple[str, ...]:
-        """The encoders that the measured output is computed from and that have an offset, a range or a step."""
+        """The encoders that the measured outputs are computed from and that have an offset, a range or a step."""
         sensors = self.sensors
         erring = {*sensors.offset, *sensors.saturation, *sensors.quantisation} & self.plant.outputs.keys()
-        return tuple(name for name in weigh_encoders(self.plant, self.measured) if name in erring)
+        used = [name for signal in self.signals for name in weigh_encoders(self.plant, signal) if name in erring]
+        return tuple(dict.fromkeys(used))
 
     @property
     def waiting(self) -> int:

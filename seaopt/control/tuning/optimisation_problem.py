@@ -161,7 +161,7 @@ class Task:
 
     The first is the design plant, whose port must be passive; of two `design_states` it is the sliding one, and the
     second plant is the same one stuck by its friction. `frictions` are those of which a friction margin is asked, and
-    those that friction which falls with speed makes grow.
+    those that friction which falls with speed makes grow; `signals` are the outputs that the law reads.
     """
 
     spec: ControllerSpec
@@ -172,6 +172,7 @@ class Task:
     port: PortModel | None = None
     design_states: int = 1
     frictions: tuple[PlantWithFriction, ...] = ()
+    signals: tuple[str, ...] = ()
 
     @property
     def asks_margin(self) -> bool:

@@ -40,7 +40,7 @@ from seaopt.control.loops.measured.figures import measure_all_discs
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
-from seaopt.control.loops.sampled_plant import DigitalPlant, sample
+from seaopt.control.loops.sampled_plant import DigitalPlant, find_signals, list_names, sample
 from seaopt.control.tuning.falling_friction import find_largest_fall
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.optimisation_problem import (
@@ -134,6 +134,10 @@ def tune(
     model = name_design(plant)
     if spec.structure == CUSTOM:
         raise ControlError('structure = "custom" is of a law that is given, which nothing tunes; use seaopt.assess')
+    if not isinstance(spec.measured, str):
+        raise ControlError(
+            f'measured = {list(spec.measured)}: structure = "{spec.structure}" feeds back one output; name one'
+        )
     spec = settle_delay(spec, model, params)
     params = params.parameters if isinstance(params, Fit) else params
     values = model.complete(params)
@@ -142,7 +146,7 @@ def tune(
     task = make_task(plant, values, spec, robust_to or {}, draws)
     if isinstance(task.plants[0], DigitalPlant):
         check_delay(spec, task.plants[0])
-    command = command_of(model, values, spec.measured)
+    command = command_of(model, values, spec.regulated)
     check_current(spec, task.k_ff, command, {} if model is not plant else find_dry_friction(model, values))
     solving, seeking, again = divide(progress, SOLUTION * (8.0 if task.asks_margin else 1.0), BANDWIDTHS, SOLUTION)
     x, loops = solve(task, progress=solving)
@@ -207,8 +211,8 @@ def make_task(
     """
     design = name_design(plant)
     values = design.complete(params)
-    command = command_of(design, values, spec.measured)
-    gain = command.per_effort
+    command = command_of(design, values, spec.regulated)
+    gain, signals = command.per_effort, find_signals(design, spec.measured)
     if not isinstance(robust_to, Mapping):
         raise ControlError(f"robust_to is a {type(robust_to).__name__}; give a mapping of name to plant")
     require_type(draws, Sequence, "draws", "give a sequence of mappings of parameter to value", ControlError)
@@ -243,25 +247,27 @@ def make_task(
     pairs = [*models.items(), *_draw_plants(models, draws)]
     plants = (
         *first.values(),
-        *(sample(model, values, spec.measured, gain, spec.sample_time_s, spec.loop_delay_samples)
+        *(sample(model, values, signals, gain, spec.sample_time_s, spec.loop_delay_samples)
           for _, (model, values) in pairs),
         *seen.values(),
     )  # fmt: skip
     static = plants[0].static_gain
     if not np.isfinite(static) or abs(static) < 1e-6:
         raise ControlError(
-            f"measured = {spec.measured}: the static gain of {design.name} from what the motor gives is {static:g}, "
+            f"measured = {spec.regulated}: the static gain of {design.name} from what the motor gives is {static:g}, "
             "which feedforward cannot invert; tune on the stand and name this plant in robust_to"
         )
     names = (*first, *(name for name, _ in pairs), *seen)
     nominal = port = None
     if isinstance(plants[0], DigitalPlant):
         nominal = Nominal.of(plants[0]) if spec.structure == "pid_dob" else None
-        port = None if spec.passive_band_hz is None else port_of(pairs[0][1][0], values, spec.measured, gain)
+        port = None if spec.passive_band_hz is None else port_of(pairs[0][1][0], values, signals, gain)
+    frictions = _find_friction(
+        spec, signals, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)
+    )  # fmt: skip
     return Task(
         spec=spec, plants=plants, names=names, k_ff=1.0 / static, nominal=nominal, port=port,
-        design_states=design_states,
-        frictions=_find_friction(spec, [pair for _, pair in pairs], plants[len(first) :], whole, gain, len(first)),
+        design_states=design_states, signals=signals, frictions=frictions,
     )  # fmt: skip
 
 
@@ -280,20 +286,20 @@ def _check_measured_design(spec: ControllerSpec) -> None:
 
 
 def _find_friction(
-    spec: ControllerSpec, pairs: Sequence[tuple[Plant, CompletedParameters]],
+    spec: ControllerSpec, signals: tuple[str, ...], pairs: Sequence[tuple[Plant, CompletedParameters]],
     plants: Sequence[DigitalPlant | MeasuredPlant], whole: Mapping[Plant, Plant], gain: float, before: int,
 ) -> tuple[PlantWithFriction, ...]:  # fmt: skip
     """Return the plants of which a friction margin is asked, and those that grow as they slide.
 
     Of those that slide, `whole` is the one with friction; in the task, `before` plants precede these.
     """
-    slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s)
+    slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s, len(signals))
     found: list[PlantWithFriction] = []
     for number, (model, values) in enumerate(pairs):
         if model not in whole or (slope is None and not count_growing(plants[number])):
             continue
         plant = whole[model]
-        (loop,) = make_friction_loops(plant, [values], spec.measured, gain, spec.loop_delay_samples, open_law)
+        (loop,) = make_friction_loops(plant, [values], signals, gain, spec.loop_delay_samples, open_law)
         if loop is None:
             continue
         if slope is not None and loop.obstacle:
@@ -358,7 +364,7 @@ def describe_law(
         sample_time_s=spec.sample_time_s,
         delay_samples=spec.loop_delay_samples,
         law=law,
-        command=command_of(name_design(plant), params, spec.measured),
+        command=command_of(name_design(plant), params, spec.regulated),
         spec=spec,
         achieved=loops[0].figures,
         feasible=not broken,
@@ -369,6 +375,7 @@ def describe_law(
         blocked_by=tuple(explain_broken(spec, verdicts, loops[0], close_plant(task.plants[0], law))),
         possible=None if not broken else possible,
         measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
+        reads=() if task.signals == list_names(spec.measured) else task.signals,
     )
     if isinstance(plant, MeasuredResponse):
         return controller

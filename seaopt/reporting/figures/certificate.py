@@ -187,7 +187,7 @@ def impedance_panel(controller: Controller) -> Panel:
     if controller.design is None:
         raise ControlError("the controller does not know its design plant; read it with Controller.from_dict")
     plant, values = controller.design
-    port = port_of(take_sliding(plant, values), values, controller.spec.measured, controller.command.per_effort)
+    port = port_of(take_sliding(plant, values), values, controller.signals, controller.command.per_effort)
     period = controller.sample_time_s
 
     def draw(axes: Sequence[Axes]) -> None:
@@ -195,8 +195,8 @@ def impedance_panel(controller: Controller) -> Panel:
 
         upper, lower = axes
         f = np.geomspace(LOWEST_HZ, 0.499 / period, PORT_POINTS)
-        law = controller.law.measurement_response(f) * hold_response(f, period, controller.delay_samples)
-        open_port, closed = port.response(f).impedance(np.zeros(f.size, dtype=complex)), port.response(f).impedance(law)
+        law = controller.law.feedback_responses(f) * hold_response(f, period, controller.delay_samples)
+        open_port, closed = port.response(f).impedance(0.0 * law), port.response(f).impedance(law)
         for z, colour, style, label in ((open_port, MEASURED, "--", "no control"), (closed, BLUE, "-", "controlled")):
             upper.plot(f, np.abs(z), color=colour, linestyle=style, linewidth=1.3, label=label)
             lower.plot(f, np.real(z) / np.abs(z), color=colour, linestyle=style, linewidth=1.3, label=label)

@@ -96,7 +96,7 @@ def step_panel(
         settled = _settling(step_response(first, most)[0]) * period if _is_stable(first) else 0.0
         duration_s = min(max(least, SPARE * settled), MOST_S)
     samples = max(round(duration_s / period), 2)
-    command, measured = controller.command, controller.spec.measured
+    command, measured = controller.command, controller.spec.regulated
 
     def draw(axes: Sequence[Axes]) -> None:
         from seaopt.reporting.figures.canvas import LIMIT
@@ -281,8 +281,8 @@ def tracking_panel(controller: Controller, plants: Plants | None = None) -> Pane
 
     return _magnitude_panel(
         controller, plants, lambda loop, f: loop.tracking(f), "tracking", "Tracking",
-        f"|{spec.measured}/reference| [dB]",
-        f"{spec.measured} over its reference; the bandwidth is where it has fallen by 3 dB.", lines,
+        f"|{spec.regulated}/reference| [dB]",
+        f"{spec.regulated} over its reference; the bandwidth is where it has fallen by 3 dB.", lines,
     )  # fmt: skip
 
 
@@ -296,7 +296,7 @@ def noise_panel(controller: Controller, plants: Plants | None = None) -> Panel:
 
     return _magnitude_panel(
         controller, plants, lambda loop, f: loop.noise(f), "noise", "Noise gain", f"|C_y S| [{unit}]",
-        f"Motor {controller.command.mechanics.word} that noise on {controller.spec.measured} makes, per unit of noise.",
+        f"Motor {controller.command.mechanics.word} that noise on {controller.signals[0]} makes, per unit of noise.",
         lines, decibels=False,
     )  # fmt: skip
 

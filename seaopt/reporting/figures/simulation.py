@@ -37,7 +37,7 @@ def simulation_panel(verification: Verification, row: Outcome) -> Panel:
     it is judged in.
     """
     controller = verification.stages[row.plant].controller
-    name, limit = controller.spec.measured, controller.command_limit
+    name, limit = controller.spec.regulated, controller.command_limit
     trace = verification.replay(row)
     visible = trace.time <= (_visible_until(trace) if row.passed else trace.time[-1])
     time = trace.time[visible]

@@ -10,12 +10,14 @@ then no difference of large products. A basis does not change a transfer functio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.drift import leave_out_drift
-from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.control.loops.sampled_plant import DELAY, find_rows
 from seaopt.plants import Plant, jacobians
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
@@ -31,25 +33,27 @@ DEGREES = (6, 6, 6, 6, 6, 5, 4)  # of the models, by the number of coordinates; 
 
 @record(eq=False)
 class ImpulseTransfer:
-    """P(z) = (head + tail / z) / (z^whole denominator), coefficients in ascending powers of w = z - 1.
+    """P_i(z) = (head_i + tail_i / z) / (z^whole denominator), coefficients in ascending powers of w = z - 1.
 
     Parameters
     ----------
-    head, tail, denominator : Taylor
-        Shapes (b, n + 1); the denominator is monic.
+    heads, tails : tuple of Taylor
+        Of each measured output, shapes (b, n + 1).
+    denominator : Taylor
+        Shape (b, n + 1), monic.
     whole : array
         Whole samples of the plant's own delay, shape (b,).
 
     """
 
-    head: Taylor
-    tail: Taylor
+    heads: tuple[Taylor, ...]
+    tails: tuple[Taylor, ...]
     denominator: Taylor
     whole: Int[np.ndarray, " b"]
 
 
 def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> ImpulseTransfer:
-    """Return the sampled plant over boxes, from motor force to the measured output.
+    """Return the sampled plant over boxes, from motor force to every measured output.
 
     Raises
     ------
@@ -57,7 +61,7 @@ def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: B
         The plant's equations have an instruction without an enclosure, or cannot rest at a box's centre.
 
     """
-    plant = leave_out_drift(freeze_heat(plant), controller.spec.measured)
+    plant = leave_out_drift(freeze_heat(plant), controller.signals)
     degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
     uncertain = within.enclose(boxes, degree)
     count, over = boxes.centre.shape[0], build_basis(within.size, degree)
@@ -73,22 +77,26 @@ def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: B
     x, u = enclose_equilibrium(plant, p, conditions, count, over)
     n, outputs = len(plant.states), len(plant.outputs)
     blocks = enclose(jacobians(plant), [x, u, p])
-    row = list(plant.outputs).index(controller.spec.measured)
+    measured = find_rows(plant, controller.signals)
     a, b, c, d = (
         assemble_matrix(block, rows, count, over) for block, rows in zip(blocks, (n, n, outputs, outputs), strict=True)
     )
     gain = controller.command.per_effort
-    return _sample(
-        a, b[:, :, :1] * gain, c[:, row : row + 1], d[:, row : row + 1, :1] * gain, controller.sample_time_s, delay
-    )
+    read = [(c[:, row : row + 1], d[:, row : row + 1, :1] * gain) for row in measured]
+    return _sample(a, b[:, :, :1] * gain, read, controller.sample_time_s, delay)
 
 
-def _sample(a: Taylor, b: Taylor, c: Taylor, d: Taylor, period: float, delay: Entry) -> ImpulseTransfer:
-    """Return the plant behind a zero-order hold and a delay, whose part of a sample splits the command in two."""
+def _sample(
+    a: Taylor, b: Taylor, read: Sequence[tuple[Taylor, Taylor]], period: float, delay: Entry
+) -> ImpulseTransfer:
+    """Return the plant behind a zero-order hold and a delay, whose part of a sample splits the command in two.
+
+    `read` are c and d of each measured output.
+    """
     count, n = a.c.shape[0], a.c.shape[1]
     over = a.basis
     left, right = _compute_bases(a.c)
-    a, b, c = a.transform(left, right), b.transform(left, np.eye(1)), c.transform(np.eye(1), right)
+    a, b = a.transform(left, right), b.transform(left, np.eye(1))
     one = make_constant(np.broadcast_to(np.eye(n), a.c.shape).copy(), over)
     x, series = _sum_series(a * period, one)
     f, gamma = x @ series, series @ b * period
@@ -101,11 +109,16 @@ def _sample(a: Taylor, b: Taylor, c: Taylor, d: Taylor, period: float, delay: En
     if split:
         remaining = (period - fraction)[:, None, None]
         newer = (_sum_series(a * remaining, one)[1] @ b) * remaining
-    denominator, (head, tail) = _expand_polynomials(f, c, [newer, gamma - newer] if split else [newer, newer * 0.0])
-    through = denominator * d[:, 0]
     late_through = (fraction.c > least)[:, None]  # the output is read before the command changes
-    head, tail = head + mask_models(through, ~late_through), tail + mask_models(through, late_through)
-    return ImpulseTransfer(head=head, tail=tail, denominator=denominator, whole=whole)
+    heads, tails, denominator = list[Taylor](), list[Taylor](), None
+    for c, d in read:
+        drives = [newer, gamma - newer] if split else [newer, newer * 0.0]
+        denominator, (head, tail) = _expand_polynomials(f, c.transform(np.eye(1), right), drives)
+        through = denominator * d[:, 0]
+        heads.append(head + mask_models(through, ~late_through))
+        tails.append(tail + mask_models(through, late_through))
+    assert denominator is not None, "a law measures something"
+    return ImpulseTransfer(heads=tuple(heads), tails=tuple(tails), denominator=denominator, whole=whole)
 
 
 def _sum_series(x: Taylor, one: Taylor) -> tuple[Taylor, Taylor]:

@@ -2,9 +2,10 @@ r"""Bounds on abs(S) and abs(T) over boxes of parameters times arcs of the unit 
 
 Over a box and an arc, :math:`z = e^{i(\theta_0 + \delta e_\theta)}`, numerator and denominator of
 
-.. math:: S = \frac{N}{D}, \qquad N = d_c(z)\, \phi, \quad D = d_c(z)\, \phi + n_c(z)\, z^{-d} \nu,
+.. math:: S = \frac{N}{D}, \qquad N = d_c(z)\, \phi, \quad D = d_c(z)\, \phi + \sum_i n_{ci}(z)\, z^{-d} \nu_i,
 
-with the law :math:`n_c / d_c` (both in powers of :math:`1 - 1/z`) and the plant :math:`\nu / \phi`, are Taylor models.
+with the law :math:`n_{ci} / d_c` (all in powers of :math:`1 - 1/z`) and the plant :math:`\nu_i / \phi` of each measured
+signal, are Taylor models.
 Their quotient :math:`S_2` to second order is exact up to :math:`(N - S_2 D) / D`, which is of third order. If D cannot
 be zero there, the loop has no pole on the arc for any parameters of the box.
 """
@@ -123,13 +124,14 @@ class ArcModel:
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # where D may be zero, which `_divide` handles
 def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, ball: int, arcs: Arcs) -> ArcBounds:
     """Return bounds on the arcs; `ball` coordinates of a box count only where they are in the unit ball."""
-    (num, den), box = _expand_law(controller.law), arcs.box
+    (nums, den), box = _expand_law(controller.law), arcs.box
     below = _expand_powers(den, np.zeros(box.size, dtype=int), arcs, plant.denominator.c.shape[1])
     delay = controller.delay_samples + plant.whole[box]
-    above = _expand_powers(num, delay, arcs, below.shape[1])
-    older = _expand_powers(num, delay + 1, arcs, below.shape[1])
     open_loop = (_pack(plant.denominator, box), below)
-    parts = [open_loop, (_pack(plant.head, box), above), (_pack(plant.tail, box), older)]
+    parts = [open_loop]
+    for num, head, tail in zip(nums, plant.heads, plant.tails, strict=True):
+        parts.append((_pack(head, box), _expand_powers(num, delay, arcs, below.shape[1])))
+        parts.append((_pack(tail, box), _expand_powers(num, delay + 1, arcs, below.shape[1])))
     n, d = _sum_models([open_loop]), _sum_models(parts)
     s = _divide(n, d)
     t = ArcModel(c=1.0 - s.c, g=-s.g, h=-s.h, r=s.r)
@@ -148,7 +150,9 @@ def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, bal
 
 def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.ndarray, " b"]:
     """Tell which boxes' D keeps its degree: 1 + d d_c is not zero without delay, and no pole comes from infinity."""
-    last = plant.head[:, -1] * -float(controller.law.d[1])
+    last = plant.heads[0][:, -1] * -float(controller.law.d[1])
+    for head, d_c in zip(plant.heads[1:], controller.law.d[2:], strict=True):
+        last = last + head[:, -1] * -float(d_c)
     return (controller.delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
 
 
@@ -165,8 +169,8 @@ def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
     return np.moveaxis(np.concatenate([model.a[: 1 + k], h]), 0, 1)[box], remainder[box]
 
 
-def _expand_law(law: Law) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return numerator and denominator of C_y in ascending powers of 1 - 1/z.
+def _expand_law(law: Law) -> tuple[list[Float[np.ndarray, " m"]], Float[np.ndarray, " m"]]:
+    """Return the numerator of every C_y, and their denominator, in ascending powers of 1 - 1/z.
 
     In these, as in w, nothing cancels near z = 1, where the law's slow poles and its integrators lie.
     """
@@ -180,14 +184,16 @@ def _expand_law(law: Law) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " 
     def multiply(*factors: np.ndarray) -> np.ndarray:
         return functools.reduce(np.convolve, factors, np.ones(1))
 
-    slow = characteristic(a)
-    drive = b[:, 1]
-    scale = max(float(np.linalg.norm(drive) * np.linalg.norm(c)), 1e-300)
-    moved = (characteristic(a - np.outer(drive / scale, c)) - slow) * scale
-    num = multiply(*[delta] * m, moved + law.d[1] * slow)
-    for j, gain in enumerate(law.b[:m, 1], start=1):
-        num = num + gain * multiply(*[q] * j, *[delta] * (m - j), slow)
-    return -num, multiply(*[delta] * m, slow)
+    slow, nums = characteristic(a), list[np.ndarray]()
+    for column in range(1, law.d.size):
+        drive = b[:, column]
+        scale = max(float(np.linalg.norm(drive) * np.linalg.norm(c)), 1e-300)
+        moved = (characteristic(a - np.outer(drive / scale, c)) - slow) * scale
+        num = multiply(*[delta] * m, moved + law.d[column] * slow)
+        for j, gain in enumerate(law.b[:m, column], start=1):
+            num = num + gain * multiply(*[q] * j, *[delta] * (m - j), slow)
+        nums.append(-num)
+    return nums, multiply(*[delta] * m, slow)
 
 
 def _expand_powers(

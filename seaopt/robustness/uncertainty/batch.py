@@ -92,7 +92,7 @@ def batch_figures(
             at = {name: column[block] for name, column in extra.items()}
             none = np.zeros(block.stop - block.start)
             delays = at.get(DELAY, none) if chain else none
-            continuous = linearise(plant, values[:, block], at, controller.spec.measured, controller.command.per_effort)
+            continuous = linearise(plant, values[:, block], at, controller.signals, controller.command.per_effort)
             pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, none.size, CURVE_BLOCK)]
             parts += pool.map(
                 lambda piece, matrices=continuous, delay=delays: _close_piece(
@@ -160,8 +160,8 @@ def _close_piece(
 ) -> tuple[Float[np.ndarray, " k"], ...]:
     """Return spectral radius, Ms and Mt of some draws."""
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
-    count = d.size
-    whole = np.concatenate([a.reshape(count, -1), b, c, d[:, None]], axis=1)
+    count = len(d)
+    whole = np.concatenate([matrix.reshape(count, -1) for matrix in (a, b, c, d)], axis=1)
     finite = np.max(np.abs(whole), axis=1) < LARGEST_ENTRY  # not so of nan
     a, b, c, d = (np.where(finite.reshape(-1, *(1,) * (m.ndim - 1)), m, 0.0) for m in (a, b, c, d))
     loops = compute_products(controller, a, b, c, d)
@@ -174,30 +174,31 @@ def _close_piece(
 
 
 def compute_products(
-    controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n x"],
-    d: Float[np.ndarray, " n"],
+    controller: Controller, a: Float[np.ndarray, "n x x"], b: Float[np.ndarray, "n x"], c: Float[np.ndarray, "n y x"],
+    d: Float[np.ndarray, "n y"],
 ) -> Products:  # fmt: skip
     """Return S of every plant behind its hold, from the eigenvalues of the open and of the closed loop."""
     law = controller.law
-    ac, bc, cc, dc = law.a, -law.b[:, 1], law.c, -law.d[1]
+    ac, bc, cc, dc = law.a, -law.b[:, 1:], law.c, -law.d[1:]
     count, nx, k = a.shape[0], a.shape[1], controller.delay_samples
     n, m = nx + k, cc.size
-    plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
-    plant[:, :nx, :nx], sense[:, :nx] = a, c
+    plant, drive, sense = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, dc.size, n))
+    plant[:, :nx, :nx], sense[:, :, :nx] = a, c
     through = d
     if k:
-        plant[:, :nx, n - 1], sense[:, n - 1], drive[:, nx] = b, d, 1.0
+        plant[:, :nx, n - 1], sense[:, :, n - 1], drive[:, nx] = b, d, 1.0
         for i in range(1, k):
             plant[:, nx + i, nx + i - 1] = 1.0
-        through = np.zeros(count)
+        through = np.zeros_like(d)
     else:
         drive = b
-    scale = 1.0 / (1.0 + through * dc)
+    scale = 1.0 / (1.0 + through @ dc)
+    at_once = scale[:, None] * np.einsum("y,nyx->nx", dc, sense)  # what the law makes of the plant's state at once
     closed = np.zeros((count, n + m, n + m))
-    closed[:, :n, :n] = plant - (dc * scale)[:, None, None] * drive[:, :, None] * sense[:, None, :]
+    closed[:, :n, :n] = plant - drive[:, :, None] * at_once[:, None, :]
     closed[:, :n, n:] = scale[:, None, None] * drive[:, :, None] * cc
-    closed[:, n:, :n] = -scale[:, None, None] * bc[:, None] * sense[:, None, :]
-    closed[:, n:, n:] = ac - (scale * through)[:, None, None] * np.outer(bc, cc)
+    closed[:, n:, :n] = -bc @ (sense - through[:, :, None] * at_once[:, None, :])
+    closed[:, n:, n:] = ac - scale[:, None, None] * (through @ bc.T)[:, :, None] * cc
     fixed = np.concatenate([law.poles, np.zeros(k)])
     opened = np.concatenate([np.linalg.eigvals(a), np.broadcast_to(fixed, (count, m + k))], axis=1)
     return Products(opened=opened.astype(complex), closed=np.linalg.eigvals(closed).astype(complex), scale=scale)

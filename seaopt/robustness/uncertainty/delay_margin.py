@@ -122,7 +122,7 @@ def sampled_delay_margin(controller: Controller, plant: Plant, params: Parameter
     """
     period = controller.sample_time_s
     sliding, effort = take_sliding(plant, params), controller.command.per_effort
-    linear, before = linearise_sets(sliding, [sliding.complete(params)], controller.spec.measured, effort)
+    linear, before = linearise_sets(sliding, [sliding.complete(params)], controller.signals, effort)
 
     @cache
     def delay_loop(part: float) -> _DelayedLoop:

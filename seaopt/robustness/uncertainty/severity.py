@@ -42,12 +42,12 @@ class _SampledPlants:
 
     a: Float[np.ndarray, "n m m"]
     b: Float[np.ndarray, "n m"]
-    c: Float[np.ndarray, "n m"]
-    d: Float[np.ndarray, " n"]
+    c: Float[np.ndarray, "n y m"]
+    d: Float[np.ndarray, "n y"]
     da: Float[np.ndarray, "n k m m"]
     db: Float[np.ndarray, "n k m"]
-    dc: Float[np.ndarray, "n k m"]
-    dd: Float[np.ndarray, "n k"]
+    dc: Float[np.ndarray, "n k y m"]
+    dd: Float[np.ndarray, "n k y"]
 
     def take(self, index: Int[np.ndarray, " r"]) -> _SampledPlants:
         return _SampledPlants(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
@@ -125,9 +125,9 @@ def _sample_plants(
     p, at = expand_draws(plant, unknown.nominal, unknown.values(repeated))
     dp = np.stack([slopes.get(name, np.zeros(points.shape)).ravel() for name in plant.parameters])
     dat = {name: slopes.get(name, np.zeros(points.shape)).ravel() for name in at}
-    spec, none = controller.spec, np.zeros(count * width)
+    none = np.zeros(count * width)
     matrices, derivatives = differentiate_linearisation(
-        plant, p, at, dp, dat, spec.measured, controller.command.per_effort
+        plant, p, at, dp, dat, controller.signals, controller.command.per_effort
     )
     a, b, c, d = (value + 1j * COMPLEX_STEP * slope for value, slope in zip(matrices, derivatives, strict=True))
     late = at.get(DELAY, none) + 1j * COMPLEX_STEP * dat.get(DELAY, none)
@@ -169,9 +169,11 @@ def _loop_slopes(
     controller: Controller, sampled: _SampledPlants, z: Complex[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "n k"]:
     """Return the derivatives of L, at one point per plant."""
+    law = -controller.law.evaluate(z - 1.0)[1:] * z**-controller.delay_samples  # (y, n)
     inner = z[:, None, None] * np.eye(sampled.b.shape[1]) - sampled.a
     right = np.linalg.solve(inner, sampled.b[:, :, None].astype(complex))[:, :, 0]
-    left = np.linalg.solve(np.swapaxes(inner, 1, 2), sampled.c[:, :, None].astype(complex))[:, :, 0]
+    fed_back = np.einsum("yn,nyi->ni", law, sampled.c)
+    left = np.linalg.solve(np.swapaxes(inner, 1, 2), fed_back[:, :, None])[:, :, 0]
     driven = np.einsum("nkij,nj->nki", sampled.da, right) + sampled.db
-    of_plant = np.einsum("ni,nki->nk", left, driven) + np.einsum("nki,ni->nk", sampled.dc, right) + sampled.dd
-    return of_plant * (-controller.law.evaluate(z - 1.0)[1] * z**-controller.delay_samples)[:, None]
+    read = np.einsum("nkyi,ni->nky", sampled.dc, right) + sampled.dd
+    return np.einsum("ni,nki->nk", left, driven) + np.einsum("yn,nky->nk", law, read)

@@ -49,18 +49,19 @@ def predict_gain(
     """
     values = plant.complete(params)
     loop = controller.close(take_sliding(plant, values), values)
-    p, s = loop.plant.response(f), loop.sensitivity(f)
-    c_y, c_r = loop.open_loop(f) / p, loop.tracking(f) / (p * s)
+    p, open_loop = loop.plant.response(f), loop.open_loop(f)
+    c_y, c_r = loop.law.feedback_responses(f), loop.law.reference_response(f)
     limit = controller.command_limit
     most = np.inf if limit is None else limit / controller.command.per_effort
     friction = _Friction.of(controller, plant, values, f)
     gains = SATURATION_GAINS if limit is not None else SATURATION_GAINS[:1]
     sigma = gains[:, None, None]
-    closed = 1.0 / (1.0 + sigma * p * c_y)  # (s, 1, f)
+    closed = 1.0 / (1.0 + sigma * open_loop)  # (s, 1, f)
     a = amplitude[None, :, None]
-    w = friction.effort(sigma, closed, c_r, c_y, a)  # (s, a, f)
-    asked = closed * (c_r * a - c_y * friction.on_output * w)
-    force = p * sigma * asked + friction.on_output * w
+    fed_back = np.sum(c_y * friction.on_outputs, axis=0)  # of a unit of friction
+    w = friction.effort(sigma, closed, c_r, fed_back, a)  # (s, a, f)
+    asked = closed * (c_r * a - fed_back * w)
+    force = p * sigma * asked + friction.on_outputs[0] * w
     share = np.minimum(most / np.maximum(np.abs(asked), 1e-300), 1.0)
     met = 2.0 / np.pi * (np.arcsin(share) + share * np.sqrt(1.0 - share**2))
     first = np.argmax(met >= sigma, axis=0)  # from no saturation downwards
@@ -71,32 +72,33 @@ class _Friction:
     """The friction of a plant as a port of its loop, at frequencies; none where nothing changes with the velocity."""
 
     def __init__(
-        self, on_output: Complex[np.ndarray, " f"], mobility: Complex[np.ndarray, " f"],
+        self, on_outputs: Complex[np.ndarray, "y f"], mobility: Complex[np.ndarray, " f"],
         by_motor: Complex[np.ndarray, " f"], gains: Float[np.ndarray, " v"],
     ) -> None:  # fmt: skip
-        self.on_output, self.mobility, self.by_motor, self.gains = on_output, mobility, by_motor, gains
+        self.on_outputs, self.mobility, self.by_motor, self.gains = on_outputs, mobility, by_motor, gains
 
     @classmethod
     def of(cls, controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"]) -> _Friction:
         (loop,) = take_friction_out(controller, plant, [params])
         nothing = np.zeros(f.size, dtype=complex)
         if loop is None or loop.only_port is None:
-            return cls(nothing, nothing, nothing, np.zeros(AMPLITUDES.size))
-        port = loop.only_port
-        rows = np.vstack([loop.velocity[port], loop.measured])
-        opened = loop.respond(2 * np.pi * f * loop.plant.sample_time_s, FUNDAMENTAL, rows)
-        mobility, on_output = opened.by_friction[:, 0, :, port].T
+            return cls(nothing[None], nothing, nothing, np.zeros(AMPLITUDES.size))
+        port, (rows, through) = loop.only_port, loop.sensed
+        seen = np.vstack([loop.velocity[port], rows])
+        opened = loop.respond(2 * np.pi * f * loop.plant.sample_time_s, FUNDAMENTAL, seen)
+        mobility, *on_outputs = opened.by_friction[:, 0, :, port].T
         return cls(
-            on_output=on_output + loop.through[port], mobility=mobility, by_motor=opened.by_motor[:, 0, 0],
+            on_outputs=np.array(on_outputs) + through[:, port, None], mobility=mobility,
+            by_motor=opened.by_motor[:, 0, 0],
             gains=describe_friction(plant, params, list(plant.friction)[port], AMPLITUDES),
         )  # fmt: skip
 
     def effort(
         self, sigma: Float[np.ndarray, "s 1 1"], closed: Complex[np.ndarray, "s 1 f"], c_r: Complex[np.ndarray, " f"],
-        c_y: Complex[np.ndarray, " f"], amplitude: Float[np.ndarray, "1 a 1"],
+        fed_back: Complex[np.ndarray, " f"], amplitude: Float[np.ndarray, "1 a 1"],
     ) -> Complex[np.ndarray, "s a f"]:  # fmt: skip
-        """Return the fundamental of the friction's effort on the plant."""
-        h = self.mobility - self.by_motor * sigma * closed * c_y * self.on_output
+        """Return the fundamental of the friction's effort on the plant; `fed_back` is the law's of a unit of it."""
+        h = self.mobility - self.by_motor * sigma * closed * fed_back
         t = self.by_motor * sigma * closed * c_r
         if not np.any(self.gains):
             return np.zeros(np.broadcast_shapes(t.shape, amplitude.shape), dtype=complex)

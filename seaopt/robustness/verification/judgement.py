@@ -166,7 +166,7 @@ def judge_run(
     view = linearise_last_phase(stage, scenario, sets[run])
     if view.instability:
         findings.add("unstable", view.instability)
-    measured = stage.controller.spec.measured
+    measured = stage.controller.spec.regulated
     force, current = trace.outputs[measured][run], trace.current[run]
     _judge_extremes(stage, scenario, trace, run, findings)
     _judge_rest(stage, trace, run, sets[run], findings)
@@ -190,7 +190,7 @@ def judge_run(
 
 def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int, findings: _Findings) -> None:
     controller, plant = stage.controller, stage.plant
-    force = float(trace.peaks[controller.spec.measured][run])
+    force = float(trace.peaks[controller.spec.regulated][run])
     angles = [float(trace.peaks[name][run]) for name, unit in plant.outputs.items() if unit == "rad"]
     current, limit = np.abs(trace.current[run]), controller.command_limit
     most = largest_current(math.inf if limit is None else limit, stage.current_step_A)
@@ -211,7 +211,7 @@ def _judge_extremes(stage: Stage, scenario: Scenario, trace: Playback, run: int,
             f"{controller.command.show(most)}",
         )
     for what, value, allowed, unit in (
-        (controller.spec.measured, force, scenario.max_force_N, controller.command.reference_unit),
+        (controller.spec.regulated, force, scenario.max_force_N, controller.command.reference_unit),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
         if allowed is not None and not value <= allowed:
@@ -240,7 +240,7 @@ def _judge_growth(stage: Stage, scenario: Scenario, trace: Playback, run: int, f
         base = 0.0 if trace.rest is None or not scenario.about_rest else trace.rest.energy_J[run]
         level, what = trace.outputs[ENERGY][run] - base, "the energy"
     else:
-        name = stage.controller.spec.measured
+        name = stage.controller.spec.regulated
         with np.errstate(over="ignore"):
             level = _error(scenario, trace, run, trace.outputs[name][run]) ** 2
         what = f"the square of the error of {name}"
@@ -259,7 +259,7 @@ def _judge_outbreak(
     """Check that noise does not set off a growing force error."""
     if twin is trace:
         return
-    name = stage.controller.spec.measured
+    name = stage.controller.spec.regulated
     off, alone = (np.abs(_error(scenario, one, run, one.outputs[name][run])) for one in (trace, twin))
     half = trace.last.stop - (trace.last.stop - trace.last.start) // 2
     before, after = max(float(np.max(off[:half])), float(np.max(alone))), float(np.max(off[half:]))
@@ -287,7 +287,7 @@ def _judge_oscillation(
             floor = max(floor, VISIBLE * abs(scenario.phases[-1].force_N))
         if not view.instability:
             floor = max(floor, LINE_SIGMAS * view.force_std(lowest))
-        line = find_oscillation(trace.outputs[spec.measured][run][window], period, floor=floor, lowest_hz=lowest)
+        line = find_oscillation(trace.outputs[spec.regulated][run][window], period, floor=floor, lowest_hz=lowest)
         if line is not None and not line.growing and _swings_alone(stage, scenario, drawn, line.frequency_hz):
             continue
         if line is not None and (line.sustained or line.growing):
@@ -327,7 +327,7 @@ def _noise_floor(stage: Stage, trace: Playback, run: int) -> float:
     rounding = 0.5 * stage.current_step_A / stage.controller.command.per_effort
     std, step = stage.reading_errors
     noise = 2.0 * std + 1.5 * step
-    return max(noise + rounding, 1e-3 * float(trace.peaks[stage.controller.spec.measured][run]))
+    return max(noise + rounding, 1e-3 * float(trace.peaks[stage.controller.spec.regulated][run]))
 
 
 def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:
@@ -342,14 +342,14 @@ def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bo
 def _respond(stage: Stage, scenario: Scenario, trace: Playback, run: int) -> Float[np.ndarray, " n"]:
     """Return the force from rest over the last phase's reference."""
     rest = 0.0 if trace.rest is None else float(trace.rest.force[run])
-    return (trace.outputs[stage.controller.spec.measured][run] - rest) / scenario.phases[-1].force_N
+    return (trace.outputs[stage.controller.spec.regulated][run] - rest) / scenario.phases[-1].force_N
 
 
 def _find_peak(stage: Stage, scenario: Scenario, trace: Playback, run: int) -> float:
     """Return the largest force over the last phase's reference, between samples too where the run rests at zero."""
     if trace.rest is not None and trace.rest.force[run]:
         return float(np.max(np.abs(_respond(stage, scenario, trace, run))))
-    return float(trace.peaks[stage.controller.spec.measured][run]) / abs(scenario.phases[-1].force_N)
+    return float(trace.peaks[stage.controller.spec.regulated][run]) / abs(scenario.phases[-1].force_N)
 
 
 def _judge_step(
@@ -383,7 +383,7 @@ def _judge_step(
 def _judge_final_error(
     stage: Stage, scenario: Scenario, trace: Playback, twin: Playback, run: int, findings: _Findings
 ) -> None:
-    last, name, called = trace.last, stage.controller.spec.measured, stage.controller.command.mechanics
+    last, name, called = trace.last, stage.controller.spec.regulated, stage.controller.command.mechanics
     end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
     error, alone = (float(np.mean(_error(scenario, one, run, one.outputs[name][run])[end])) for one in (trace, twin))
     findings.figures["final_error_N"] = error

@@ -166,7 +166,7 @@ def large_signal(
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
+        plant=plant, law=runnable(controller), measured=controller.signals, delay_samples=controller.delay_samples
     )
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
@@ -190,7 +190,7 @@ def large_signal(
         n = length + math.ceil(max(SETTLING_PERIODS / frequency, LEAST_SETTLING_S) / period)
         phase = 2 * np.pi * frequency * period * np.arange(n)
         run = run_loop(loop, [parameters] * amplitude.size, amplitude[:, None] * np.sin(phase))
-        force, current = run.outputs[loop.measured][:, -length:], run.current[:, -length:]
+        force, current = run.outputs[loop.regulated][:, -length:], run.current[:, -length:]
         gain[:, column] = 2j * np.mean(force * np.exp(-1j * phase[-length:]), axis=1) / amplitude
         saturated[:, column] = np.max(np.abs(current), axis=1) >= (math.inf if limit is None else limit * (1 - 1e-9))
     dense = np.geomspace(f[0], f[-1], PREDICTED_POINTS)

@@ -137,14 +137,14 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     period = controller.sample_time_s
     lasting = min(max(PERIODS / cycle.frequency_hz, LEAST_S), LONGEST_S)
     values = plant.complete(params).drop_conditions()
-    measured, delay = controller.spec.measured, controller.delay_samples
+    measured, delay = controller.signals, controller.delay_samples
     try:
         loop = SampledLoop(plant=plant, law=runnable(controller), measured=measured, delay_samples=delay)
         start = at_rest(loop, 1, PUSH * np.array(cycle.state))
         run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
     except SimulationError as error:
         return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None, not_simulated=str(error))
-    force = run.outputs[measured][0]
+    force = run.outputs[controller.spec.regulated][0]
     if not np.all(np.isfinite(force)):
         return FoundCycle(predicted=cycle, simulated_N=None, simulated_hz=None, runs_away=True)
     end = force[-int(JUDGED * force.size) :]

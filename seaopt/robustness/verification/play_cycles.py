@@ -23,7 +23,7 @@ from jaxtyping import Float
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limit_cycles import LimitCycle
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.sampled_plant import hold
+from seaopt.control.loops.sampled_plant import find_rows, hold
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, jacobians
 from seaopt.plants.friction import take_sliding
@@ -74,11 +74,11 @@ def predict_play_cycles(controller: Controller, plant: Plant, params: ParameterS
 
 
 def _find_plays(controller: Controller, plant: Plant, params: CompletedParameters) -> list[_Play]:
-    row, gain = list(plant.outputs).index(controller.spec.measured), controller.command.per_effort
+    rows, gain = find_rows(plant, controller.signals), controller.command.per_effort
 
     def linearise(x: Float[np.ndarray, " n"]) -> tuple[Any, ...]:
         a, b, c, d = (np.array(block) for block in jacobians(plant)(x, np.zeros(len(plant.inputs)), params.vector))
-        return a, b[:, 0] * gain, c[row], np.array(d[row, 0] * gain)
+        return a, b[:, 0] * gain, c[rows], d[rows, 0] * gain
 
     plays: list[_Play] = []
     for state in range(len(plant.states)):
@@ -100,7 +100,8 @@ def _predict(controller: Controller, loop: Loop, play: _Play) -> list[LimitCycle
     def find_pole(share: float) -> complex:
         a, b, c, d = (np.array(block)[None] for block in play.mix(share))
         a, b, c, d = hold(a, b, c, d, controller.sample_time_s, np.zeros(1))
-        poles = replace(loop, plant=replace(loop.plant, a=a[0], b=b[0], c=c[0], d=float(d[0]))).eigenvalues()
+        held = replace(loop.plant, a=a[0], b=b[0], c=c[0, 0], d=float(d[0, 0]), others=(c[0, 1:], d[0, 1:]))
+        poles = replace(loop, plant=held).eigenvalues()
         swinging = poles[np.abs(np.imag(poles)) > 0.0]
         return complex(swinging[np.argmax(np.abs(swinging))]) if swinging.size else 0j
 

@@ -61,7 +61,7 @@ class Stage:
         return SampledLoop(
             plant=plant,
             law=runnable(self.controller),
-            measured=self.controller.spec.measured,
+            measured=self.controller.signals,
             delay_samples=self.controller.delay_samples,
             sensors=self.sensors,
             current_step_A=self.current_step_A,
@@ -84,14 +84,14 @@ class Stage:
     @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
-        measured = self.controller.spec.measured
+        measured = self.controller.spec.regulated
         offset = any(self.sensors.offset.get(name) for name in (measured, *weigh_encoders(self.plant, measured)))
         return not (self.current_step_A or offset or any(self.reading_errors))
 
     @property
     def reading_errors(self) -> tuple[float, float]:
         """Noise (std) and rounding (step) of what is fed back, of the encoders included that it is computed from."""
-        measured = self.controller.spec.measured
+        measured = self.controller.spec.regulated
         if self.controller.design is None:
             return self.sensors.noise_std.get(measured, 0.0), self.sensors.quantisation.get(measured, 0.0)
         plant, params = self.controller.design

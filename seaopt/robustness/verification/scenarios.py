@@ -364,7 +364,7 @@ def find_step_limit(controller: Controller) -> float | None:
     loop = SampledLoop(
         plant=sliding,
         law=runnable(controller, current_limit_A=math.inf),
-        measured=controller.spec.measured,
+        measured=controller.signals,
         delay_samples=controller.delay_samples,
     )
     tried = NOMINAL_EFFORT[controller.command.mechanics]
@@ -392,13 +392,13 @@ def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     assert link is not None
     params = plant.complete(_require_design(controller)[1]).drop_conditions()
     loop = SampledLoop(
-        plant=plant, law=runnable(controller), measured=controller.spec.measured, delay_samples=controller.delay_samples
+        plant=plant, law=runnable(controller), measured=controller.signals, delay_samples=controller.delay_samples
     )
 
     def measure_peak(blow: float) -> float:
         state = strike(plant, params, np.zeros(len(plant.states)), link, blow)
         run = run_loop(loop, [params], np.zeros(_count_samples(controller, 0.1)), start=at_rest(loop, 1, state))
-        return float(run.peaks[controller.spec.measured][0])
+        return float(run.peaks[controller.spec.regulated][0])
 
     blow, reached = LIGHTEST_NS, measure_peak(LIGHTEST_NS)
     while reached < force and blow < HEAVIEST_NS:

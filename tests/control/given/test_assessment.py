@@ -101,7 +101,7 @@ def test_python_control_laws_are_taken_as_they_are():
     for wrong, words in (
         (control.tf([1.0], [1.0, 1.0]), "sample it first"),
         (control.tf([1.0, 0.0, 0.0], [1.0, -0.5], TS), "higher power of z"),
-        (control.ss(-0.5 * np.eye(1), np.ones((1, 3)), np.ones((1, 1)), np.zeros((1, 3)), TS), "3 inputs"),
+        (control.ss(-0.5 * np.eye(1), np.ones((1, 3)), np.ones((1, 1)), np.zeros((1, 3))), "sample it first"),
         ("2/(s + 1)", "python-control"),
     ):
         with pytest.raises(ControlError, match=words):

@@ -167,7 +167,7 @@ def test_the_sampled_plant_holds_exponentials(parts, ranges, robust_controller, 
             powers = w ** np.arange(enclosed.denominator.r.shape[1])
             (head, off_head), (tail, off_tail), (below, off_below) = (
                 (polynomial(model, e[None])[0, 0] @ powers, model.r[0] @ np.abs(powers))
-                for model in (enclosed.head, enclosed.tail, enclosed.denominator)
+                for model in (enclosed.heads[0], enclosed.tails[0], enclosed.denominator)
             )
             miss = abs(exact * below - (head + tail / z))
             assert enclosed.whole[0] == whole
