@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from seaopt.cli.schemas import DOCUMENTS, json_schema
+from seaopt.cli.session import Session
 
 jsonschema = pytest.importorskip("jsonschema")
 PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
@@ -36,6 +37,16 @@ def test_results_agree(done, document):
     assert not [f"{error.json_path}: {error.message}" for error in check.iter_errors(content)]
     for key in check.schema["required"]:
         assert list(check.iter_errors({name: value for name, value in content.items() if name != key}))
+
+
+@pytest.mark.slow  # a whole run of a rotary joint with friction
+def test_results_of_a_rotary_joint_agree(tmp_path):
+    session = Session(PROBLEMS / "knee.toml", tmp_path)
+    for stage in ("fit", "tune", "certify"):
+        session.run(stage)
+    for document, name in RESULTS.items():
+        content = json.loads((tmp_path / name).read_text(encoding="utf-8"))
+        assert not [f"{error.json_path}: {error.message}" for error in validator(document).iter_errors(content)]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
