@@ -110,12 +110,19 @@ def run(
 
     session = Session(problem, output)
     stages = session.plan_stages()
-    for stage in stages:
-        if stage == "tune" and not session.can_design():
-            stages = ["fit", "report"]
-            session.run("report")
-            break
-        session.run(stage)
+    done = list[str]()
+    try:
+        for stage in stages:
+            if stage == "tune" and not session.can_design():
+                stages = ["fit", "report"]
+                session.run("report")
+                break
+            session.run(stage)
+            done.append(stage)
+    except Exception:  # minutes of work have a verdict, whatever becomes of the next stage
+        if done and not json:
+            session.show(json, done, _choose_amount(quiet, verbose))
+        raise
     for what in session.explain_left_out(stages):
         session.say(f"left out: {what}")
     _finish(session, json, stages, quiet, verbose)

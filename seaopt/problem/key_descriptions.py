@@ -13,6 +13,7 @@ KEYS: dict[str, dict[str, str]] = {
         "fit": "How parameters are estimated.",
         "controller": "What is asked of the controller; without it nothing is tuned.",
         "robustness": "What the certificate covers besides what the fit leaves open.",
+        "impedance": "Stiffness and damping at the link, rendered around the force loop.",
     },
     "ParameterTable": {
         "value": "In `unit`, else in the parameter's own.",

@@ -203,7 +203,7 @@ def test_a_requirement_not_met_exits_1(copied, seaopt, short):
     [
         (("fit", "nothing.toml"), "seaopt new LOG -o nothing.toml"),
         (("tune", "short.toml", "-o", "empty"), "run seaopt fit"),
-        (("certify", "short.toml", "-o", "empty"), "run seaopt tune"),
+        (("certify", "short.toml", "-o", "empty"), "run seaopt fit"),
         (("report", "short.toml", "-o", "empty"), "run seaopt fit"),
         (("fit", "short.toml", "-o", "short.toml"), "is a file"),
         (("fit", "."), "is a folder.*toml"),

@@ -356,3 +356,12 @@ def test_a_law_of_ones_own_is_certified_as_the_tuned_one(write, tmp_path):
     wrong = write('sample_rate_hz = 1000\ndelay_samples = 1\nmeasured = "F2"\n[pid]\nk_p = 1.0\n', "law.toml")
     with pytest.raises(so.SeaoptError, match='measured = "F2"'):
         Session(path, mine).take_law(wrong)
+
+
+def test_what_was_done_has_a_verdict_where_a_later_stage_fails(folder, seaopt, design, monkeypatch):
+    (folder / "problem.toml").write_text(design, encoding="utf-8")
+    monkeypatch.setattr(Session, "_certify", lambda *_: (_ for _ in ()).throw(so.SeaoptError("no room; make some")))
+    done = seaopt("run", "problem.toml", "-o", "out")
+    assert done.returncode == 2
+    assert "no room" in done.stderr
+    assert "Controller" in done.stdout.splitlines()[0]

@@ -289,5 +289,5 @@ def test_a_plant_whose_zero_swallows_the_force_is_refused(swing, thor):
 
 def test_a_plant_without_rest_is_refused(thor):
     plant = so.plants.rotary()
-    with pytest.raises(ControlError, match="does not come to rest by itself"):
+    with pytest.raises(ControlError, match="constant current"):
         made(plant, plant.defaults, measured="tau_s")
