@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from seaopt import __version__
 from seaopt.errors import ProblemError
 from seaopt.problem import Problem
 from seaopt.problem.columns import list_log_files
@@ -50,7 +50,7 @@ class Plan:
     @property
     def version(self) -> str:
         """Of the package, whose results are taken up again."""
-        return __version__
+        return version("seaopt")
 
     def make_problem(self) -> Problem:
         """Return the problem."""
