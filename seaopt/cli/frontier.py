@@ -17,6 +17,11 @@ FRONTIER_NOTE = (
     "largest reference at that frequency before the command saturates"
 )
 FRICTION_NOTE = "; friction: by how much it raises the integral of |S|"
+FREE_NOTE = (
+    "; free law: the least {objective} that any linear law could have on the design plant alone, and by how much the "
+    "tuned one is above"
+)
+OBJECTIVES = {"disturbance": "integral of |S| over ln f from 0.1 Hz to the bandwidth", "noise": "noise"}
 
 
 def parse_bandwidths(text: str) -> tuple[float, ...]:
@@ -51,17 +56,19 @@ def parse_bandwidths(text: str) -> tuple[float, ...]:
 def print_frontier(frontier: Frontier, console: Terminal) -> None:
     """Print a row per bandwidth, what blocks those that are not met, and what the columns mean."""
     called, sticks = frontier.mechanics, any(row.without_sticking for row in frontier.rows)
+    free = next((row.free_law for row in frontier.rows if row.free_law), None)
     rows = [
         (
             f"{row.bandwidth_hz:g}", "yes" if row.feasible else "no", format_number(row.noise_gain, 3),
             format_number(row.ms), row.ms_plant, format_number(row.sensitivity_bandwidth_hz, 3),
             format_number(row.phase_margin_deg, 3), format_number(row.force_limit_N),
             *([row.describe_friction_cost()] if sticks else []),
+            *([row.describe_structure_cost()] if free else []),
         )
         for row in frontier.rows
     ]  # fmt: skip
-    head = (*HEAD, f"limit {called.unit}", *(["friction"] if sticks else []))
-    console.tabulate(rows, head, "><>><>>>>")
+    head = (*HEAD, f"limit {called.unit}", *(["friction"] if sticks else []), *(["free law"] if free else []))
+    console.tabulate(rows, head, "><>><>>>>>"[: len(head)])
     blocked: dict[str, list[str]] = {}
     for row in frontier.rows:
         if row.blocked_by:
@@ -69,4 +76,6 @@ def print_frontier(frontier: Frontier, console: Terminal) -> None:
     for text, at in blocked.items():
         console.wrap(f"not met at {join_words(at)} Hz: {text}", indent=2)
     note = FRONTIER_NOTE.format(word=called.word, gain=called.gain)
-    console.wrap(note + (FRICTION_NOTE if sticks else ""), indent=2, style="dim")
+    note += FRICTION_NOTE if sticks else ""
+    note += FREE_NOTE.format(objective=OBJECTIVES[free.objective]) if free else ""
+    console.wrap(note, indent=2, style="dim")

@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from seaopt.cli.terminal import Amount, prepare_streams
-from seaopt.errors import SeaoptError
+from seaopt.errors import ControlError, SeaoptError
 from seaopt.formatting import printable
 
 INTERRUPTED = 130  # exit code, as a shell's
@@ -239,13 +239,19 @@ def tune(
             metavar="LOW:HIGH:STEP", help="Tune at each bandwidth (Hz) instead; write frontier.json and figure."
         ),
     ] = None,
+    free_law: Annotated[
+        bool, typer.Option("--free-law", help="With --sweep: also the best that any linear law could do.")
+    ] = False,
 ) -> None:
     """Tune the controller with the fit in DIR; write controller.json."""
     from seaopt.cli.frontier import parse_bandwidths
     from seaopt.cli.session import Session
 
     stage = "tune" if sweep is None else "sweep"
-    session = Session(problem, output, bandwidths_hz=() if sweep is None else parse_bandwidths(sweep))
+    if free_law and sweep is None:
+        raise ControlError("--free-law: is of a sweep; give --sweep LOW:HIGH:STEP too")
+    bandwidths = () if sweep is None else parse_bandwidths(sweep)
+    session = Session(problem, output, bandwidths_hz=bandwidths, free_law=free_law)
     session.run(stage)
     _finish(session, json, [stage], quiet, verbose)
 

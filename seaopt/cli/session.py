@@ -180,7 +180,13 @@ class Session:
     """Runs stages for one problem and one folder; later stages read earlier ones' JSON where they did not run."""
 
     def __init__(
-        self, problem: Path, folder: Path, stretch_s: float | None = None, bandwidths_hz: tuple[float, ...] = ()
+        self,
+        problem: Path,
+        folder: Path,
+        stretch_s: float | None = None,
+        bandwidths_hz: tuple[float, ...] = (),
+        *,
+        free_law: bool = False,
     ) -> None:
         check_folder(folder)
         self.problem: Problem = read_problem(problem)
@@ -191,6 +197,7 @@ class Session:
         self.folder = folder
         self.stretch_s = stretch_s
         self.bandwidths_hz = bandwidths_hz
+        self.free_law = free_law
         self.results: dict[str, Any] = {}
         self.written: list[Path] = []
         self._experiments: tuple[Experiment, ...] | None = None
@@ -463,7 +470,10 @@ class Session:
                 f"{self.problem.response_names[0]}; name a plant there, and the response in robust_to"
             )
         draws = self.problem.draws(self.parameters())
-        result = sweep(design, values, self._spec(), self.bandwidths_hz, robust_to, draws=draws, progress=tell)
+        result = sweep(
+            design, values, self._spec(), self.bandwidths_hz, robust_to, draws=draws, free_law=self.free_law,
+            progress=tell,
+        )  # fmt: skip
         self.results["sweep"] = result
         self._write("sweep", result.to_dict())
         self.written += write_frontier_figure(result, self.folder / "frontier")

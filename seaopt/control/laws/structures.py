@@ -135,7 +135,9 @@ class Nominal:
         zeros = np.roots(b[lead:]).astype(complex)
         inverted = (np.abs(zeros) < LARGEST_INVERTED) & (np.real(zeros) > 0.0)
         left = np.atleast_1d(np.real(np.poly(zeros[~inverted])))
-        pairs = zip_longest(*(_factors(roots) for roots in (np.linalg.eigvals(plant.a), zeros[inverted])))
+        pairs = zip_longest(
+            *(_factors(roots) for roots in (np.linalg.eigvals(plant.a).astype(complex), zeros[inverted]))
+        )
         inverse = [TransferFunction(num=_or_one(top), den=_or_one(below)) for top, below in pairs]
         gain = 1.0 / (b[lead] * np.sum(left))
         if np.isfinite(plant.static_gain) and plant.static_gain:  # which is known better than what b and left give

@@ -11,6 +11,8 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken, shorten_blocked
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.tuning.free_law import FreeLaw, bound_free_law
 from seaopt.control.tuning.optimisation_problem import LawNumbers, Task
 from seaopt.control.tuning.solution import solve
 from seaopt.control.tuning.tuner import RobustTo, disturbance, make_controller, make_task
@@ -65,6 +67,9 @@ class FrontierRow:
         The limits that are broken.
     without_sticking : SlidingAlone or None
         What could be had if no plant ever stuck; None where none has friction. The difference is what friction costs.
+    free_law : FreeLaw or None
+        The best that any linear law could do on the design plant; None where it was not asked for. The difference to
+        the disturbance, or with that objective to the noise gain, is what the structure costs, at most.
 
     """
 
@@ -80,6 +85,16 @@ class FrontierRow:
     force_limit_N: float | None
     blocked_by: tuple[str, ...]
     without_sticking: SlidingAlone | None = None
+    free_law: FreeLaw | None = None
+
+    def describe_structure_cost(self) -> str:
+        """Return a free law's value of the objective and by how much this is above, or that none keeps the limits."""
+        free = self.free_law
+        if free is None or free.bound is None:
+            return "impossible" if free is not None and free.status == "impossible" else MISSING
+        tuned = self.disturbance if free.objective == "disturbance" else self.noise_gain
+        above = f" ({100.0 * (tuned / free.bound - 1.0):+.0f} %)" if self.feasible else ""
+        return f"{format_number(free.bound)}{above}"
 
     def describe_friction_cost(self) -> str:
         """Return by how much friction raises the disturbance, or that it alone makes a bandwidth impossible."""
@@ -117,16 +132,19 @@ class Frontier:
         called = self.mechanics
         head = (*head, f"{called.word} limit")
         sticks = any(row.without_sticking for row in self.rows)
+        free = any(row.free_law for row in self.rows)
         cells = [
             [
                 *_cells(row, called.unit),
                 *([row.describe_friction_cost()] if sticks else []),
+                *([row.describe_structure_cost()] if free else []),
                 shorten_blocked(row.blocked_by) if row.blocked_by else "",
             ]
             for row in self.rows
         ]
         friction = ("cost of friction",) if sticks else ()
-        return (*head, *friction, "blocked by"), cells
+        structure = ("free law",) if free else ()
+        return (*head, *friction, *structure, "blocked by"), cells
 
     def __repr__(self) -> str:
         head, cells = self._list_cells()
@@ -144,6 +162,7 @@ def sweep(
     robust_to: RobustTo | None = None,
     *,
     draws: Sequence[Mapping[str, float]] = (),
+    free_law: bool = False,
     progress: Progress = ignore,
 ) -> Frontier:
     """Tune at each of several bandwidths, also starting from the one before; an infeasible row is a result.
@@ -154,6 +173,9 @@ def sweep(
         As `tune`; the specification's own bandwidth is not used.
     bandwidths_hz : sequence of float
         In the specification's range.
+    free_law : bool
+        Also compute, for each bandwidth, the best that any linear law could do on the design plant under these limits
+        (`seaopt.control.bound_free_law`), which takes about two seconds.
     progress : callable, optional
         Called with the bandwidth that is tuned and the share of all that is done (`seaopt.progress.Progress`).
 
@@ -194,7 +216,10 @@ def sweep(
         x, loops = solve(present, warm, whole)
         controller = make_controller(present, x, loops, (plant, params))
         alone = _tune_sliding(replace(sliding, spec=one), x, sliding_alone) if sticks else None
-        rows.append(replace(_row(present, x, loops, controller), without_sticking=alone))
+        row = replace(_row(present, x, loops, controller), without_sticking=alone)
+        if free_law and isinstance(task.plants[0], DigitalPlant):
+            row = replace(row, free_law=bound_free_law(task.plants[0], one, [controller.law]))
+        rows.append(row)
         controllers.append(controller)
         warm = (x,)
     progress(f"{spec.structure}, {len(rows)} bandwidths", 1.0)

@@ -20,11 +20,15 @@ FIGURES = {
     "force_limit_N": ("Largest reference at the bandwidth", "{called.word} [{called.unit}]"),
 }
 
+OBJECTIVES = {"disturbance": "disturbance", "noise": "noise_gain"}  # objective: the figure that it is
+
 
 def frontier_panel(frontier: Frontier, figure: str) -> Panel:
     """Draw one figure of a sweep against bandwidth; bandwidths that keep not every limit are hollow."""
     title, label = FIGURES[figure]
     values = [getattr(row, figure) for row in frontier.rows]
+
+    bars = any(row.free_law is not None and OBJECTIVES[row.free_law.objective] == figure for row in frontier.rows)
 
     def draw(axes: Sequence[Axes]) -> None:
         from seaopt.reporting.figures.canvas import BLUE, MEASURED, VERMILION
@@ -40,6 +44,11 @@ def frontier_panel(frontier: Frontier, figure: str) -> Panel:
                     "color": colour, "markerfacecolor": colour if met else "white", "label": label_, "markersize": 5
                 }  # fmt: skip
                 axis.plot(*zip(*points, strict=True), "o", **look)
+        bounds = [(row.bandwidth_hz, row.free_law.bound) for row in frontier.rows
+                  if row.free_law is not None and row.free_law.bound is not None
+                  and OBJECTIVES[row.free_law.objective] == figure]  # fmt: skip
+        if bounds:
+            axis.plot(*zip(*bounds, strict=True), "_", color=MEASURED, markersize=9, label="any linear law, at best")
         if not known:
             axis.text(0.5, 0.5, "no limit of the command", transform=axis.transAxes, ha="center")
         axis.set_xlabel("bandwidth [Hz]")
@@ -50,7 +59,8 @@ def frontier_panel(frontier: Frontier, figure: str) -> Panel:
         title=title,
         draw=draw,
         link="bandwidth",
-        caption="Of the best controller for each bandwidth; hollow: it misses a limit.",
+        caption="Of the best controller for each bandwidth; hollow: it misses a limit."
+        + (" Bars: the best of all linear laws on the design plant alone." if bars else ""),
     )
 
 

@@ -1,0 +1,341 @@
+r"""The best that any linear law could do on one plant under the same limits: what the tuned structure costs.
+
+For a stable plant P, with hold and delay, the laws that make a stable loop are :math:`C_y = Q/(1 - PQ)` with Q stable
+(Youla), and every limit on the loop is convex in Q:
+
+.. math:: S = 1 - PQ, \quad T = PQ, \quad C_y S = Q, \qquad
+    |S| \le M_s, \; |T| \le M_t, \; |2S - 1| \le 2/\alpha, \; |Q| \le N, \; |S| \le 1/\sqrt2 \; (f \le f_s),
+
+as are the objectives, :math:`\int |S|\, d\ln f` and :math:`\max |Q|`. What the reference does, C_r of a law with two
+degrees of freedom, is chosen apart and costs nothing here: its limits are left out. A law that integrates has
+:math:`S = 0` at 0 Hz.
+
+Q is a sum of Laguerre's functions (complete in the stable ones: more of them come as close as one likes), of slow
+exponentials, and of the tuned law's own Q, so that the tuned law is among those compared. A modulus is the largest of
+its parts in all directions, :math:`|z| = \max_\psi \mathrm{Re}\, e^{-j\psi} z`; a linear program has some directions at
+some frequencies, those that its answer breaks are added until none is (Kelley's cutting planes), by the solver HiGHS.
+
+**In which sense it is a bound.** A program with fewer directions and frequencies has a smaller optimum: for laws of the
+`functions` counted the value is a lower bound, whether or not the last cuts changed it. For all laws it is the limit of
+many functions; `seaopt.control.tuning.feasibility` has what is proved for all. With several plants it is a bound only:
+those besides the design plant ask more of a tuned law, and here nothing of a free one. So do a passive band, a friction
+margin, and the limits of a structure (the derivative's filter, the integral's rate).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.laws.spec import LOWEST_HZ, ControllerSpec
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.loop import GROWING, Loop
+from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.errors import ControlError
+from seaopt.records import record
+
+FUNCTIONS = 40
+SLOW_POLES = 12  # exponentials, from the slowest to the bandwidth
+SLOWEST_HZ = 0.01
+LAGUERRE_AT = 2.0  # times the bandwidth: the pole of Laguerre's functions
+FREQUENCIES, EVEN = 130, 130  # of the program: in ratio below, and at even distances up to the Nyquist frequency
+SLOW = 12  # of them below 0.1 Hz
+OBJECTIVE_HZ = 0.1  # disturbances count from here
+FIRST_DIRECTIONS = 6
+MOST_CUTS = 30  # rounds
+CUTS_AT_ONCE = 120  # of one limit
+OPTIMAL, INFEASIBLE = 0, 2  # of linprog's status
+LONGEST_S = 60.0  # of one linear program, which takes a third of a second
+LEAST_SIZE = 1e-7  # of the largest combination of functions
+TOLERANCE = 2e-4  # by which a modulus may be beyond its limit, or the objective beyond the program's
+FINER = 7  # times as many frequencies, on which the answer is looked at again
+
+
+@record(eq=False)
+class FreeLaw:
+    """The best of the free laws.
+
+    Parameters
+    ----------
+    status : {"optimal", "impossible", "unstable plant", "no answer"}
+        Impossible: no law of as many functions keeps the limits. Of a plant that grows by itself nothing is computed.
+    objective : str
+        Which one it is.
+    bound : float or None
+        The least value of the objective; None where there is none.
+    missed : float or None
+        By which share the law found is beyond a limit between the frequencies of the program: if that is small, a law
+        with nearly this value exists.
+    reached : float or None
+        The objective of the law found, on many frequencies.
+    functions : int
+        Of which Q is a sum.
+    frequencies : int
+        Of the program.
+
+    """
+
+    status: Literal["optimal", "impossible", "unstable plant", "no answer"]
+    objective: str
+    bound: float | None = None
+    reached: float | None = None
+    missed: float | None = None
+    functions: int = 0
+    frequencies: int = 0
+
+
+@record(eq=False)
+class _Terms:
+    """What Q is a sum of, and the plant, at frequencies."""
+
+    f: Float[np.ndarray, " m"]
+    p: Complex[np.ndarray, " m"]
+    basis: Complex[np.ndarray, "m n"]
+
+    def s(self, x: Float[np.ndarray, " n"]) -> Complex[np.ndarray, " m"]:
+        """Return S."""
+        return 1.0 - self.p * (self.basis @ x)
+
+
+@record(eq=False)
+class _Modulus:
+    """abs(constant + slope x) <= level at some of the frequencies."""
+
+    constant: Complex[np.ndarray, " k"]
+    slope: Complex[np.ndarray, "k n"]
+    level: Float[np.ndarray, " k"]
+
+
+def bound_free_law(
+    plant: DigitalPlant, spec: ControllerSpec, laws: Sequence[Law] = (), *, functions: int = FUNCTIONS
+) -> FreeLaw:
+    """Return the best that a free linear law could do on a plant.
+
+    Parameters
+    ----------
+    plant : DigitalPlant
+        The design plant, with hold and delay; of one with friction the one that slides.
+    spec : ControllerSpec
+        Limits and objective; the reserve is not taken off.
+    laws : sequence of Law
+        Laws that are among those compared; those that make an unstable loop are left out.
+    functions : int
+        Laguerre's functions; with twice as many the bound is lower, by how much says how far it is from the limit.
+
+    Raises
+    ------
+    ControlError
+        `functions` is not 1 or more.
+
+    Examples
+    --------
+    >>> import seaopt as so
+    >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=25)
+    >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
+    >>> tuned = so.tune(stand, thor, spec)
+    >>> free = bound_free_law(tuned.plant(stand, thor), spec, [tuned.law])
+    >>> free.status
+    'optimal'
+
+    """
+    if isinstance(functions, bool) or not isinstance(functions, int) or functions < 1:
+        raise ControlError(f"functions = {functions!r} is not a number of functions; give 1 or more")
+    if np.max(np.abs(np.linalg.eigvals(plant.a)), initial=0.0) > GROWING:
+        return FreeLaw(status="unstable plant", objective=spec.objective)
+    own = [law for law in laws if _is_stable(plant, law)]
+    f = _place(spec)
+    terms = _make_terms(plant, spec, own, f, functions)
+    answer = _Program(spec, terms).solve()
+    if isinstance(answer, str):
+        return FreeLaw(status=answer, objective=spec.objective, functions=terms.basis.shape[1], frequencies=f.size)
+    value, x = answer
+    fine = np.unique(np.concatenate([f, *(f[:-1] + share * np.diff(f) for share in np.arange(1, FINER) / FINER)]))
+    reached, missed = _look_again(spec, _make_terms(plant, spec, own, fine, functions), x)
+    return FreeLaw(
+        status="optimal", objective=spec.objective, bound=value, reached=reached, missed=missed,
+        functions=terms.basis.shape[1], frequencies=f.size,
+    )  # fmt: skip
+
+
+def _is_stable(plant: DigitalPlant, law: Law) -> bool:
+    return Loop(plant=plant, law=law).is_stable()
+
+
+def _place(spec: ControllerSpec) -> Float[np.ndarray, " m"]:
+    """Return the frequencies of the program, with the ends of all bands."""
+    nyquist = 0.5 * spec.sample_rate_hz
+    ends = [OBJECTIVE_HZ, spec.bandwidth_hz, spec.sensitivity_bandwidth_limit_hz or spec.bandwidth_hz]
+    slow, base = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW), np.geomspace(OBJECTIVE_HZ, nyquist, FREQUENCIES)
+    return np.unique(np.concatenate([slow, base, np.linspace(spec.bandwidth_hz, nyquist, EVEN), ends]))
+
+
+def _make_terms(
+    plant: DigitalPlant, spec: ControllerSpec, laws: Sequence[Law], f: Float[np.ndarray, " m"], functions: int
+) -> _Terms:
+    """Return plant and functions at frequencies, and at 0 Hz where the law integrates: the first of them then."""
+    if spec.structure != "pd":
+        f = np.concatenate([[0.0], f])
+    ts, z = plant.sample_time_s, np.exp(2j * np.pi * f * plant.sample_time_s)
+    q = 1.0 / z
+    a = np.exp(-2 * np.pi * min(LAGUERRE_AT * spec.bandwidth_hz, 0.2 / ts) * ts)
+    columns = [np.sqrt(1.0 - a * a) / (1.0 - a * q)]
+    for _ in range(functions - 1):
+        columns.append(columns[-1] * (q - a) / (1.0 - a * q))
+    slow = np.exp(-2 * np.pi * np.geomspace(SLOWEST_HZ, spec.bandwidth_hz, SLOW_POLES) * ts)
+    columns += [(1.0 - pole) / (1.0 - pole * q) for pole in slow]
+    p = plant.response(f)
+    for law in laws:
+        c = law.measurement_response(np.maximum(f, 1e-9))
+        columns.append(c / (1.0 + p * c))
+    return _Terms(f=f, p=p, basis=np.column_stack(columns))
+
+
+def _orthogonalise(terms: _Terms) -> Float[np.ndarray, "n k"]:
+    """Return the combinations of functions that differ at the frequencies, each of the same size.
+
+    Many functions are nearly combinations of others, and a program in their coefficients cannot be solved.
+    """
+    both = np.concatenate([terms.basis / np.max(np.abs(terms.basis)), terms.p[:, None] * terms.basis])
+    _, sizes, turns = np.linalg.svd(np.concatenate([np.real(both), np.imag(both)]), full_matrices=False)
+    kept = sizes > LEAST_SIZE * sizes[0]
+    return turns[kept].T / sizes[kept] * np.sqrt(terms.f.size)
+
+
+class _Program:
+    """The linear program, and the cuts it has so far."""
+
+    def __init__(self, spec: ControllerSpec, terms: _Terms) -> None:
+        self.spec, self.terms = spec, terms
+        self.noise = spec.objective == "noise"
+        m, self.turn = terms.f.size, _orthogonalise(terms)
+        basis = terms.basis @ self.turn
+        n = basis.shape[1]
+        loop = -terms.p[:, None] * basis  # of S
+        self.integrates = spec.structure != "pd"
+        some = slice(1, None) if self.integrates else slice(None)
+        f, one = terms.f[some], np.ones(m - self.integrates)
+        self.limits = [_Modulus(constant=one + 0j, slope=loop[some], level=_s_level(spec, f))]
+        mt, disk, noise = (spec.level(name) for name in ("max_complementary", "min_disk_margin", "max_noise_gain"))
+        if mt is not None:
+            self.limits.append(_Modulus(constant=0j * one, slope=-loop[some], level=mt * one))
+        if disk is not None:
+            self.limits.append(_Modulus(constant=one + 0j, slope=2.0 * loop[some], level=2.0 / disk * one))
+        if noise is not None and not self.noise:
+            self.limits.append(_Modulus(constant=np.zeros(m) + 0j, slope=basis, level=np.full(m, float(noise))))
+        self.zero = loop[0].real if self.integrates else np.zeros(n)
+        if self.noise:
+            self.weights, self.owner = np.ones(1), np.zeros(m, dtype=int)
+            self.aim = _Modulus(constant=np.zeros(m) + 0j, slope=basis, level=np.zeros(m))
+        else:
+            weights = weigh(f, spec.bandwidth_hz)
+            counted = np.flatnonzero(weights > 0.0)
+            self.weights, self.owner = weights[counted], np.arange(counted.size)
+            self.aim = _Modulus(constant=one[counted] + 0j, slope=loop[some][counted], level=0.0 * counted)
+        self.rows: list[Float[np.ndarray, "r v"]] = []
+        self.ends: list[Float[np.ndarray, " r"]] = []
+
+    def solve(self) -> tuple[float, Float[np.ndarray, " n"]] | Literal["impossible", "no answer"]:
+        """Return the optimum and the coefficients; or why there are none."""
+        for psi in 2 * np.pi * np.arange(FIRST_DIRECTIONS) / FIRST_DIRECTIONS:
+            for one in (*self.limits, self.aim):
+                chosen = np.arange(0, one.level.size, 3)
+                self._cut(one, chosen, np.full(chosen.size, psi))
+        n, t = self.turn.shape[1], self.weights.size
+        x, bound = np.zeros(n), np.zeros(t)
+        for _ in range(MOST_CUTS):
+            answer = self._run(n, t)
+            if isinstance(answer, str):
+                return answer
+            x, bound = answer[:n], answer[n:]
+            if not self._add_cuts(x, bound):
+                break
+        return float(self.weights @ bound), self.turn @ x
+
+    def _run(self, n: int, t: int) -> Float[np.ndarray, " v"] | Literal["impossible", "no answer"]:
+        from scipy.optimize import linprog
+
+        equal: dict[str, Any] = {}
+        if self.integrates:
+            equal = {"A_eq": np.concatenate([self.zero, np.zeros(t)])[None], "b_eq": [-1.0]}
+        cost, rows, ends = np.concatenate([np.zeros(n), self.weights]), np.concatenate(self.rows), self.ends
+        result: Any = None
+        for method in ("highs-ds", "highs-ipm"):  # the simplex is quicker; where it loses its way, the other one
+            result = linprog(
+                cost, A_ub=rows, b_ub=np.concatenate(ends), bounds=[(None, None)] * n + [(0.0, None)] * t,
+                method=method, options={"time_limit": LONGEST_S}, **equal,
+            )  # fmt: skip
+            if result.status == OPTIMAL:
+                return np.asarray(result.x)
+        return "impossible" if result.status == INFEASIBLE else "no answer"
+
+    def _add_cuts(self, x: Float[np.ndarray, " n"], bound: Float[np.ndarray, " t"]) -> bool:
+        """Add the directions in which the answer breaks a limit, or its own objective; tell whether there are any."""
+        added = False
+        for one in self.limits:
+            value = one.constant + one.slope @ x
+            beyond = np.flatnonzero(np.abs(value) > one.level * (1.0 + TOLERANCE))
+            if beyond.size:
+                beyond = beyond[np.argsort(-np.abs(value[beyond]) / one.level[beyond])][:CUTS_AT_ONCE]
+                self._cut(one, beyond, np.angle(value[beyond]))
+                added = True
+        value, total = self.aim.constant + self.aim.slope @ x, float(self.weights @ bound)
+        short = np.abs(value) - bound[self.owner]
+        if self.noise:
+            beyond = np.flatnonzero(short > TOLERANCE * total)
+        elif float(self.weights @ np.maximum(short, 0.0)) > TOLERANCE * total:
+            beyond = np.flatnonzero(short > 0.0)
+        else:
+            beyond = np.zeros(0, dtype=int)
+        if beyond.size:
+            self._cut(self.aim, beyond, np.angle(value[beyond]))
+        return added or bool(beyond.size)
+
+    def _cut(self, one: _Modulus, at: Any, psi: Float[np.ndarray, " k"]) -> None:
+        """Add Re exp(-j psi) (constant + slope x) <= level, in units of the level."""
+        turn, t = np.exp(-1j * psi), self.weights.size
+        rows, ends = np.real(turn[:, None] * one.slope[at]), one.level[at] - np.real(turn * one.constant[at])
+        extra = np.zeros((psi.size, t))
+        if one is self.aim:
+            extra[np.arange(psi.size), self.owner[at]] = -1.0
+        else:
+            rows, ends = rows / one.level[at][:, None], ends / one.level[at]
+        self.rows.append(np.hstack([rows, extra]))
+        self.ends.append(ends)
+
+
+def _s_level(spec: ControllerSpec, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return what abs(S) may be."""
+    ms = spec.level("max_sensitivity") or np.inf
+    slow = f <= spec.sensitivity_bandwidth_limit_hz * (1.0 + 1e-9)
+    return np.minimum(np.where(slow, HALF_POWER, ms), 1e3)
+
+
+def weigh(f: Float[np.ndarray, " m"], bandwidth_hz: float) -> Float[np.ndarray, " m"]:
+    """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are among the frequencies."""
+    inside = (f >= OBJECTIVE_HZ * (1 - 1e-9)) & (f <= bandwidth_hz * (1 + 1e-9))
+    out, step = np.zeros(f.size), 0.5 * np.diff(np.log(f[inside]))
+    out[np.flatnonzero(inside)[:-1]] += step
+    out[np.flatnonzero(inside)[1:]] += step
+    return out
+
+
+def _look_again(spec: ControllerSpec, terms: _Terms, x: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return the objective on many frequencies, and by which share a limit is missed at most."""
+    positive, every = terms.f > 0.0, terms.basis @ x
+    f, s, q = terms.f[positive], terms.s(x)[positive], every[positive]
+    usage = [np.abs(s) / _s_level(spec, f)]
+    for name, size in (("max_complementary", 1.0 - s), ("max_noise_gain", q)):
+        level = spec.level(name)
+        if level is not None and not (name == "max_noise_gain" and spec.objective == "noise"):
+            usage.append(np.abs(size) / level)
+    disk = spec.level("min_disk_margin")
+    if disk is not None:
+        usage.append(np.abs(2.0 * s - 1.0) * disk / 2.0)
+    value = (
+        float(np.max(np.abs(every))) if spec.objective == "noise" else float(weigh(f, spec.bandwidth_hz) @ np.abs(s))
+    )
+    return value, max(0.0, max(float(np.max(one)) for one in usage) - 1.0)
