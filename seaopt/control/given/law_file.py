@@ -143,6 +143,7 @@ class LawFile(_Strict):
     largest_bandwidth_hz: Any = None
     possible: Any = None
     notes: Any = None
+    measured_responses: Any = None
     provenance: Any = None
     fit_met: Any = None
     made_from: Any = None
