@@ -401,7 +401,7 @@ def _say_value(parameter: Parameter, value: float, unresolved: float) -> str:
     if value < 2.0 * unresolved:
         return (
             f"friction that jumps at rest more sharply than the logs resolve: {parameter.name} = {value:.1g}{unit} or "
-            f"less {place}; fix it there, or free it"
+            f"less {place}; let it jump, with sticks = true in [plant.NAME] (so.plants.let_stick), or fix it there"
         )
     if value in (parameter.min, parameter.max):
         way = "smaller" if value < parameter.value else "larger"
