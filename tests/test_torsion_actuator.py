@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import passivity
+from seaopt.control import Law, passivity, scorecard
 from tests.pages import read_page
 
 SCRIPT = Path(__file__).parents[1] / "problems" / "torsion_actuator.py"
@@ -71,3 +72,28 @@ def test_published_laws_hold_the_torque(script, rows):
     expected = 100.0 * np.concatenate([outer * inner, -outer * inner, -inner * slow])
     assert law.respond(z)[0] == pytest.approx(expected, rel=1e-9)
     assert so.read_problem(script.PROBLEM).spec is not None
+
+
+def test_the_cascade_is_assessed_with_its_encoder(script):
+    """The package reads the motor's angle and takes differences, half a sample later than the judge's speed."""
+    problem = so.read_problem(script.PROBLEM)
+    law = script.read_matrices(*script.PUBLISHED["cascaded PID"])
+    spec = replace(problem.spec, measured=("tau_s", "thetad_m"), passive_band_hz=None)
+    given = Law.from_state_space(law.a, law.b, law.c, law.d, script.PERIOD)
+    controller = so.assess(problem.design_plant, problem.parameters, given, spec)
+    found, judged = controller.achieved, script.judge(law, script.run_law(law))
+    assert not controller.feasible
+    assert found.bandwidth_hz == pytest.approx(95.3, abs=0.05)
+    assert found.ms == pytest.approx(3.53, abs=0.005)
+    assert found.phase_margin_deg == pytest.approx(16.4, abs=0.05)
+    late = 360.0 * 65.6 * 0.5 * script.PERIOD  # half a sample at the crossover, of the inner loop's share of it
+    assert 0.0 < judged["phase_margin_deg"] - found.phase_margin_deg < late
+    score = scorecard({"cascade": controller})["cascade"]
+    assert score.passive_to_hz == pytest.approx(113.5, abs=0.1)
+    system = controller.close(*controller.design).system()
+    z = np.exp(1j * np.linspace(0.0, np.pi, 20_001)[1:])
+    inner = z[:, None, None] * np.eye(len(system.a)) - system.a
+    x = np.linalg.solve(inner, np.broadcast_to(system.b[:, 2:3] + 0j, (z.size, len(system.a), 1)))[:, :, 0]
+    gain = np.abs(x @ system.c[1] + system.d[1, 2])
+    assert np.max(gain) == pytest.approx(found.noise_gain, rel=1e-3)
+    assert score.noise_rms == pytest.approx(float(np.sqrt(np.mean(gain**2))), rel=1e-3)

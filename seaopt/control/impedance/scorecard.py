@@ -48,9 +48,9 @@ class Score:
     needed_damping : float
         The damper at the link that makes it passive everywhere; zero where it is.
     noise_gain : float
-        Peak over frequency from sensor noise to effort.
+        Peak over frequency from noise on the regulated signal to effort.
     noise_rms : float
-        Root mean square of the effort over that of white sensor noise.
+        Root mean square of the effort over that of white noise on the regulated signal.
     unit : str
         Of impedance and damping.
 
@@ -171,15 +171,16 @@ def scorecard(
 
 def _score(controller: Controller, plant: Plant, parameters: ParameterSet) -> Score:
     figures = controller.close(plant, parameters).figures()
-    port = port_of(take_sliding(plant, parameters), parameters, controller.spec.measured, controller.command.per_effort)
+    port = port_of(take_sliding(plant, parameters), parameters, controller.signals, controller.command.per_effort)
     found = passivity(controller, plant, parameters)
     period = controller.sample_time_s
     top = min(figures.bandwidth_hz or 1.0 / period, 0.49 / period)
     f = np.union1d(np.geomspace(LOWEST_HZ, max(top, 2 * LOWEST_HZ), POINTS), [1.0])
     late = hold_response(f, period, controller.delay_samples)
     response = port.response(f)
-    size = np.abs(response.impedance(controller.law.measurement_response(f) * late))
-    share = size / np.abs(response.impedance(np.zeros(f.size, dtype=complex)))
+    law = -controller.law.responses(f)[1:] * late
+    size = np.abs(response.impedance(law))
+    share = size / np.abs(response.impedance(np.zeros_like(law)))
     return Score(
         bandwidth_hz=figures.bandwidth_hz, reference_peak=figures.reference_peak,
         impedance_1hz=float(size[np.searchsorted(f, 1.0)]), impedance_largest=float(np.max(size)),
@@ -195,8 +196,9 @@ def _find_noise_rms(controller: Controller, plant: Plant, parameters: ParameterS
     from scipy.linalg import solve_discrete_lyapunov
 
     system = controller.close(plant, parameters).system()
+    noise = 0 if len(controller.signals) == 1 else 2  # of several signals the inputs are w, reference and noises
     if not np.max(np.abs(system.poles), initial=0.0) < 1.0:
         return np.inf
-    driven = np.outer(system.b[:, 0], system.b[:, 0])
+    driven = np.outer(system.b[:, noise], system.b[:, noise])
     covariance: Any = solve_discrete_lyapunov(system.a, driven)
-    return float(np.sqrt(system.c[1] @ covariance @ system.c[1] + system.d[1, 0] ** 2))
+    return float(np.sqrt(system.c[1] @ covariance @ system.c[1] + system.d[1, noise] ** 2))
