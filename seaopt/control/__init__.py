@@ -3,7 +3,7 @@
 from seaopt.control.deploy.export import export
 from seaopt.control.given.assessment import assess
 from seaopt.control.given.law_file import GivenLaw, read_law
-from seaopt.control.given.pid_forms import drive_pid, ideal_pid, parallel_pid
+from seaopt.control.given.pid_forms import cascade_pid, drive_pid, ideal_pid, parallel_pid
 from seaopt.control.impedance.critical_damping import critical_impedance
 from seaopt.control.impedance.region import ImpedanceRegion, passive_region
 from seaopt.control.impedance.rendering import Rendering, add_impedance, render
@@ -37,12 +37,12 @@ from seaopt.control.tuning.tuner import tune
 
 __all__ = [
     "Command", "Controller", "ControllerSpec", "DigitalPlant", "DiskMargin", "DisturbanceObserver", "Estimator",
-    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "Gains", "GateState",
-    "GivenLaw", "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState",
-    "MPCStep", "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate", "Rendering",
-    "RunnableLaw", "SampledLoop", "Score", "Scorecard", "TransferFunction", "add_impedance", "assess",
-    "bound_free_law", "close_loop", "command_of", "corners", "critical_impedance", "draw", "drive_pid",
-    "estimate_noise", "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap",
-    "parallel_pid", "passive_region", "passivity", "passivity_rows", "read_law", "realise", "render", "run_loop",
-    "runnable", "sample", "scorecard", "sweep", "tune",
+    "EstimatorRun", "EstimatorState", "ForceMPC", "ForceRun", "FreeLaw", "Frontier", "Gains", "GateState", "GivenLaw",
+    "Impedance", "ImpedanceRegion", "Law", "LawState", "Loop", "LoopFigures", "MPCSpec", "MPCState", "MPCStep",
+    "Margins", "NoiseModel", "Notch", "OuterLoop", "Passivity", "PlausibilityGate", "Rendering", "RunnableLaw",
+    "SampledLoop", "Score", "Scorecard", "TransferFunction", "add_impedance", "assess", "bound_free_law",
+    "cascade_pid", "close_loop", "command_of", "corners", "critical_impedance", "draw", "drive_pid", "estimate_noise",
+    "estimator", "export", "export_mpc", "force_mpc", "ideal_pid", "margins", "nu_gap", "parallel_pid",
+    "passive_region", "passivity", "passivity_rows", "read_law", "realise", "render", "run_loop", "runnable",
+    "sample", "scorecard", "sweep", "tune",
 ]  # fmt: skip

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Literal, get_args
 
+import numpy as np
+
 from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.law import Law
 from seaopt.errors import ControlError, require_number
@@ -58,6 +60,65 @@ def parallel_pid(
     more = 0.5 * k_i * sample_time_s * {"trapezoid": 0.0, "backward": 1.0, "forward": -1.0}[integral]
     gains = Gains(k_p=k_p + more, k_i=k_i, k_d=k_d, T_f=T_f, k_r=b * k_p + more + feedforward, c=c)
     return gains.law("pid", sample_time_s).balanced()
+
+
+def cascade_pid(
+    *, k_v: float, T_v: float = math.inf, k_p: float, k_i: float = 0.0, k_d: float = 0.0, T_f: float = 0.0,
+    sample_time_s: float, b: float = 1.0, c: float = 1.0, feedforward: float = 0.0,
+) -> Law:  # fmt: skip
+    r"""Return a drive's cascade: a force loop that asks a speed loop of the motor for a speed.
+
+    .. math::
+        v_\mathrm{ref} &= k_p (b r - y) + k_i \int (r - y) + k_d \frac{d}{dt}(c r - y), \\
+        u &= k_v \Big[v_\mathrm{ref} - v + \frac{1}{T_v} \int (v_\mathrm{ref} - v)\Big] + k_{ff} r .
+
+    With a P inside (T_v infinite) it is a PID of gains :math:`k_v k_p, k_v k_i, k_v k_d` with damping by the motor's
+    speed. Integrals are trapezoids.
+
+    Parameters
+    ----------
+    k_v : float
+        Of the speed loop: effort per motor speed, N s/m or N m s/rad.
+    T_v : float
+        Seconds: its integral time; infinite for none.
+    k_p, k_i, k_d : float
+        Of the force loop: motor speed per measured unit, per second of it, and per rate of it.
+    T_f, b, c, feedforward
+        As in `parallel_pid`; feedforward is of effort.
+    sample_time_s : float
+        Seconds.
+
+    Returns
+    -------
+    Law
+        From (reference, measured, motor speed): of a specification with ``measured = ("tau_s", "thetad_m")``.
+
+    Raises
+    ------
+    ControlError
+        A number is not finite, or a time is negative.
+
+    Examples
+    --------
+    >>> law = cascade_pid(k_v=0.3, k_p=5.0, k_i=60.0, T_v=0.05, sample_time_s=1e-3)
+    >>> law.integrators, law.d.size
+    (2, 3)
+
+    """
+    for name, value in (("k_v", k_v), ("T_v", T_v)):
+        require_number(value, name, ControlError)
+    if math.isnan(T_v) or not T_v > 0.0 or not math.isfinite(k_v):
+        raise ControlError(f"k_v = {k_v:g}, T_v = {T_v:g}: give a finite gain and a positive time")
+    outer = parallel_pid(k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, sample_time_s=sample_time_s, b=b, c=c)
+    n, half = outer.c.size, 1.0 + 0.5 * sample_time_s / T_v  # of the newest error, which the trapezoid counts by half
+    drive = np.append(outer.d, -1.0)  # v_ref - v of reference, measured and speed
+    a = np.zeros((n + 1, n + 1))
+    a[:n, :n], a[n, :n], a[n, n] = outer.a, sample_time_s * outer.c, 1.0
+    columns = np.vstack([np.hstack([outer.b, np.zeros((n, 1))]), sample_time_s * drive])
+    row, through = k_v * np.append(half * outer.c, 1.0 / T_v), k_v * half * drive
+    through[0] += feedforward
+    kept = slice(None) if math.isfinite(T_v) else slice(n)
+    return Law.from_state_space(a[kept, kept], columns[kept], row[kept], through, sample_time_s)
 
 
 def ideal_pid(

@@ -13,7 +13,7 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import Law, assess, parallel_pid, passivity, read_law, realise, runnable
+from seaopt.control import Law, assess, cascade_pid, parallel_pid, passivity, read_law, realise, runnable
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limit_cycles import predict_limit_cycles
@@ -200,6 +200,40 @@ def test_it_is_stored_and_exported(speed, tmp_path, compiler):
     found = CompiledLaw(compiler, tmp_path, speed, "double", allow_infeasible=True).run(r, y)
     assert "theta_m" in (tmp_path / "law_gains.m").read_text()
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("T_v", [0.05, np.inf])
+def test_a_cascade_is_its_difference_equation(T_v):
+    k_v, k_p, k_i, k_d, T_f, b, c, ahead = 0.3, 5.0, 60.0, 0.05, 2e-3, 0.7, 0.4, 0.9
+    law = cascade_pid(
+        k_v=k_v, T_v=T_v, k_p=k_p, k_i=k_i, k_d=k_d, T_f=T_f, sample_time_s=TS, b=b, c=c, feedforward=ahead
+    )
+    rng = np.random.default_rng(5)
+    r, y, v = np.cumsum(rng.normal(size=(3, 200)), axis=1)
+    force = rate = speed = late = moved_before = miss_before = 0.0
+    wanted, found, x = [], [], np.zeros(law.c.size)
+    for sample in np.stack([r, y, v], axis=1):
+        error, moved = sample[0] - sample[1], c * sample[0] - sample[1]
+        force += k_i * TS / 2 * (error + late)
+        rate = (T_f * rate + k_d * (moved - moved_before)) / (T_f + TS)
+        miss = k_p * (b * sample[0] - sample[1]) + force + rate - sample[2]
+        speed += TS / 2 * (miss + miss_before) / T_v
+        wanted.append(k_v * (miss + speed) + ahead * sample[0])
+        late, moved_before, miss_before = error, moved, miss
+        found.append(law.c @ x + law.d @ sample)
+        x = law.a @ x + law.b @ sample
+    np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
+
+
+def test_a_cascade_is_measured_like_any_law():
+    law = cascade_pid(k_v=0.3, k_p=2.0, k_i=30.0, T_v=0.1, feedforward=1.0, sample_time_s=TS)
+    measured = assess(STAND, VALUES, law, so.ControllerSpec(**{**SPEC.to_dict(), "measured": ("tau_s", "thetad_m")}))
+    assert measured.achieved.stable
+    assert measured.signals == ("tau_s", "theta_m")
+    certificate = so.certify(measured, {"swing": SWING}, VALUES, ranges={"J_l": (0.2, 0.3)}, samples=50)
+    assert {"design sliding", "design stuck", "swing sliding", "swing stuck"} == set(certificate.plants)
+    assert certificate.simulated.verification is not None
+    assert certificate.simulated.passivity is not None
 
 
 def test_what_does_not_fit_is_refused(speed):
