@@ -103,7 +103,7 @@ def show_controller(console: Terminal, controller: Controller) -> None:
         for name, value in controller.gains.items()
     ]  # fmt: skip
     _tabulate(console, gains, ("gain", "value", "", f"as {controller.command.word}", ""), "<><><")
-    _tabulate(console, controller.list_achieved(), ("design plant", "achieved", "asked"), "<><")
+    _tabulate(console, controller.list_achieved(), (controller.judged_on, "achieved", "asked"), "<><")
     _show_notes(console, controller.notes)
 
 

@@ -167,6 +167,11 @@ class Controller:
         return replace(loop, friction_slope=self.friction.least_slope, slope_unit=name_slope_unit(self.design[0]))
 
     @property
+    def judged_on(self) -> str:
+        """What `achieved` is of: the design plant, or the worst of a measured response's discs."""
+        return "worst measured" if self.design is None and self.measured else "design plant"
+
+    @property
     def largest_bandwidth_hz(self) -> float | None:
         """The largest bandwidth that is possible where the one asked is not; None where none is known."""
         return None if self.possible is None else self.possible.largest_hz
@@ -515,7 +520,7 @@ class Controller:
         explanation = [] if self.feasible else [self.explanation]
         return (
             html_paragraph(head) + (html_table(("gain", "", f"as {self.command.word}"), gains) if gains else "")
-            + html_table(("on the design plant", "achieved", "asked"), self.list_achieved())
+            + html_table((f"on the {self.judged_on}", "achieved", "asked"), self.list_achieved())
             + html_list([*explanation, *(line.strip() for line in self._force_lines())]) + self.plot.to_html()
         )  # fmt: skip
 
