@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
 from seaopt.cli.provenance import FILES, check_unedited, digest
-from seaopt.cli.session import SCHEMAS, UNMET
+from seaopt.cli.session import SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.laws.verdict import join_labels
 from seaopt.errors import ProblemError
 from seaopt.files import read_json, to_json
+from seaopt.reporting.verdict import UNMET
 
 
 def export_controller(
@@ -44,10 +46,11 @@ def export_controller(
         options["derate"] = read_guard(content, derate_margin_K) or True
     written = [str(file) for file in export(content, target, **options)]
     met, broken = content.get("fit_met", True) is True, _list_broken_requirements(path, results / FILES["certify"])
+    certified = broken is not None
     if json:
         result = {
             "schema": "seaopt/export/1", "feasible": content["feasible"], "fit_met": met,
-            "certificate_failed": broken, "files": written,
+            "certified": certified, "certificate_failed": broken or [], "files": written,
         }  # fmt: skip
         sys.stdout.write(to_json(result))
     else:
@@ -58,6 +61,8 @@ def export_controller(
             console.wrap(f"not met: {join_labels(content['active_constraints'])}")
         if broken:
             console.wrap(f"not met: the certificate of this controller FAILED: {', '.join(broken)}")
+        if not certified:
+            console.wrap(f"not certified: type seaopt certify PROBLEM -o {shlex.quote(str(results))}")
         if amount != "quiet" or (met and content["feasible"] and not broken):
             console.wrap(f"wrote {', '.join(written)}")
         for note in content.get("notes") or () if amount == "verbose" else ():
@@ -65,12 +70,12 @@ def export_controller(
     return content["feasible"] and met and not broken
 
 
-def _list_broken_requirements(controller: Path, certificate: Path) -> list[str]:
-    """Return the requirements that the certificate of this very controller says are not met."""
+def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
+    """Return the requirements that the certificate of this very controller says are not met; None without one."""
     if not certificate.is_file():
-        return []
+        return None
     content = read_json(certificate, SCHEMAS["certify"])
     made_from = content.get("made_from")
     if made_from is not None and made_from.get(controller.name) != digest(controller):
-        return []  # of another controller, and says nothing of this one
+        return None  # of another controller, and says nothing of this one
     return list(dict.fromkeys(row["name"] for row in content["requirements"] if not row["met"]))

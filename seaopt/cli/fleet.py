@@ -11,10 +11,10 @@ from pathlib import Path
 from seaopt.cli.session import show_progress
 from seaopt.cli.show import heading, show_verdicts
 from seaopt.cli.terminal import Terminal
-from seaopt.cli.verdicts import Reason, StageVerdict
 from seaopt.errors import LogError
 from seaopt.files import to_json
 from seaopt.formatting import format_count
+from seaopt.reporting.verdict import Reason, StageVerdict
 
 
 def run_fleet(

@@ -24,7 +24,6 @@ from seaopt.cli.provenance import FILES, ROBUSTNESS, check_unedited, digest_cont
 from seaopt.cli.responses import estimate_responses
 from seaopt.cli.show import show_certificate, show_controller, show_fit, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.cli.verdicts import StageVerdict, judge_certificate, judge_controller, judge_fit
 from seaopt.control import Controller, ControllerSpec, read_law, sweep
 from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
@@ -48,6 +47,15 @@ from seaopt.problem.stages import (
 )
 from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
+from seaopt.reporting.verdict import (
+    UNMET,
+    StageVerdict,
+    doubt_design,
+    judge_certificate,
+    judge_controller,
+    judge_expectations,
+    judge_fit,
+)
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
@@ -78,7 +86,6 @@ MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 REPORT_S = 30.0  # between lines of progress that go to a file
 # Of a specification: what a law of the user's own says itself, and nothing asks for.
 OF_THE_LAW = ("structure", "notch", "reference_weights", "sample_rate_hz", "delay_samples")
-UNMET = "on a fit that is not met"
 SIMULATED = (
     "simulation_NAME.csv: the plant with the values of [parameters], sensors ideal",
     "virtual_NAME.csv: the log of a virtual experiment, with its truth, noise and offsets, as a fit reads it",
@@ -510,7 +517,7 @@ class Session:
             results += [self.results["certify"]] if "certify" in self.results else []
         page = write_report(
             results, self.folder / "report.html", title=self.problem.title, progress=drawing,
-            files=[self.problem.source], command=shlex.join(["seaopt", *sys.argv[1:]]),
+            files=[self.problem.source], command=shlex.join(["seaopt", *sys.argv[1:]]), expectations=self._expected(),
         )  # fmt: skip
         self.results["report"] = page
         self.written.append(page)
@@ -520,24 +527,24 @@ class Session:
         return all(verdict.met for stage in self._judged(stages) for verdict in self._verdicts(stage))
 
     def _judged(self, stages: list[str]) -> list[str]:
-        """Return what has a verdict: of a whole run also what the problem file expects."""
-        return ["fit", "tune", "certify", *(["expect"] if len(stages) > 1 else [])] if "report" in stages else stages
+        """Return what has a verdict: of a report also what the problem file expects."""
+        return ["fit", "tune", "certify", "expect"] if "report" in stages else stages
 
     def _expected(self) -> list[tuple[bool, str]]:
-        """Return what came of each expectation of the problem file in a whole run."""
+        """Return what came of each expectation of the problem file."""
+        expectations = list_expectations(self.problem)
+        if expectations and isinstance(fit := self.results.get("fit"), Fit) and "scores" not in self.results:
+            self.results["scores"] = score_problem(self.problem, fit, self.experiments())
         results = Stages(
             self.problem, fit=self.results.get("fit"), scores=self.results.get("scores", []),
             controller=self.results.get("tune"), certificate=self.results.get("certify"),
         )  # fmt: skip
-        return [expectation.check(results) for expectation in list_expectations(self.problem)]
+        return [expectation.check(results) for expectation in expectations]
 
     def _verdicts(self, stage: str) -> list[StageVerdict]:
         """Return what to say of a stage that has run; a design on a fit that is not met is not met either."""
         if stage == "expect":
-            outcomes = self._expected()
-            unmet = [StageVerdict(met=False, text=text) for met, text in outcomes if not met]
-            text = f"Expectations: {len(outcomes) - len(unmet)} of {len(outcomes)} met"
-            return [StageVerdict(met=True, text=text), *unmet] if len(unmet) < len(outcomes) else unmet
+            return judge_expectations(self._expected())
         result = self.results.get(stage)
         if stage == "frf" and result is not None:
             return [StageVerdict(met=good, text=text) for good, text in result.verdict()]
@@ -554,8 +561,9 @@ class Session:
             verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
         if stage not in ("tune", "certify", "sweep") or self.fit_met():
             return verdicts
-        unmet = [replace(one, met=False, text=f"{one.text}, {UNMET}") for one in verdicts]
-        return unmet or [StageVerdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
+        if stage == "sweep":
+            return [StageVerdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
+        return [doubt_design(one) for one in verdicts]
 
     def _spell(self, command: str) -> str:
         """Return a command on this problem as it is typed."""

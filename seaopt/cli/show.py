@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from seaopt.cli.terminal import Terminal
-from seaopt.cli.verdicts import Reason, StageVerdict
 from seaopt.control import Controller
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.estimation import Fit, ModelledOutputs
 from seaopt.formatting import MISSING, format_count, format_number, printable
 from seaopt.parameters import Parameter
+from seaopt.reporting.verdict import Reason, StageVerdict
 from seaopt.robustness import Certificate
 from seaopt.units import unit_after
 

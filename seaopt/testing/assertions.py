@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from seaopt.errors import SeaoptError, suggestion
+from seaopt.errors import SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Experiment, Fit
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.robustness import Certificate
 from seaopt.units import unit_after
 
@@ -34,7 +36,7 @@ def assert_recovered(
     AssertionError
         The fit is not met, or a parameter is too far off; the message is a table of all of them.
     SeaoptError
-        `truth` lacks a free parameter.
+        `truth` lacks a free parameter, the fit has none, or a limit is no positive number.
 
     Examples
     --------
@@ -45,13 +47,20 @@ def assert_recovered(
     >>> assert_recovered(fit, thor, sigmas=3, within=0.05)
 
     """
+    require_type(fit, Fit, "fit", "give what seaopt.fit returned")
+    require_type(truth, (ParameterSet, Mapping), "truth", 'give the true values: thor(), or {"J": 3.31e-6}')
+    _require_positive(sigmas, "sigmas")
+    if within is not None:
+        _require_positive(within, "within")
+    if not fit.covariance.names:
+        raise SeaoptError('the fit estimated no parameter, so that there is nothing to compare; free one: .free("J")')
     rows: list[str] = []
     failed = not fit.met
     for name in fit.covariance.names:
         if name not in truth:
             raise SeaoptError(f'truth has no "{name}", which the fit estimated; {suggestion(name, truth)}')
         expected = truth[name]
-        true = expected if isinstance(expected, (int, float)) else expected.value
+        true = expected.value if isinstance(expected, Parameter) else require_number(expected, f'truth["{name}"]')
         fitted = fit.parameters[name]
         std = fitted.std if fitted.std is not None else np.nan
         error = fitted.value - true
@@ -85,7 +94,7 @@ def assert_predicts(fit: Fit, experiment: Experiment, fit_percent: float | Mappi
     AssertionError
         An output is predicted worse than that.
     SeaoptError
-        An output is named that the experiment does not measure.
+        An output is named that the experiment does not measure, none is, or a limit is no finite number.
 
     Examples
     --------
@@ -95,20 +104,27 @@ def assert_predicts(fit: Fit, experiment: Experiment, fit_percent: float | Mappi
     >>> assert_predicts(so.fit([bench], so.plants.thor().free("J", "b_r")), other, fit_percent=95)
 
     """
+    require_type(fit, Fit, "fit", "give what seaopt.fit returned")
+    require_type(experiment, Experiment, "experiment", "give an Experiment")
     score = fit.predict(experiment)
-    found = score.fit_percent
-    asked = dict(fit_percent) if isinstance(fit_percent, Mapping) else dict.fromkeys(found, fit_percent)
+    percents = score.fit_percent
+    limits: Mapping[str, Any] = (
+        fit_percent if isinstance(fit_percent, Mapping) else dict.fromkeys(percents, fit_percent)
+    )
+    if not limits:
+        raise SeaoptError("fit_percent names no output, so that there is nothing to compare; give 95, or {'F1': 95}")
+    asked = {name: _require_finite(least, f'fit_percent["{name}"]') for name, least in limits.items()}
     for name in asked:
-        if name not in found:
+        if name not in percents:
             raise SeaoptError(
-                f'fit_percent names "{name}", which {experiment.name} does not measure; {suggestion(name, found)}'
+                f'fit_percent names "{name}", which {experiment.name} does not measure; {suggestion(name, percents)}'
             )
     rows = [
-        f"  {name}: fit {found[name]:.2f} %, asked for {least:g} %, rms residual {score.rms_residual[name]:.3g}"
-        f"{unit_after(score.units[name])}{'' if found[name] >= least else '   <-- TOO LOW'}"
+        f"  {name}: fit {percents[name]:.2f} %, asked for {least:g} %, rms residual {score.rms_residual[name]:.3g}"
+        f"{unit_after(score.units[name])}{'' if percents[name] >= least else '   <-- TOO LOW'}"
         for name, least in asked.items()
     ]
-    if not all(found[name] >= least for name, least in asked.items()):
+    if not all(percents[name] >= least for name, least in asked.items()):
         remark = "" if fit.met else f"; the fit is not met: {fit.verdict}"
         raise AssertionError("\n".join([f"{experiment.name} is not predicted{remark}:", *rows]))
 
@@ -137,6 +153,9 @@ def assert_certified(certificate: Certificate, *, failure_probability: float | N
     >>> assert_certified(certificate, failure_probability=0.03)
 
     """
+    require_type(certificate, Certificate, "certificate", "give what seaopt.certify returned")
+    if failure_probability is not None:
+        _require_positive(failure_probability, "failure_probability")
     broken = [
         f"  {row.name} = {row.value:.4g}, must be {row.sense} {row.limit:.4g} ({row.where})"
         for row in certificate.requirements
@@ -150,3 +169,15 @@ def assert_certified(certificate: Certificate, *, failure_probability: float | N
         )
     if broken:
         raise AssertionError("\n".join(["the controller is not certified:", *broken]))
+
+
+def _require_finite(value: Any, argument: str) -> float:
+    number = require_number(value, argument)
+    if not math.isfinite(number):
+        raise SeaoptError(f"{argument} = {number} is not finite; give a finite number")
+    return number
+
+
+def _require_positive(value: Any, argument: str) -> None:
+    if not _require_finite(value, argument) > 0.0:
+        raise SeaoptError(f"{argument} = {value} is not positive; give a positive number")

@@ -92,3 +92,12 @@ def test_a_controller_whose_certificate_failed_exits_1(done, seaopt, tmp_path):
     assert out.returncode == 1
     assert "certificate" in out.stdout and "FAILED" in out.stdout
     assert len(list((tmp_path / "out").iterdir())) == 4
+
+
+def test_a_controller_that_was_never_certified_says_so(done, seaopt, tmp_path):
+    (tmp_path / "controller.json").write_bytes((done.results / "controller.json").read_bytes())
+    out = seaopt("export", tmp_path, "--c", tmp_path / "out")
+    assert out.returncode == 0 and f"not certified: type seaopt certify PROBLEM -o {tmp_path}" in out.stdout
+    content = json.loads(seaopt("export", tmp_path, "--c", tmp_path / "out", "--json").stdout)
+    assert content["certified"] is False
+    assert "not certified" not in seaopt("export", done.results, "--c", tmp_path / "out").stdout

@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.cli.session import format_left
 from seaopt.cli.terminal import Terminal
-from seaopt.cli.verdicts import explain_failure
+from seaopt.reporting.verdict import explain_failure
 from seaopt.robustness.certificate.certificate import Requirement
 from seaopt.robustness.certificate.failures import group_failures
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.reporting import verdict
+from seaopt.estimation.result.findings import FitFinding
+from seaopt.reporting import judge_results
 from seaopt.reporting.figures.panel import Panel
 from seaopt.reporting.page.chart import make_chart
 
@@ -178,18 +179,38 @@ def test_a_failure_is_said_once_with_a_count(fitted, controller, certificate, tm
     broken = [replace(row, value=1.7 + 0.01 * k, met=False, where=f"plant {k}") for k in range(12)]
     failed = replace(certificate, passed=False, requirements=(*broken, row))
     text = so.write_report([failed], tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "Ms (12 times)" in text.split("<h3>Why</h3>")[0]
+    assert "12 of 13 requirements not met" in text.split("<h3>Why</h3>")[0]
     why = text.split("<h3>Why</h3>")[1].split("</ul>")[0]
-    assert why.count("<li>") == 1 and "Ms 1.81, above 1.6 (the worst of 12): plant 11" in why
+    assert why.count("<li>") == 1 and "max_sensitivity 1.81, limit ≤ 1.6 (and 11 more): plant 11" in why
     table = text.split('id="certificate"')[1].split("</table>")[0]
     assert table.count("plant 11") == 1 and "plant 10" not in table
-    worst = dict(verdict(None, None, failed))
-    assert worst == {False: "Certificate: failed – Ms (12 times)"}
+    (judged,) = judge_results(certificate=failed)
+    assert not judged.met and judged.text == "Certificate: failed, 12 of 13 requirements not met"
 
 
 @pytest.mark.parametrize("kind", ["nothing uncertain", "simulated"])
 def test_what_a_certificate_says_in_a_line(certificate, kind):
     drawn = certificate.monte_carlo if kind == "simulated" else replace(certificate.monte_carlo, samples=0)
-    ((met, text),) = verdict(None, None, replace(certificate, passed=True, monte_carlo=drawn))
-    assert met and f"{len(certificate.runs.rows)} simulations passed" in text
-    assert ("nothing was uncertain" in text) == (kind == "nothing uncertain")
+    (judged,) = judge_results(certificate=replace(certificate, passed=True, monte_carlo=drawn))
+    assert judged.met and f"{len(certificate.runs.rows)} simulated runs passed" in judged.text
+    assert ("nothing was uncertain" in judged.text) == (kind == "nothing uncertain")
+
+
+def test_a_design_on_a_fit_that_is_not_met_is_not_met_on_the_page(fitted, controller, tmp_path, without_drawing):
+    finding = FitFinding(severity="error", kind="explained", where="chirp.F1", text="half of it")
+    unmet = replace(fitted, findings=(finding,))
+    assert not unmet.met and controller.feasible
+    text = so.write_report([unmet, controller], tmp_path / "r.html").read_text(encoding="utf-8")
+    lines = text.split('class="verdict">')[1].split("</ul>")[0]
+    assert '<li class="good">' not in lines and "every limit met, on a fit that is not met" in lines
+    header = text.split('aria-label="C header">')[1].split("</pre>")[0]
+    assert "the fit that this controller was tuned with is not met" in header
+    assert "These gains were found on a fit that is not met" in text
+
+
+def test_what_a_problem_expects_stands_in_the_verdict_and_in_a_table(controller, tmp_path, without_drawing):
+    outcomes = [(True, "expect.a: found 1"), (False, "expect.fit_met: found yes, asked for no")]
+    text = so.write_report([controller], tmp_path / "r.html", expectations=outcomes).read_text(encoding="utf-8")
+    assert '<li class="bad"><b class="bad">not met</b> Expectations: 1 of 2 met</li>' in text
+    table = text.split('<section id="expectations"')[1].split("</table>")[0]
+    assert table.count("<tr>") == 3 and "asked for no" in table

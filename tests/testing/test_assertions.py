@@ -45,6 +45,28 @@ def test_another_log_is_predicted_to_the_percents_asked(fit, truth):
         so.testing.assert_predicts(fit, other, fit_percent={"q": 90})
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sigmas": float("nan")}, "sigmas = nan is not finite"),
+        ({"sigmas": -3.0}, "sigmas = -3.0 is not positive"),
+        ({"within": float("inf")}, "within = inf is not finite"),
+    ],
+)
+def test_limits_of_a_recovery_are_positive_numbers(fit, truth, options, words):
+    with pytest.raises(so.SeaoptError, match=words):
+        so.testing.assert_recovered(fit, truth, **options)
+
+
+def test_nothing_to_compare_is_no_success(fit, experiment, truth):
+    with pytest.raises(so.SeaoptError, match="nothing to compare"):
+        so.testing.assert_recovered(so.fit([experiment], truth), truth)
+    with pytest.raises(so.SeaoptError, match="nothing to compare"):
+        so.testing.assert_predicts(fit, experiment, {})
+    with pytest.raises(so.SeaoptError, match=r'fit_percent\["F1"\] = nan is not finite'):
+        so.testing.assert_predicts(fit, experiment, {"F1": float("nan")})
+
+
 def test_a_certificate_that_fails_lists_what_is_not_met(truth):
     stand = so.plants.high_impedance()
     controller = so.tune(stand, truth, so.ControllerSpec(bandwidth_hz=30))

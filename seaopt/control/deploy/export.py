@@ -63,6 +63,7 @@ def export(
     gate: PlausibilityGate | None = None,
     derate: bool | HeatGuard = False,
     allow_infeasible: bool = False,
+    fit_met: bool | None = None,
 ) -> tuple[Path, ...]:
     """Write a controller as C99, with its gains as a C header and as a MATLAB script.
 
@@ -75,7 +76,7 @@ def export(
     precision : {"double", "float"}
         Of the C code.
     name : str
-        Prefix of every name in C; characters that C does not allow become underscores.
+        Prefix of every name in C: a letter, then letters, digits and underscores.
     current_limit_A, command_limit : float, optional
         In place of the specification's limit: of a current, or of whatever is commanded, in its unit. Give one.
     tracking_time_s : float, optional
@@ -87,6 +88,9 @@ def export(
         "thermal" that is commanded a current; or by a guard of your own, with a margin say, at the law's sample time.
     allow_infeasible : bool
         Also write a controller that misses its limits; the files state it.
+    fit_met : bool, optional
+        Whether the fit that it was tuned with is met; the files state one that is not. What a controller.json says of
+        it, if left out.
 
     Returns
     -------
@@ -112,7 +116,7 @@ def export(
     """
     if precision not in LARGEST_NUMBER:
         raise ControlError(f'precision = "{precision}" is not known; use "double" or "float"')
-    prefix = _identifier(name)
+    prefix = _check_prefix(name)
     if Path(folder).exists() and not Path(folder).is_dir():
         raise FileError(f"{folder}: is a file; give a folder")
     if isinstance(controller, Controller):
@@ -122,6 +126,7 @@ def export(
         from seaopt.control.laws.stored import read_controller  # deferred: pydantic
 
         stored, figures, heat = read_controller(controller), _stated(controller), read_guard(controller)
+        fit_met = controller.get("fit_met", True) is True if fit_met is None else fit_met
     if not stored["feasible"] and not allow_infeasible:
         missed = join_labels(stored["active_constraints"])
         raise ControlError(f"the controller misses {missed}; tune one that does not, or allow an infeasible one")
@@ -140,6 +145,7 @@ def export(
         "precision": precision,
         "name": prefix,
         "NAME": prefix.upper(),
+        "fit_met": fit_met,
     }
     numbers = {".m": repr, ".h": _literal(precision), ".c": _literal(precision)}
     texts = {
@@ -176,8 +182,17 @@ def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard |
     return HeatGuard.of_rating(rating, period, margin_K=margin_K)
 
 
+def _check_prefix(name: str) -> str:
+    """Return a name that files and names in C begin with; one that C does not take as it is is refused."""
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+        raise ControlError(
+            f'name = "{name}" cannot begin a name in C; give a letter, then letters, digits and underscores: force_law'
+        )
+    return _identifier(name)
+
+
 def _identifier(name: str) -> str:
-    """Return a name that C takes."""
+    """Return a name that C takes, made of one that it may not take."""
     identifier = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
     if not identifier or identifier[0].isdigit() or len(identifier) > LONGEST_NAME:
         raise ControlError(

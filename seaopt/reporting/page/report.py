@@ -33,7 +33,7 @@ from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
 from seaopt.reporting.page.chart import Chart, make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_template
-from seaopt.reporting.verdict import describe_failure, verdict
+from seaopt.reporting.verdict import UNMET, judge_results
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.failures import group_failures
 from seaopt.robustness.verification.environments import StabilityMap
@@ -92,6 +92,7 @@ def write_report(
     progress: Progress = ignore,
     files: Sequence[Path | str] = (),
     command: str = "",
+    expectations: Sequence[tuple[bool, str]] = (),
 ) -> Path:
     """Write an HTML page that needs no network and no other file; its figures also stand beside it as SVG and PNG.
 
@@ -110,6 +111,8 @@ def write_report(
         What the results were made of, besides the logs: named with their hashes.
     command : str
         What was typed to make the report, to be stated in it.
+    expectations : sequence of (bool, str)
+        Of a problem file: whether each is met, and what to say of it.
 
     Returns
     -------
@@ -143,7 +146,7 @@ def write_report(
         drawn.setdefault(plate.part, []).append(
             DrawnPlate(name=plate.name, heading=plate.heading, charts=charts, text=plate.text)
         )
-    page = write_text(target, _render(material, drawn, title, files, command))
+    page = write_text(target, _render(material, drawn, title, files, command, expectations))
     progress(format_count(len(plates), "figure"), 1.0)
     return page
 
@@ -299,23 +302,28 @@ def _plates_of_logs(material: Material) -> list[Plate]:
 
 def _render(
     material: Material, drawn: Mapping[str, Sequence[DrawnPlate]], title: str, files: Sequence[Path | str],
-    command: str,
+    command: str, expectations: Sequence[tuple[bool, str]],
 ) -> str:  # fmt: skip
     """Return the page."""
     fit, controller, certificate = material.fit, material.controller, material.certificate
     experiments = fit.experiments if fit is not None else ()
     runs = material.verification
     apart = runs if certificate is None or runs is not certificate.runs else None  # else the certificate speaks of them
-    met = verdict(fit, controller, certificate, apart, material.mpc)
+    judged = judge_results(
+        fit=fit, controller=controller, mpc=material.mpc, certificate=certificate, verification=apart,
+        expectations=expectations,
+    )  # fmt: skip
+    sound = fit is None or fit.met
     return render_template(
-        "page.html.jinja", title=title, verdict=met, reasons=list_reasons(material), glance=list_figures(material),
+        "page.html.jinja", title=title, verdicts=judged, glance=list_figures(material),
+        expectations=expectations, doubt="" if sound else UNMET,
         plates=drawn, fit=fit, diagnostics=material.diagnostics, ranking=material.ranking, controller=controller,
         mpc=material.mpc, certificate=certificate, verification=material.verification, large=material.large,
         coupled=material.coupled, simulated=None if certificate is None else certificate.simulated,
         limited=[] if controller is None else list_design_figures(controller.spec, controller.design_loop),
         units={} if controller is None else name_gain_units(controller.command),
         card=_score(controller), card_heads=HEADS,
-        header=None if controller is None else write_header(controller),
+        header=None if controller is None else write_header(controller, fit_met=sound),
         forces=_describe_forces(controller), swinging=_swings(certificate),
         requirements=[] if certificate is None else group_requirements(certificate),
         failures=[] if material.verification is None else list_failed_runs(material.verification),
@@ -332,21 +340,6 @@ def _score(controller: Controller | None) -> Scorecard | None:
         return scorecard({controller.structure: controller})
     except SeaoptError:
         return None
-
-
-def list_reasons(material: Material) -> list[str]:
-    """Return why something is not met, the same failure once: errors of the fit, limits, requirements."""
-    reasons: list[str] = []
-    if material.fit is not None:
-        reasons += [f"{one.where}: {one.text}" if one.where else one.text for one in material.fit.errors]
-    for one in (material.controller, material.mpc):
-        if one is not None and not one.feasible:
-            reasons.append(one.explanation)
-    if material.certificate is not None:
-        reasons += [describe_failure(one) for one in group_failures(material.certificate.requirements)]
-    elif material.verification is not None:
-        reasons += [f"{row.plant}, {row.scenario}: {row.reason}" for row in material.verification.failures[:1]]
-    return reasons
 
 
 def list_figures(material: Material) -> list[tuple[str, str, str]]:
@@ -418,11 +411,11 @@ def list_failed_runs(verification: Verification) -> list[str]:
     ]
 
 
-def write_header(controller: Controller) -> tuple[bool, str]:
+def write_header(controller: Controller, *, fit_met: bool = True) -> tuple[bool, str]:
     """Return the C header of the gains, and True; or False, and why there is none."""
     try:
         with TemporaryDirectory() as folder:
-            paths = export(controller, folder, name=LAW_NAME, allow_infeasible=True)
+            paths = export(controller, folder, name=LAW_NAME, allow_infeasible=True, fit_met=fit_met)
             return True, next(path for path in paths if path.name.endswith("_gains.h")).read_text(encoding="utf-8")
     except SeaoptError as error:
         return False, str(error)

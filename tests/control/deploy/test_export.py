@@ -193,7 +193,7 @@ def numbers(text):
 
 def test_the_matlab_script_has_the_law(tuned, tmp_path):
     """Every assignment read back; the state space's response is C_r and C_y at 20 frequencies."""
-    export(tuned, tmp_path, precision="float", name="knee joint")
+    export(tuned, tmp_path, precision="float", name="knee_joint")
     text = (tmp_path / "knee_joint_gains.m").read_text(encoding="utf-8")
     given = dict(re.findall(r"^([\w.]+) = ([^%\n]*);", text, flags=re.MULTILINE))
     for name, value in tuned.gains.items():
@@ -242,12 +242,18 @@ def test_an_infeasible_controller_is_refused_unless_asked(tuned, tmp_path):
         assert path.suffix == ".c" or "NOT FEASIBLE: this controller does not meet max_noise_gain" in path.read_text()
 
 
+def test_a_fit_that_is_not_met_stands_in_the_files(tuned, tmp_path):
+    content = json.loads(to_json(tuned.to_dict())) | {"fit_met": False}
+    for path in (*export(content, tmp_path / "a"), *export(tuned, tmp_path / "b", fit_met=False)):
+        assert path.suffix == ".c" or "the fit that this controller was tuned with is not met" in path.read_text()
+    assert all("is not met" not in path.read_text() for path in export(tuned, tmp_path / "c"))
+
+
 def test_text_cannot_leave_its_comment(tuned, tmp_path):
     content = json.loads(to_json(tuned.to_dict()))
     content |= {"feasible": False, "active_constraints": ["x */ int main(void)\n{"]}
-    for path in export(content, tmp_path, name="a/../b", allow_infeasible=True):
+    for path in export(content, tmp_path, allow_infeasible=True):
         assert path.parent == tmp_path
-        assert path.name.startswith("a_b")
         assert path.read_text().count("*/ int") == 0
 
 
@@ -256,6 +262,8 @@ def test_text_cannot_leave_its_comment(tuned, tmp_path):
     [
         ({"precision": "half"}, 'precision = "half" is not known'),
         ({"name": "../.."}, "cannot begin a name in C"),
+        ({"name": "../x"}, "cannot begin a name in C"),
+        ({"name": "a b"}, "cannot begin a name in C"),
         ({"name": "stdio"}, 'name = "stdio" is a keyword or a header of C; give another, such as stdio_law'),
         ({"name": "Math"}, "header of C"),
         ({"name": "volatile"}, "keyword"),
