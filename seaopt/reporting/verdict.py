@@ -19,6 +19,7 @@ from seaopt.robustness.verification.verification import Verification
 
 UNMET = "on a fit that is not met"
 FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
+RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
 DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 MOST_PLACES = 3  # that a reason names
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
@@ -127,11 +128,15 @@ def judge_fit(fit: Fit, again: str = "") -> StageVerdict:
 
 
 def _list_cures(errors: Sequence[FitFinding]) -> tuple[str, ...]:
-    """Return the lines to write for the likely cause that is named first."""
+    """Return the lines to write for the likely cause that is named first.
+
+    What is not told from zero is not to be freed: a search for how sharp friction is takes long and ends nowhere.
+    """
     cause = next((one for one in errors if one.kind == "cause" and one.preferred), None)
     if cause is None:
         return ()
-    return tuple(filter(None, (spell_cure(name, value) for name, (value, _) in cause.preferred.items())))
+    apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
+    return tuple(filter(None, (spell_cure(name, value) for name, value in apart.items())))
 
 
 def spell_cure(name: str, value: float) -> str:
