@@ -149,6 +149,11 @@ CASES = {
     "report": lambda: so.write_report(None, "report.html"),
     "report of nothing": lambda: so.write_report([None], "report.html"),
     "report of one": lambda: so.write_report(tuned(), "report.html"),
+    "report of others besides": lambda: so.write_report([tuned(), "junk", 42], "report.html"),
+    "report's title": lambda: so.write_report([tuned()], "report.html", title=None),
+    "recovery of no fit": lambda: so.testing.assert_recovered("fit", THOR),
+    "prediction of no fit": lambda: so.testing.assert_predicts("fit", experiment(), 95),
+    "certificate that is none": lambda: so.testing.assert_certified("certificate"),
     "report's page": lambda: so.write_report([tuned()], None),
     "quality": lambda: assess_quality(None),
 }

@@ -125,6 +125,8 @@ def run(
         raise
     for what in session.explain_left_out(stages):
         session.say(f"left out: {what}")
+    for what in session.name_leftovers(stages):
+        session.say(f"note: {what}")
     _finish(session, json, stages, quiet, verbose)
 
 

@@ -236,6 +236,11 @@ class Session:
             return ["tuning and certifying: they need a fit that has converged; mend it first"]
         return []
 
+    def name_leftovers(self, stages: list[str]) -> list[str]:
+        """Return the results in the folder that an earlier run left and this one does not replace."""
+        paths = [self.folder / FILES[stage] for stage in ("fit", "tune", "certify") if stage not in stages]
+        return [f"{path} is of an earlier run, and no part of this report" for path in paths if path.exists()]
+
     def say(self, text: str) -> None:
         """Write one line on stderr."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -398,12 +398,12 @@ class CertificatePlots(Plots):
         self._certificate = certificate
 
     def _main(self) -> Iterable[Make]:
-        found = self._certificate
-        yield lambda: certificates.requirements_panel(found)
-        yield lambda: certificates.worst_panel(found)
-        yield lambda: certificates.draws_panel(found)
-        yield lambda: loops.step_panel(found.controller, certificates.plants_of(found))
-        yield lambda: certificates.friction_panel(found)
+        certificate = self._certificate
+        yield lambda: certificates.requirements_panel(certificate)
+        yield lambda: certificates.worst_panel(certificate)
+        yield lambda: certificates.draws_panel(certificate)
+        yield lambda: loops.step_panel(certificate.controller, certificates.plants_of(certificate))
+        yield lambda: certificates.friction_panel(certificate)
         yield lambda: simulations.bandwidth_panel(self._sweeps())
 
     def _sweeps(self) -> tuple[LargeSignal, ...]:
@@ -430,8 +430,10 @@ class CertificatePlots(Plots):
 
     def step(self, *, size: float = 1.0, duration_s: float | None = None, ax: Place = None) -> PlainFigure:
         """Draw the step response of every plant, linear; `ax` is a sequence of two Axes."""
-        found = self._certificate
-        panel = loops.step_panel(found.controller, certificates.plants_of(found), size=size, duration_s=duration_s)
+        certificate = self._certificate
+        panel = loops.step_panel(
+            certificate.controller, certificates.plants_of(certificate), size=size, duration_s=duration_s
+        )
         return _draw(panel, ax)
 
     def friction(self, *, ax: Axes | None = None) -> Axes:

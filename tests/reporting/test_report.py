@@ -13,7 +13,7 @@ import seaopt as so
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.reporting import judge_results
 from seaopt.reporting.figures.panel import Panel
-from seaopt.reporting.page.chart import make_chart
+from seaopt.reporting.page.chart import make_chart, make_id
 
 
 def test_text_from_problems_is_escaped(stand, thor, tmp_path, without_drawing):
@@ -44,6 +44,28 @@ def test_the_page_says_how_the_papers_form_compares_with_the_fit(stand, stand_lo
     assert mass == pytest.approx(0.646 + 3.31e-6 / (0.002 / (6 * 3.141592653589793)) ** 2, rel=5e-4)  # (1), (2)
     assert "not of second order" not in said
     assert (tmp_path / "figures" / "response_chirp.svg").exists()
+
+
+def test_a_heading_holds_nothing_that_a_reader_does_not_see(controller, tmp_path, without_drawing):
+    page = so.write_report([controller], tmp_path / "r.html", title="a\x1b[31m \u202e b \udcff")
+    text = page.read_text(encoding="utf-8")
+    assert "<h1>a\\x1b[31m \\u202e b \\udcff</h1>" in text and "\u202e" not in text and "\x1b" not in text
+
+
+def test_every_name_has_its_own_id():
+    names = ["a_b", "a-b", "a.b", "a b", "ab", "_a_b", "a__b", "a_b_", "a_2d_b"]
+    assert len({make_id(name) for name in names}) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z0-9_-]+", make_id(name)) for name in names)
+
+
+def test_figures_of_an_earlier_page_are_removed(controller, certificate, tmp_path, without_drawing):
+    figures = tmp_path / "figures"
+    so.write_report([controller, certificate], tmp_path / "r.html")
+    before = {path.name for path in figures.iterdir()}
+    (figures / "mine.svg").write_text("mine")
+    so.write_report([controller], tmp_path / "r.html")
+    after = {path.name for path in figures.iterdir()}
+    assert after == {"loop.svg", "loop.png", "r.json", "mine.svg"} < before | {"mine.svg"}
 
 
 @pytest.fixture

@@ -157,11 +157,11 @@ def friction_panel(certificate: Certificate) -> Panel:
             "nominal": (margins, lambda one: one.factor, BLUE, "o"),
             "least of the draws": (draws, lambda one: one.factor, ORANGE, "D"),
         }
-        finite = [factor(one) for found, factor, _, _ in shown.values() for one in found.values()]
+        finite = [factor(one) for values, factor, _, _ in shown.values() for one in values.values()]
         finite = [value for value in finite if np.isfinite(value) and value > 0.0]
         low, high = 0.5 * min([1.0, *finite]), 4.0 * max([1.0, *finite])
-        for label, (found, factor, colour, marker) in shown.items():
-            at = [(float(np.clip(factor(one), low, high)), places[name]) for name, one in found.items()]
+        for label, (values, factor, colour, marker) in shown.items():
+            at = [(float(np.clip(factor(one), low, high)), places[name]) for name, one in values.items()]
             if at:
                 axis.plot(*zip(*at, strict=True), marker, color=colour, markersize=8, label=label)
         axis.axvline(1.0, color=LIMIT, linestyle="--", linewidth=0.9, label="its own friction")

@@ -77,10 +77,22 @@ def make_chart(panel: Panel) -> Chart:
         return _make_chart(panel)
 
 
+def make_id(name: str) -> str:
+    """Return a name as an id, another one for every name.
+
+    Examples
+    --------
+    >>> make_id("outputs_chirp"), make_id("a-b"), make_id("a.b")
+    ('outputs-chirp', 'a_2d_b', 'a_2e_b')
+
+    """
+    return re.sub(r"[^A-Za-z0-9]", lambda match: "-" if match[0] == "_" else f"_{ord(match[0]):x}_", name) or "figure"
+
+
 def _make_chart(panel: Panel) -> Chart:
     from seaopt.reporting.figures.canvas import label_lines
 
-    name = re.sub(r"[^A-Za-z0-9]+", "-", panel.name).strip("-") or "figure"
+    name = make_id(panel.name)
     drawn: Any = draw_panel(panel, bare=True)
     figure: Any = drawn if len(panel.heights) > 1 else drawn.get_figure(root=True)
     figure.patch.set_visible(False)
@@ -98,7 +110,7 @@ def _make_chart(panel: Panel) -> Chart:
                 key.setdefault(label, []).append((artist.get_gid(), artist))
         panes.append(_describe_axes(axis, figure, curves, str(figure.axes[-1].get_xlabel())))
     svg = _fit_to_page(render_figure(figure, "svg").decode("utf-8"), name, f"{panel.title}. {panel.caption}")
-    entries = tuple(_make_entry(label, found, name) for label, found in key.items())
+    entries = tuple(_make_entry(label, artists, name) for label, artists in key.items())
     return Chart(
         name=name, title=printable(panel.title), caption=printable(panel.caption), link=panel.link, svg=svg,
         axes=json.dumps(panes, separators=(",", ":")) if panel.hover else "", hover=panel.hover,
@@ -141,17 +153,17 @@ def _describe_side(ends: Sequence[float], scale: str, label: str) -> dict[str, A
     return {"low": float(ends[0]), "high": float(ends[1]), "log": scale == "log", "label": label}
 
 
-def _make_entry(label: str, found: list[tuple[str, Any]], name: str) -> KeyEntry:
+def _make_entry(label: str, artists: list[tuple[str, Any]], name: str) -> KeyEntry:
     from matplotlib.colors import to_hex
 
-    artist = found[0][1]
+    artist = artists[0][1]
     line = hasattr(artist, "get_linestyle") and hasattr(artist, "get_marker")
     style = str(artist.get_linestyle()) if line else "-"
     colour = artist.get_color() if line else (artist.get_facecolor())
     colour = np.atleast_2d(colour)[0] if not isinstance(colour, str) else colour
     dash = {"--": "6 3", "-.": "7 3 2 3", ":": "2 3"}.get(style, "")
     return KeyEntry(
-        label=printable(label), ids=tuple(f"{name}-{gid}" for gid, _ in found), colour=to_hex(colour), dash=dash,
+        label=printable(label), ids=tuple(f"{name}-{gid}" for gid, _ in artists), colour=to_hex(colour), dash=dash,
         marker=style in ("None", "none", "") or not line,
     )  # fmt: skip
 
@@ -166,18 +178,18 @@ def _fit_to_page(svg: str, name: str, alternative: str) -> str:
     for attribute in ("height", "width", "xmlns:xlink", "xmlns", "version"):
         if attribute != "xmlns:xlink":
             body = re.sub(rf'(<svg[^>]*?)\s{attribute}="[^"]*"', r"\1", body, count=1)
-    body = _STYLE.sub(lambda found: f'style="{_COLOUR.sub(_follow, found.group(1))}"', body)
-    body = _TAG.sub(lambda found: _DIGITS.sub(_shorten, found.group(0)), body)  # not the numbers at ticks
+    body = _STYLE.sub(lambda match: f'style="{_COLOUR.sub(_follow, match.group(1))}"', body)
+    body = _TAG.sub(lambda match: _DIGITS.sub(_shorten, match.group(0)), body)  # not the numbers at ticks
     body = re.sub(r"\s*\n\s*", "\n", body).replace("\nL ", "L")
     return body.replace("<svg", f'<svg role="img" aria-label="{escape(printable(alternative))}"', 1).strip()
 
 
-def _shorten(found: re.Match[str]) -> str:
+def _shorten(match: re.Match[str]) -> str:
     """Return a coordinate with three decimals."""
-    return f"{float(found.group(0)):.3f}".rstrip("0").rstrip(".")
+    return f"{float(match.group(0)):.3f}".rstrip("0").rstrip(".")
 
 
-def _follow(found: re.Match[str]) -> str:
+def _follow(match: re.Match[str]) -> str:
     """Return a colour as the page's variable of that name, itself where the page has none."""
-    colour = found.group(0)
+    colour = match.group(0)
     return f"var(--c{colour[1:]},{colour})"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.estimation.advice.forecasts import Percent
-from seaopt.formatting import MISSING, format_band, format_number
+from seaopt.formatting import MISSING, format_band, format_number, printable
 from seaopt.units import unit_after
 
 
@@ -20,7 +20,7 @@ def render_template(name: str, **values: Any) -> str:
 
     environment = Environment(
         loader=PackageLoader("seaopt.reporting.page", "templates"), autoescape=True, trim_blocks=True,
-        lstrip_blocks=True, undefined=StrictUndefined,
+        lstrip_blocks=True, undefined=StrictUndefined, finalize=_show,
     )  # fmt: skip
     environment.filters |= {
         "number": format_number, "band": _format_band, "interval": _format_interval, "percent": _format_percent,
@@ -41,6 +41,11 @@ def make_slug(text: str) -> str:
 
     """
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+def _show(value: Any) -> Any:
+    """Return a text with its control characters shown, markup as it is."""
+    return printable(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
 def _format_unit(unit: str) -> str:

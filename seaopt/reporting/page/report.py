@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,9 +14,9 @@ from seaopt.control.deploy.export import export
 from seaopt.control.impedance.scorecard import HEADS
 from seaopt.control.laws.controller import name_gain_units
 from seaopt.control.laws.verdict import list_design_figures
-from seaopt.errors import SeaoptError, require_type
+from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
-from seaopt.files import write_text
+from seaopt.files import read_json, write_json, write_text
 from seaopt.formatting import format_count, format_figure, format_number
 from seaopt.frequency import Survey
 from seaopt.progress import Progress, count_off, ignore
@@ -44,6 +45,7 @@ from seaopt.robustness.verification.verification import Verification, describe_w
 Result = Fit | Ranking | Controller | ForceMPC | Certificate | Verification | StabilityMap | LargeSignal
 KINDS = (Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap)
 FILED = ("controller", "fit", "ranking", "certificate", "amplitude", "contact")  # parts with figures as files
+FIGURES_SCHEMA = "seaopt/figures/1"
 LAW_NAME = "force_law"  # of the C header that can be copied
 
 
@@ -102,7 +104,8 @@ def write_report(
         At most one of each, of the last any number; sections without a result are left out. A fit that was not
         read from a file has a section of diagnostics. A certificate's simulations need not be listed.
     path : path
-        The page; figures go to the folder ``figures`` beside it.
+        The page; figures go to the folder ``figures`` beside it, with a list of them; those of an earlier page of that
+        name which this one does not have are removed.
     title : str
         Heading of the page.
     progress : callable, optional
@@ -136,26 +139,48 @@ def write_report(
     """
     require_type(results, Sequence, "results", "give a list of results")
     require_type(path, (str, Path), "path", "give the page to write")
+    require_type(title, str, "title", "give the page's heading")
+    for result in results:
+        require_type(
+            result, (*KINDS, LargeSignal), "results", "give what fit, tune, certify, verify or compare returned"
+        )
     material, target = _sort_results(results), Path(path)
     plates = list_plates(material)
     drawn: dict[str, list[DrawnPlate]] = {}
+    figures: list[Path] = []
     for plate in count_off(plates, "figure", progress):
         if plate.part in FILED:
-            write_figure(compose_sheet(plate.panels), target.parent / "figures" / plate.name)
+            figures += write_figure(compose_sheet(plate.panels), target.parent / "figures" / plate.name)
         charts = tuple(make_chart(panel) for panel in plate.panels)
         drawn.setdefault(plate.part, []).append(
             DrawnPlate(name=plate.name, heading=plate.heading, charts=charts, text=plate.text)
         )
     page = write_text(target, _render(material, drawn, title, files, command, expectations))
+    _list_figures(target, figures)
     progress(format_count(len(plates), "figure"), 1.0)
     return page
+
+
+def _list_figures(page: Path, figures: Sequence[Path]) -> None:
+    """Write the names of a page's figures beside them, and remove those that it had before and has no more."""
+    folder = page.parent / "figures"
+    contents = folder / f"{page.stem}.json"
+    names = sorted(figure.name for figure in figures)
+    before: set[str] = set()
+    with suppress(FileError):  # none, or one that somebody wrote: then nothing is known to be this page's
+        before = {str(name) for name in read_json(contents, FIGURES_SCHEMA).get("figures", ())}
+    for name in before - set(names):
+        if Path(name).name == name and Path(name).suffix in (".svg", ".png"):
+            (folder / name).unlink(missing_ok=True)
+    if names or before:
+        write_json(contents, {"schema": FIGURES_SCHEMA, "figures": names})
 
 
 def _sort_results(results: Sequence[Result]) -> Material:
     """Return the results by their kind, with what a certificate brings besides."""
     fit, ranking, controller, mpc, certificate, verification, coupled = (_select(results, kind) for kind in KINDS)
     large = tuple(result for result in results if isinstance(result, LargeSignal))
-    if not any(isinstance(result, (*KINDS, LargeSignal)) for result in results):
+    if not results:
         raise SeaoptError(
             "write_report got no result; give a Fit, a Ranking, a Controller, a Certificate or a Verification"
         )

@@ -41,18 +41,18 @@ class Side {
   ticks(count) {
     const [low, high] = [this.value(this.from), this.value(this.to)].sort((p, q) => p - q);
     if (this.log && high / low > 3) {
-      const found = [];
+      const marks = [];
       const steps = high / low > 1e3 ? [1] : [1, 2, 5];
       const stride = Math.max(1, Math.ceil(Math.log10(high / low) / (1.5 * count)));
       for (let decade = Math.floor(Math.log10(low)); decade <= Math.log10(high); decade += stride)
-        for (const step of steps) found.push(step * 10 ** decade);
-      return found.filter((value) => value >= low && value <= high).map((value) => [value, format(value)]);
+        for (const step of steps) marks.push(step * 10 ** decade);
+      return marks.filter((value) => value >= low && value <= high).map((value) => [value, format(value)]);
     }
     const raw = (high - low) / count, size = 10 ** Math.floor(Math.log10(raw));
     const step = size * [1, 2, 5, 10].find((factor) => factor * size >= raw);
-    const found = [];
-    for (let k = Math.ceil(low / step); k * step <= high; k += 1) found.push([k * step, format(k * step, step)]);
-    return found;
+    const marks = [];
+    for (let k = Math.ceil(low / step); k * step <= high; k += 1) marks.push([k * step, format(k * step, step)]);
+    return marks;
   }
 }
 
