@@ -89,8 +89,22 @@ def describe_os_error(error: OSError | ValueError) -> str:
 
 
 def write_text(path: Path | str, content: str) -> Path:
-    """Write text as UTF-8, as `write_bytes` does."""
-    return write_bytes(path, content.encode())
+    """Write text as UTF-8, as `write_bytes` does.
+
+    Raises
+    ------
+    FileError
+        It holds half a character, as a name that is no text does; or as of `write_bytes`.
+
+    """
+    try:
+        raw = content.encode()
+    except UnicodeEncodeError as error:
+        around = ascii(content[max(error.start - 20, 0) : error.end])
+        raise FileError(
+            f"{path}: cannot be written, as {around} is not text; remove or rename what is so named"
+        ) from error
+    return write_bytes(path, raw)
 
 
 def plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import shlex
 import sys
 from collections.abc import Sequence
@@ -9,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from seaopt.cli.terminal import Terminal
-from seaopt.errors import ProblemError
-from seaopt.files import to_json, write_text
+from seaopt.errors import ProblemError, SeaoptError
+from seaopt.files import check_regular, describe_os_error, to_json, write_text
 from seaopt.problem import read_problem
 from seaopt.problem.proposal import Proposal, Question, propose
 
@@ -26,17 +27,13 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
         A log cannot be read, a file is there already, or an answer is missing.
 
     """
-    target = output or (logs[0].with_suffix(".toml") if len(logs) == 1 else logs[0].parent / "problem.toml")
-    if target.exists() and not force:
-        others = " ".join(shlex.quote(str(log)) for log in logs)
-        raise ProblemError(f"{target}: is there already; to replace it type seaopt new {others} -o {target} --force")
+    target = _choose_target(logs, output, force=force)
     folder, answers = target.parent, dict[str, str]()
     proposal = propose(logs, answers, folder, target.stem)
     console = Terminal(stderr=json)
     if not yes and not json:
         proposal = _interview(console, logs, answers, folder, proposal, target.stem)
-    write_text(target, proposal.text)
-    read_problem(target)  # what was written is what the other commands take
+    _write_checked(target, proposal.text)
     if json:
         rows = [asdict(column) for column in proposal.columns]
         sys.stdout.write(to_json({
@@ -48,6 +45,42 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
         _print_columns(console, proposal)
     _print_end(console, proposal, target)
     return target
+
+
+def _choose_target(logs: Sequence[Path], output: Path | None, *, force: bool) -> Path:
+    """Return the file to write; one that is a log, is there already, or is no problem file by its name is refused."""
+    for log in logs:
+        check_regular(log)
+    target = output or (logs[0].with_suffix(".toml") if len(logs) == 1 else logs[0].parent / "problem.toml")
+    command = shlex.join(["seaopt", "new", *map(str, logs), "-o"])
+    other = shlex.quote(str(target.parent / f"{target.stem or 'problem'}.toml"))
+    if target.suffix.lower() != ".toml":
+        raise ProblemError(f"{target}: a problem file ends in .toml; type {command} {other}")
+    if any(target.exists() and log.exists() and target.samefile(log) for log in logs):
+        raise ProblemError(
+            f"{target}: is one of the logs, which are never replaced; give another file: -o problem.toml"
+        )
+    if target.exists() and not force:
+        again = f"{command} {shlex.quote(str(target))} --force"
+        raise ProblemError(f"{target}: is there already; to replace it type {again}")
+    return target
+
+
+def _write_checked(target: Path, text: str) -> None:
+    """Write a problem file that the other commands take; where they would not, what was there stays."""
+    draft = target.with_name(f".seaopt-{secrets.token_hex(8)}.toml")
+    try:
+        write_text(draft, text)
+        read_problem(draft)
+        draft.replace(target)
+    except SeaoptError as error:
+        raise ProblemError(str(error).replace(str(draft), str(target))) from error
+    except OSError as error:
+        raise ProblemError(
+            f"{target}: cannot be written ({describe_os_error(error)}); give another file: -o"
+        ) from error
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def _interview(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -670,6 +671,10 @@ def _read_toml(source: Path) -> dict[str, Any]:
         check_regular(source)
     except FileError as error:
         found = next(iter(sorted(source.glob("*.toml"))), "problem.toml")
-        raise ProblemError(f"{error}: seaopt run {found}") from error
-    remedy = f"write one from a log: seaopt new LOG -o {source}"
+        raise ProblemError(f"{error}: seaopt run {shlex.quote(str(found))}") from error
+    # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
+    is_log = source.suffix.lower() != ".toml"
+    remedy = "write one from a log: " + shlex.join(
+        ["seaopt", "new", str(source)] if is_log and source.exists() else ["seaopt", "new", "LOG", "-o", str(source)]
+    )
     return parse_file(source, tomllib.loads, "TOML", remedy=remedy, error=ProblemError)

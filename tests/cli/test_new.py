@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 
 import pytest
 
@@ -95,3 +96,47 @@ def test_control_characters_of_a_header_do_not_reach_the_terminal(folder, seaopt
     out = seaopt("new", "evil.csv", "--yes")
     assert "\x1b" not in out.stdout + out.stderr and "\x07" not in out.stdout
     assert "\x1b" not in (folder / "evil.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("target", ["knee.csv", "./knee.csv", "link.toml", "keep"])
+def test_a_log_is_never_written_over(folder, seaopt, held, target):
+    (folder / "link.toml").symlink_to("knee.csv")
+    before = held.read_bytes()
+    for force in ((), ("--force",)):
+        out = seaopt("new", "knee.csv", "-y", "-o", target, *force)
+        assert out.returncode == 2 and "--force" not in out.stderr and len(out.stderr.strip().splitlines()) == 1
+    assert held.read_bytes() == before and (folder / "link.toml").is_symlink() and not (folder / "keep").exists()
+
+
+def test_a_log_in_toml_is_never_written_over_by_the_name_beside_it(folder, seaopt, held):
+    log = held.rename(folder / "knee.toml")
+    before = log.read_bytes()
+    assert seaopt("new", "knee.toml", "-y", "--force").returncode == 2
+    assert log.read_bytes() == before
+
+
+def test_a_log_taken_for_a_problem_file_is_not_offered_as_the_file_to_write(folder, seaopt, held):
+    out = seaopt("fit", "knee.csv")
+    assert out.returncode == 2 and "seaopt new knee.csv" in out.stderr and "-o" not in out.stderr
+
+
+def test_a_folder_is_no_log(folder, seaopt):
+    out = seaopt("new", ".", "-y")
+    assert out.returncode == 2 and "is a folder" in out.stderr
+
+
+def test_a_name_that_is_no_text_is_refused(folder, seaopt, held):
+    try:
+        (folder / os.fsdecode(b"bad\xff.csv")).write_bytes(held.read_bytes())
+    except OSError:
+        pytest.skip("this file system holds names of text alone")
+    out = seaopt("new", os.fsdecode(b"bad\xff.csv"), "-y")
+    assert out.returncode == 2 and "rename the log" in out.stderr
+    assert not list(folder.glob("bad*.toml")) and not list(folder.glob(".seaopt*"))
+
+
+def test_commands_to_type_are_quoted(folder, seaopt, held):
+    (folder / "my log.csv").write_bytes(held.read_bytes())
+    assert seaopt("new", "my log.csv", "-y").returncode == 0
+    out = seaopt("new", "my log.csv", "-y")
+    assert out.returncode == 2 and "seaopt new 'my log.csv' -o 'my log.toml' --force" in out.stderr

@@ -186,6 +186,32 @@ def test_a_header_says_what_it_says(header, quantity, side, unit):
     assert (read.quantity, read.side, read.unit) == (quantity, side, unit)
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "motor_vel_act", "speed_ist", "drehzahl_ist", "rpm_act", "joint_velocity_act", "enc_vel", "encoder_speed",
+        "vel_x", "acc_x", "enc_vel_m", "motor_vel [rad]", "Drehzahl_Geber", "position_rate", "omega_y",
+    ],
+)  # fmt: skip
+def test_a_speed_is_no_angle_whatever_else_its_name_says(header):
+    assert read_header(header).quantity == "speed"
+
+
+@pytest.mark.parametrize("header", ["motor_act", "motor_ist"])
+def test_measured_alone_says_nothing_of_the_quantity(header):
+    assert read_header(header).quantity == "" and read_header(header).measured
+
+
+def test_the_angle_is_used_beside_the_speed(tmp_path, logs):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {
+        "t_s": logs["t"], "iq_A": held["I"], "motor_vel_act": held["omega_m"], "motor_pos_act": held["theta_m"],
+        "tau_s [Nm]": held["tau_s"],
+    })  # fmt: skip
+    rows = {row.column: row.role for row in propose([path], {}, tmp_path).columns}
+    assert rows["motor_pos_act"] == "theta_m" and rows["motor_vel_act"] == ""
+
+
 def test_a_fit_of_what_was_proposed_recovers_a_knee(tmp_path):
     """With the motor's own figures known; stiffness, inertias, friction and damping come from the log."""
     t, current = drive(10.0, RATE, 2.0)
@@ -323,6 +349,36 @@ def test_a_log_elsewhere_is_refused_with_the_command(tmp_path, logs):
     path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
     with pytest.raises(so.SeaoptError, match=r"seaopt new .*a.csv -o .*problem.toml"):
         propose([path], {}, tmp_path / "in")
+
+
+@pytest.mark.parametrize(
+    ("names", "match"),
+    [
+        (("t [s]", "F1 [N]", "F2 [N]"), r"no column drives a motor, of F1 \[N\] and F2 \[N\]; log its current"),
+        (("time", "time2", "x"), "nothing is measured besides the input, x"),
+    ],
+)
+def test_a_log_without_an_input_or_an_output_is_refused(tmp_path, logs, names, match):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", dict(zip(names, (logs["t"], held["I"], held["tau_s"]), strict=True)))
+    with pytest.raises(so.SeaoptError, match=match):
+        propose([path], {}, tmp_path)
+
+
+def test_a_comma_before_three_digits_is_asked_about(tmp_path, logs):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]})
+    with pytest.raises(so.SeaoptError, match=r"may be 1\.000 or 1000"):
+        propose([path], {"N": "1,000"}, tmp_path)
+    assert "N     = 0.125 " in propose([path], {"N": "0,125"}, tmp_path).text
+
+
+def test_experiments_get_names_of_their_own(tmp_path, logs):
+    held = logs["held"]
+    columns = {"t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": held["tau_s"]}
+    paths = [write_csv(tmp_path / name, columns) for name in ("a_b_2.csv", "a_b.csv", "a b.csv", "a.b.csv")]
+    problem = write(tmp_path, propose(paths, {}, tmp_path).text)
+    assert [one.name for one in problem.table.experiment] == ["a_b_2", "a_b", "a_b_3", "a_b_4"]
 
 
 @pytest.mark.parametrize("text", ["note\na\nb\n", "t [s],I [A]\n0,1\n1,1\n2,1\n"])

@@ -15,14 +15,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.errors import ProblemError
+from seaopt.errors import LogError, ProblemError
 from seaopt.formatting import join_words, printable
 from seaopt.logs import assess_quality
 from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality, assess_clock
@@ -175,7 +177,7 @@ def _assign(survey: Survey, interview: Interview, turns: bool) -> Assignment:
         "roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"),
     )  # fmt: skip
     if whole == "yes":
-        return roles
+        return _check_outputs(roles, survey)
     known = {one.name: role for role, one in roles.columns.items()}
     choices = (*INPUTS, *(ROTARY_OUTPUTS if turns else LINEAR_OUTPUTS), "none")
     given = {
@@ -187,7 +189,18 @@ def _assign(survey: Survey, interview: Interview, turns: bool) -> Assignment:
     chosen = [role for role in given.values() if role in INPUTS]
     if len(chosen) != 1:
         raise ProblemError(f"{survey.name}: {len(chosen)} columns are inputs; give exactly one of {', '.join(INPUTS)}")
-    return assign(survey, rotary=turns, given={name: "" if role == "none" else role for name, role in given.items()})
+    known = {name: "" if role == "none" else role for name, role in given.items()}
+    return _check_outputs(assign(survey, rotary=turns, given=known), survey)
+
+
+def _check_outputs(roles: Assignment, survey: Survey) -> Assignment:
+    """Refuse a log of an input alone."""
+    if not roles.outputs:
+        raise LogError(
+            f"{survey.name}: nothing is measured besides the input, {roles.columns[roles.input].name}; log a force, a "
+            "torque or an angle as well"
+        )
+    return roles
 
 
 def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folder: Path, at: int) -> _Log:
@@ -215,11 +228,17 @@ def _describe_log(survey: Survey, roles: Assignment, interview: Interview, folde
 
 def _relative(path: Path, folder: Path) -> str:
     try:
+        path.name.encode()
+    except UnicodeEncodeError:
+        raise ProblemError(
+            f"{path}: a problem file cannot name it, for its name is not UTF-8; rename the log"
+        ) from None
+    try:
         return path.resolve().relative_to(folder.resolve()).as_posix()
     except ValueError:
+        beside = shlex.join(["seaopt", "new", str(path), "-o", str(path.parent / "problem.toml")])
         raise ProblemError(
-            f"{path}: is not in the folder of the problem file, {folder}; write that beside the log: "
-            f"seaopt new {path} -o {path.parent / 'problem.toml'}"
+            f"{path}: is not in the folder of the problem file, {folder}; write that beside the log: {beside}"
         ) from None
 
 
@@ -339,7 +358,7 @@ def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Inte
         lines += ["", f"[plant.{name}]", *(f"{key} = {_value(value)}" for key, value in options.items())]
     names: set[str] = set()
     for log in logs:
-        name = log.name if log.name not in names else f"{log.name}_{len(names) + 1}"
+        name = next(one for one in _number_names(log.name) if one not in names)
         names.add(name)
         lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
         for table, roles in (("inputs", (log.roles.input,)), ("outputs", log.outputs)):
@@ -357,6 +376,12 @@ def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Inte
     else:
         lines += ["", "# No [controller]: these logs have neither a torque or force, nor both encoders of the spring."]
     return "\n".join(lines) + "\n"
+
+
+def _number_names(name: str) -> Iterator[str]:
+    """Yield a name, and then the name with 2, 3, ... at its end."""
+    yield name
+    yield from (f"{name}_{number}" for number in count(2))
 
 
 def _describe_experiment(log: _Log, name: str, interview: Interview) -> list[tuple[str, str]]:

@@ -11,6 +11,7 @@ from seaopt.formatting import printable
 from seaopt.records import record
 
 UNKNOWN = "unknown"
+THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})")  # or a German decimal
 
 
 @record
@@ -64,6 +65,10 @@ class Question:
             return found[0]
         if self.open and text.casefold() in (UNKNOWN, "?", "no", "n", "-"):
             return UNKNOWN
+        if THOUSANDS.fullmatch(text):
+            raise ProblemError(
+                f'"{text}" may be {text.replace(",", ".")} or {text.replace(",", "")}; write one of them'
+            )
         try:
             number = float(text.replace(",", "."))
         except ValueError:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from seaopt.errors import LogError
+from seaopt.formatting import join_words
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, find_leader, regress
 from seaopt.problem.proposal.vocabulary import UNITS_OF, Quantity
 from seaopt.records import record
@@ -75,7 +77,7 @@ def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignm
     doubts: list[str] = []
     role = next((role for role in columns if role in INPUTS), None)
     if role is None:
-        role, column, doubt = _find_input(free)
+        role, column, doubt = _find_input(free, survey)
         columns = {role: column, **columns}
         free.remove(column)
         doubts += [doubt] if doubt else []
@@ -92,8 +94,15 @@ def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignm
     )  # fmt: skip
 
 
-def _find_input(columns: Sequence[SurveyedColumn]) -> tuple[str, SurveyedColumn, str]:
-    """Return the input's role, its column, and why that is a guess, if it is one."""
+def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str, SurveyedColumn, str]:
+    """Return the input's role, its column, and why that is a guess, if it is one.
+
+    Raises
+    ------
+    LogError
+        No column drives a motor.
+
+    """
     for role, quantity in OF_INPUT.items():
         named = [one for one in columns if one.header.quantity == quantity]
         if role in ("torque", "goal"):  # which are measured as often
@@ -106,8 +115,15 @@ def _find_input(columns: Sequence[SurveyedColumn]) -> tuple[str, SurveyedColumn,
         best = min(named, key=lambda one: (not one.header.commanded, one.header.side == "link"))
         others = [one.name for one in named if one is not best]
         return role, best, f"{best.name} is the input, and not {', '.join(others)}" if others else ""
-    unknown = [one for one in columns if not one.header.quantity] or list(columns)
-    leader = find_leader(columns if len(unknown) == len(columns) else unknown) if len(columns) > 1 else columns[0]
+    likely = [one for one in columns if not one.header.quantity]
+    likely = likely or [one for one in columns if one.header.quantity in ("torque", "angle")]
+    if not likely:
+        names = join_words([one.name for one in survey.columns])
+        raise LogError(
+            f"{survey.name}: no column drives a motor, of {names}; log its current as well, or the torque, voltage, "
+            "duty or goal that it is sent"
+        )
+    leader = find_leader(likely)
     role = "torque" if leader.header.quantity == "torque" else "goal" if leader.header.quantity == "angle" else "I"
     return role, leader, f"{leader.name} is the input: the other columns follow it"
 

@@ -36,7 +36,7 @@ QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
         "sample", "samples", "no", "nr",
     }),
 }  # fmt: skip
-PLACE_WORDS = frozenset({"pos", "position", "enc", "encoder", "q", "x", "y", "coordinate", "geber", "ist", "act"})
+PLACE_WORDS = frozenset({"pos", "position", "enc", "encoder", "q", "x", "y", "coordinate", "geber"})
 SIDE_WORDS: dict[Side, frozenset[str]] = {
     "spring": frozenset({
         "spring", "feder", "sea", "s", "deflection", "defl", "compression", "auslenkung", "federweg", "sensor", "taus",
@@ -131,6 +131,8 @@ def read_header(name: str, unit: str | None = None) -> Header:
     own = _quantity_of_unit(stated or suffix)
     if "other" in kinds and own in ("", "voltage", "current"):  # of the supply, say
         own = "other"
+    if "speed" in kinds and own in ("angle", "length"):  # a speed in rad, say, is none the less no angle
+        own = "speed"
     quantity = "voltage" if bare == "V" else own or _decide(kinds, place=place, counts=COUNTS in (stated, suffix))
     return Header(
         name=name, quantity=quantity, side=_find_side(words), unit=stated or suffix,
@@ -189,7 +191,7 @@ def _fits(unit: str, kinds: list[Quantity], words: list[str], *, place: bool) ->
     if unit == COUNTS or measured in kinds:
         return True
     if measured in ("angle", "length"):
-        return place or (not kinds and unit != "m")
+        return (place and "speed" not in kinds) or (not kinds and unit != "m")
     return not kinds and len(unit) > 1 and bool(words)
 
 
@@ -215,7 +217,7 @@ def _matches(words: Iterable[str], known: frozenset[str]) -> list[str]:
 def _decide(kinds: list[Quantity], *, place: bool, counts: bool) -> Quantity:
     """Return the one quantity of a name's words; of several, the most telling."""
     for quantity in ("other", "speed", "duty", "current", "voltage", "torque", "force", "angle", "length", "time"):
-        if quantity in kinds and not (quantity == "speed" and place and kinds == ["speed"]):
+        if quantity in kinds:
             return quantity
     return "angle" if place or counts else ""
 
