@@ -38,7 +38,7 @@ def write_problem(logs: Sequence[Path], output: Path | None, *, yes: bool, force
         rows = [asdict(column) for column in proposal.columns]
         sys.stdout.write(to_json({
             "schema": "seaopt/new/1", "file": str(target), "columns": rows,
-            "guesses": {one.key: one.guess for one in proposal.guesses},
+            "guesses": {one.key: one.guess for one in proposal.guesses}, "guessed": list(proposal.guessed),
         }))  # fmt: skip
         return target
     if yes:
@@ -138,11 +138,15 @@ def _print_columns(console: Terminal, proposal: Proposal) -> None:
 
 def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
     """Print what was written, what of it is a guess, and the command to type next."""
-    guessed = [one for one in proposal.guesses if one.key != "roles"]
+    guesses = [(one.label, one.guess, one.why) for one in proposal.guesses if one.key != "roles"]
+    if any(one.key == "roles" for one in proposal.guesses):
+        guesses += [(f'Column "{one.column}"', one.role, one.doubt) for one in proposal.columns if one.doubt]
     console.say(f"wrote {target}", soft_wrap=True)
-    if guessed:
-        are = "is a guess" if len(guessed) == 1 else "are guesses"
-        console.say(f"{len(guessed)} of its values {are}, marked in it:")
-        console.tabulate([(one.label, one.guess, one.why) for one in guessed])
+    if guesses:
+        are = "is a guess" if len(guesses) == 1 else "are guesses"
+        console.say(f"{len(guesses)} of its values {are}, marked in it:")
+        console.tabulate(guesses)
+    if proposal.guessed:
+        console.wrap('Verdicts name those that they rest on, until they are out of "guessed" in the file.')
     out = shlex.quote(str(target.with_suffix("")))
     console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)

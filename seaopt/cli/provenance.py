@@ -104,7 +104,7 @@ def _read_by_fit(problem: Problem) -> dict[str, Any]:
     names = {name for plant in plants for name in problem.plants[plant].parameters}.union(problem.parameters.free_names)
     table["plant"] = {name: plant for name, plant in table["plant"].items() if name in plants}
     table["parameters"] = {name: value for name, value in table["parameters"].items() if name in names}
-    return table
+    return table | ({"guessed": problem.table.guessed} if problem.table.guessed else {})
 
 
 def _read_by_design(problem: Problem) -> dict[str, Any]:

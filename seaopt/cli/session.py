@@ -29,6 +29,7 @@ from seaopt.control.laws.delay import settle_delay, warn_short_delay
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, warn_unidentified
+from seaopt.estimation.result.findings import state_guesses
 from seaopt.files import check_folder, read_json, to_json, write_json
 from seaopt.formatting import printable
 from seaopt.logs import Log, write_log
@@ -55,6 +56,7 @@ from seaopt.reporting.verdict import (
     judge_controller,
     judge_expectations,
     judge_fit,
+    name_guesses,
 )
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.signals import Signal
@@ -353,7 +355,7 @@ class Session:
         versions = {"seaopt": __version__, "python": platform.python_version(), "machine": platform.machine()}
         content = content | {"provenance": content.get("provenance", {}) | versions}
         if stage not in ("fit", "frf"):
-            content = content | {"fit_met": self.fit_met()}
+            content = content | {"fit_met": self.fit_met(), "guessed": self.problem.table.guessed}
         made_from = digest_sources(self.problem, stage, self.folder) | {"content": digest_content(content)}
         self.written.append(write_json(self.folder / FILES[stage], content | {"made_from": made_from}))
 
@@ -555,7 +557,7 @@ class Session:
             return [StageVerdict(met=good, text=text) for good, text in result.verdict()]
         verdicts: list[StageVerdict] = []
         if stage == "fit" and result is not None:
-            return [judge_fit(result, self._spell("fit"))]
+            return self._name_guesses([judge_fit(result, self._spell("fit"))])
         if stage == "tune" and result is not None:
             joint, sweep = self.results.get("joint"), f"{self._spell('tune')} --sweep"
             if joint is not None:
@@ -565,10 +567,15 @@ class Session:
             again = self._spell("run" if self.problem.table.experiment else "tune")
             verdicts.append(judge_certificate(result, again, f"{self._spell('tune')} --sweep"))
         if stage not in ("tune", "certify", "sweep") or self.fit_met():
-            return verdicts
+            return self._name_guesses(verdicts)
         if stage == "sweep":
             return [StageVerdict(met=False, text=UNMET, next=(f"mend the fit: {self._spell('fit')}",))]
         return [doubt_design(one) for one in verdicts]
+
+    def _name_guesses(self, verdicts: list[StageVerdict]) -> list[StageVerdict]:
+        """Return verdicts of which those that are met name the guesses that they rest on."""
+        guesses = state_guesses(self.problem.table.guessed)
+        return [name_guesses(one, guesses) for one in verdicts]
 
     def _spell(self, command: str) -> str:
         """Return a command on this problem as it is typed."""

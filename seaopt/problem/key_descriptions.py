@@ -6,6 +6,8 @@ KEYS: dict[str, dict[str, str]] = {
     "ProblemTable": {
         "schema": "Version of this format: 1.",
         "title": "Heading of the report.",
+        "guessed": "What of this file nobody knew: names of parameters, or words for other entries. Every verdict "
+        "names them; take a name out once its value is known.",
         "parameters": "Values of the plants' parameters, in their own SI units where no unit is given; what is "
         "left out has the plant's default.",
         "plant": "Plants by name: a kind with its options, or equations.",

@@ -543,6 +543,7 @@ class ProblemTable(_Strict):
 
     version: Annotated[Literal[1], Field(alias="schema")]
     title: str = "untitled"
+    guessed: list[Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=200)]] = []
     parameters: dict[str, Number | ParameterTable] = {}
     plant: dict[Name, AnyPlant]
     experiment: list[ExperimentTable] = []

@@ -22,6 +22,7 @@ from seaopt.control.laws.delay import settle_delay
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
+from seaopt.estimation.result.findings import find_guesses, order_findings
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -58,10 +59,12 @@ def fit_problem(
     fitted = problem.choose_fitted(problem.experiments() if experiments is None else experiments)
     if not fitted:
         raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them: use = "fit"')
-    return fit(
+    result = fit(
         fitted, problem.parameters, progress=progress, alternatives=tuple(problem.plants.values()),
         **problem.fit_options,
     )  # fmt: skip
+    findings = order_findings((*result.findings, *find_guesses(problem.table.guessed)))
+    return replace(result, findings=findings)
 
 
 def score_problem(problem: Problem, result: Fit, experiments: Sequence[Experiment]) -> list[ModelledOutputs]:

@@ -91,7 +91,14 @@ def judge_results(
         designs.append(_judge_verification(verification))
     first = [] if fit is None else [judge_fit(fit)]
     sound = fit is None or fit.met
-    return [*first, *(designs if sound else map(doubt_design, designs)), *judge_expectations(expectations)]
+    judged = [*first, *(designs if sound else map(doubt_design, designs))]
+    guesses = "" if fit is None else fit.guesses
+    return [*(name_guesses(one, guesses) for one in judged), *judge_expectations(expectations)]
+
+
+def name_guesses(verdict: StageVerdict, guesses: str) -> StageVerdict:
+    """Return the verdict with the guesses that it rests on ("on 2 guesses: N_p, l"), where it is met."""
+    return replace(verdict, text=f"{verdict.text}, {guesses}") if verdict.met and guesses else verdict
 
 
 def doubt_design(verdict: StageVerdict) -> StageVerdict:

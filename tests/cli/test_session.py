@@ -290,6 +290,30 @@ def test_a_design_on_a_fit_that_is_not_met_says_so(write, tmp_path, capsys):
     assert not export_controller(tmp_path / "out", tmp_path / "c", json=False)
 
 
+def test_what_was_guessed_is_named_by_every_verdict_until_it_is_taken_out(write, tmp_path, capsys):
+    known = BENCH.replace("[plant.stand]", "b_r = { value = 1e-4, free = true }\n[plant.stand]")
+    known += '[controller]\nplant = "stand"\nmeasured = "F1"\nbandwidth_hz = 30\nsample_rate_hz = 1000\n'
+    guessed = known.replace("schema = 1\n", 'schema = 1\nguessed = ["N_p", "unit of F1, F2"]\n')
+    session = Session(write(guessed), tmp_path / "out")
+    for stage in ("fit", "tune"):
+        session.run(stage)
+    session.show(False, ["fit", "tune"])
+    out = " ".join(capsys.readouterr().out.split())
+    lines = out.split("met ")[1:3]
+    assert all("on 2 guesses: N_p, unit of F1, F2" in line for line in lines)
+    content = json.loads((tmp_path / "out" / "fit.json").read_text(encoding="utf-8"))
+    (finding,) = (one for one in content["findings"] if one["kind"] == "guess")
+    assert finding["severity"] == "warning" and finding["where"] == "on 2 guesses: N_p, unit of F1, F2"
+    assert so.Fit.from_dict(content).verdict.endswith("on 2 guesses: N_p, unit of F1, F2")
+    session.run("report")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert page.count("every limit met, on 2 guesses: N_p, unit of F1, F2") >= 1
+    controller = json.loads((tmp_path / "out" / "controller.json").read_text(encoding="utf-8"))
+    assert controller["guessed"] == ["N_p", "unit of F1, F2"]
+    with pytest.raises(so.SeaoptError, match="made from another problem file"):
+        Session(write(known), tmp_path / "out").parameters()
+
+
 def test_a_long_stage_writes_its_progress_to_a_file(write, tmp_path, monkeypatch, capsys):
     """At most one line per interval, also while the stage tells nothing; none where it ends before."""
     monkeypatch.setattr("seaopt.cli.session.REPORT_S", 0.2)

@@ -288,7 +288,7 @@ def test_answers_take_the_place_of_guesses(tmp_path, logs):
     while missing := [one for one in propose([path], answers, tmp_path).questions if one.key not in answers]:
         answers |= {one.key: one.guess for one in missing}
     proposal = propose([path], answers, tmp_path)
-    assert not proposal.guesses and "guessed:" not in proposal.text
+    assert not proposal.guesses and "guessed" not in proposal.text.split("schema")[1]
     problem = write(tmp_path, proposal.text)
     assert {name: problem.parameters[name].value for name in ("N", "K_tau", "k_s", "m")} == {
         "N": 80.0, "K_tau": 0.04, "k_s": 250.0, "m": 3.0,
@@ -296,6 +296,49 @@ def test_answers_take_the_place_of_guesses(tmp_path, logs):
     assert problem.parameters["k_s"].prior_std == pytest.approx(12.5)
     assert problem.table.controller.robust_to == ["hanging"]
     assert problem.table.robustness.retune > 0 and "J_l" in problem.table.robustness.parameters
+
+
+def test_what_results_rest_on_and_nobody_knew_is_data(tmp_path, logs):
+    held = logs["held"]
+    path = write_csv(tmp_path / "a.csv", {"a": logs["t"], "b": held["I"], "tau": held["tau_s"]})
+    problem = write(tmp_path, propose([path], {}, tmp_path).text)
+    # K_tau is fitted, m is left out and the bandwidth is a wish: nothing rests on a guess of them.
+    assert set(problem.table.guessed) == {
+        "unit of a", "unit of b", "unit of tau", "role of a", "role of b", "link of a.csv", "N", "k_s",
+        "sample_rate_hz", "current_limit_A",
+    }  # fmt: skip
+    known = {"roles": "yes", "unit:a": "s", "N": "100", "k_s": "unknown"}
+    problem = write(tmp_path, propose([path], known, tmp_path).text)
+    assert set(problem.table.guessed) == {
+        "unit of b", "unit of tau", "link of a.csv", "k_s", "sample_rate_hz", "current_limit_A",
+    }  # fmt: skip
+    assert next(line for line in propose([path], known, tmp_path).text.splitlines() if line.startswith("k_s ")).count(
+        "guessed: no log tells it"
+    )
+
+
+def test_reasons_of_guesses_are_true(tmp_path, logs):
+    screw = logs["screw"]
+    path = write_csv(
+        tmp_path / "a.csv", {"t [s]": logs["t"], "I": screw["I"], "F1": screw["F1"], "F2 [foo]": screw["F2"]}
+    )
+    why = {one.key: one.why for one in propose([path], {}, tmp_path).questions}
+    assert why["unit:I"] == "by the size of its numbers" and "size" not in why["unit:F1"]
+    assert why["unit:F2 [foo]"].startswith('"foo" is not a known unit')
+    path = write_csv(tmp_path / "b.csv", {"a": logs["t"], "b": screw["I"], "c": screw["F1"]})
+    assert "unit" not in {one.key: one.why for one in propose([path], {}, tmp_path).questions}["actuator"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_column_without_numbers_is_listed_as_such(tmp_path, logs):
+    held = logs["held"]
+    huge = held["tau_s"].copy()
+    huge[[50, 51]] = 1e300, -1e308
+    path = write_csv(tmp_path / "a.csv", {
+        "t [s]": logs["t"], "I [A]": held["I"], "tau_s [N m]": huge, "theta_m [rad]": np.full(huge.size, np.nan),
+    })  # fmt: skip
+    rows = {row.column: row.description for row in propose([path], {}, tmp_path).columns}
+    assert rows["theta_m [rad]"] == "not used: holds no number"
 
 
 def test_wrong_roles_can_be_put_right(tmp_path, logs):

@@ -146,6 +146,7 @@ class LawFile(_Strict):
     measured_responses: Any = None
     provenance: Any = None
     fit_met: Any = None
+    guessed: Any = None
     made_from: Any = None
 
     @model_validator(mode="after")

@@ -24,7 +24,7 @@ from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, r
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
-from seaopt.estimation.result.findings import SEVERITIES, FitFinding, OutputFit
+from seaopt.estimation.result.findings import FitFinding, OutputFit, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
@@ -114,7 +114,7 @@ def _measure_excess(problem: FitProblem, residuals: ResidualsByExperiment) -> di
 
 def _conclude(fit: Fit, findings: Sequence[FitFinding]) -> Fit:
     """Return the fit with its findings, errors first; one that explains too little did not converge."""
-    ordered = tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+    ordered = order_findings(findings)
     unexplained = [one for one in ordered if one.kind == "explained" and one.severity == "error"]
     if fit.status == "converged" and unexplained:
         message = f"{unexplained[0].where}: {unexplained[0].text} ({fit.message})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from seaopt.units import unit_after
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+GUESS = "guess"  # kind of the finding that names what nobody knew
 
 
 @record
@@ -26,7 +27,7 @@ class FitFinding:
     severity : "error", "warning" or "note"
         The fit is not to be used; look at it; for information.
     kind : str
-        For programs: "explained", "residual", "cause", "bound", "range", "samples", "held_out", "status", ...
+        For programs: "explained", "residual", "cause", "bound", "range", "samples", "held_out", "guess", "status", ...
     where : str
         EXPERIMENT.OUTPUT, an experiment, a parameter, or empty.
     text : str
@@ -41,6 +42,35 @@ class FitFinding:
     where: str
     text: str
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+
+
+def state_guesses(guessed: Sequence[str]) -> str:
+    """Return what verdicts say of the guesses that a result rests on; "" where there are none.
+
+    Examples
+    --------
+    >>> state_guesses(["N_p", "l"]), state_guesses([])
+    ('on 2 guesses: N_p, l', '')
+
+    """
+    count = "1 guess" if len(guessed) == 1 else f"{len(guessed)} guesses"
+    return f"on {count}: {', '.join(guessed)}" if guessed else ""
+
+
+def order_findings(findings: Iterable[FitFinding]) -> tuple[FitFinding, ...]:
+    """Return findings with the errors first, and the notes last."""
+    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+def find_guesses(guessed: Sequence[str]) -> tuple[FitFinding, ...]:
+    """Return the finding that a fit has where some of what it was given are guesses: a warning, or none."""
+    if not guessed:
+        return ()
+    text = (
+        "no interval covers them, and what is fitted is only as right as they are; measure them, and take each name "
+        "out of guessed = [...] once its value is known"
+    )
+    return (FitFinding(severity="warning", kind=GUESS, where=state_guesses(guessed), text=text),)
 
 
 @record

@@ -15,7 +15,7 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
 from seaopt.estimation.result.covariance import Covariance
-from seaopt.estimation.result.findings import DerivedFigure, FitFinding, ModelledOutputs, Nuisance, OutputFit
+from seaopt.estimation.result.findings import GUESS, DerivedFigure, FitFinding, ModelledOutputs, Nuisance, OutputFit
 from seaopt.estimation.result.identifiability import Identifiability
 from seaopt.estimation.result.nuisance import estimate_nuisance, take_sensors
 from seaopt.estimation.solver.methods import Method
@@ -125,10 +125,15 @@ class Fit:
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
+    def guesses(self) -> str:
+        """What to say of the guesses that it rests on, "on 2 guesses: N_p, l"; empty where there are none."""
+        return next((one.where for one in self.findings if one.kind == GUESS), "")
+
+    @property
     def verdict(self) -> str:
         """What to say of it in one line."""
         if self.met:
-            return f"{self.status} ({self.message})"
+            return f"{self.status} ({self.message})" + (f", {self.guesses}" if self.guesses else "")
         if self.status != "converged":
             return f"{self.status.replace('_', ' ')}: {self.message}"
         first, *more = self.errors

@@ -108,6 +108,7 @@ class _Lines:
         elif told:
             self.free(name)
         else:
+            self.interview.assume(name)
             self.add(name, f"{parameter.value:.10g}", name)
         return value
 

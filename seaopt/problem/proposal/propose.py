@@ -80,12 +80,16 @@ class ProposedColumn:
 
 @record
 class Proposal:
-    """A problem file's text, what was made of the columns, all questions, and those of them that nobody answered."""
+    """A problem file's text, what was made of the columns, all questions, and those of them that nobody answered.
+
+    `guessed` are the guesses that results rest on, as the file's key of that name has them.
+    """
 
     text: str
     columns: tuple[ProposedColumn, ...]
     questions: tuple[Question, ...]
     guesses: tuple[Question, ...]
+    guessed: tuple[str, ...]
 
 
 @record(eq=False)
@@ -123,6 +127,7 @@ _SI = {
 }  # fmt: skip
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a column with numbers near the largest float
 def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, title: str = "") -> Proposal:
     """Return a problem file for logs; `answers` are texts by the keys of `Question`, `folder` is the file's.
 
@@ -134,11 +139,11 @@ def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, titl
     """
     interview = Interview(answers)
     surveys = [_survey(path, interview) for path in logs]
-    turns, clear = is_rotary([one for survey in surveys for one in survey.columns])
-    if not clear:
+    turns, doubt = is_rotary([one for survey in surveys for one in survey.columns])
+    if doubt:
         kind = interview.ask(
-            "actuator", "Is the actuator rotary (a gear) or linear (a screw)?", "rotary" if turns else "linear",
-            "by the columns' units", ("rotary", "linear"),
+            "actuator", "Is the actuator rotary (a gear) or linear (a screw)?", "rotary" if turns else "linear", doubt,
+            ("rotary", "linear"),
         )  # fmt: skip
         turns = kind == "rotary"
     assignments = [_assign(survey, interview, turns) for survey in surveys]
@@ -158,6 +163,7 @@ def propose(logs: Sequence[Path], answers: Mapping[str, str], folder: Path, titl
         text=text, columns=tuple(row for log in described for row in _list_columns(log)),
         questions=tuple(interview.questions),
         guesses=tuple(one for one in interview.questions if one.key not in interview.answers),
+        guessed=tuple(interview.list_guessed()),
     )  # fmt: skip
 
 
@@ -253,12 +259,10 @@ def _ask_units(roles: Assignment, interview: Interview) -> tuple[dict[str, str],
     units: dict[str, str] = {}
     scales: dict[str, float] = {}
     for role, column in roles.columns.items():
-        unit, sure = guess_unit(role, column)
-        if not sure:
-            unit = interview.ask(
-                f"unit:{column.name}", f'Unit of "{column.name}" ({DESCRIPTIONS[role]})?', unit,
-                "by the size of its numbers", _choices_of(role),
-            )  # fmt: skip
+        unit, why = guess_unit(role, column)
+        if why:
+            text = f'Unit of "{column.name}" ({DESCRIPTIONS[role]})?'
+            unit = interview.ask(f"unit:{column.name}", text, unit, why, _choices_of(role))
         if unit == COUNTS:
             turn = interview.number(
                 f"counts:{column.name}", f'Steps of "{column.name}" for a whole turn', 4096.0, "a common encoder's"
@@ -331,25 +335,29 @@ def _list_columns(log: _Log) -> list[ProposedColumn]:
     rows: list[ProposedColumn] = []
     if survey.clock is not None:
         rows.append(ProposedColumn(
-            log=survey.name, column=survey.clock.name, role="time", unit=log.time_unit, description="time", doubt="",
+            log=survey.name, column=survey.clock.name, role="time", unit=log.time_unit, description="time",
+            doubt=_doubt_clock(survey),
         ))  # fmt: skip
     for role, column in log.roles.columns.items():
-        doubt = next((text for text in log.roles.doubts if text.startswith(f"{column.name} is ")), "")
         rows.append(ProposedColumn(
             log=survey.name, column=column.name, role="input" if role == log.roles.input else role,
-            unit=column.header.unit or log.units[role], description=DESCRIPTIONS[role], doubt=doubt,
+            unit=column.header.unit or log.units[role], description=DESCRIPTIONS[role],
+            doubt=log.roles.doubts.get(column.name, ""),
         ))  # fmt: skip
-    for name in (*(one.name for one in log.roles.unused), *survey.left_out):
-        rows.append(ProposedColumn(log=survey.name, column=name, role="", unit="", description="not used", doubt=""))
+    for name, why in {**dict.fromkeys((one.name for one in log.roles.unused), ""), **survey.left_out}.items():
+        text = f"not used: {why}" if why else "not used"
+        rows.append(ProposedColumn(log=survey.name, column=name, role="", unit="", description=text, doubt=""))
     return rows
 
 
 def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Interview) -> str:
     """Return the text of the problem file."""
-    lines = [
+    head = [
         "# Written by seaopt new. What a comment calls guessed was not asked, or nobody knew it: look at that first.",
         "schema = 1",
         f"title = {_quote(title)}",
+    ]
+    lines = [
         "",
         _comment("[parameters]", "SI units; what is free is fitted"),
         *_align([(f"{line.name} = {line.value}", line.comment) for line in actuator.lines]),
@@ -375,13 +383,23 @@ def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Inte
         lines += ["", "[robustness]", *_align(_describe_robustness(logs, actuator))]
     else:
         lines += ["", "# No [controller]: these logs have neither a torque or force, nor both encoders of the spring."]
-    return "\n".join(lines) + "\n"
+    if guessed := interview.list_guessed():
+        head += [
+            "# What was guessed, named in every verdict; take a name out once you know its value and have written it.",
+            f"guessed = {_value(guessed)}",
+        ]
+    return "\n".join([*head, *lines]) + "\n"
 
 
 def _number_names(name: str) -> Iterator[str]:
     """Yield a name, and then the name with 2, 3, ... at its end."""
     yield name
     yield from (f"{name}_{number}" for number in count(2))
+
+
+def _doubt_clock(survey: Survey) -> str:
+    """Return why a log's clock is a guess; "" where its name says that it is one."""
+    return "" if survey.clock is None or survey.clocks else "the time, as it only rises, and evenly"
 
 
 def _describe_experiment(log: _Log, name: str, interview: Interview) -> list[tuple[str, str]]:
@@ -391,7 +409,9 @@ def _describe_experiment(log: _Log, name: str, interview: Interview) -> list[tup
     if clock is None:
         rows.append((f"rate_hz = {log.rate_hz:.10g}", interview.mark(f"rate:{log.survey.name}")))
     else:
-        rows.append((f"time = {_spell_column(clock.name, log.time_unit, 1.0)}", interview.mark(f"unit:{clock.name}")))
+        marks = [interview.mark(f"unit:{clock.name}"), _mark_role(clock.name, _doubt_clock(log.survey), interview)]
+        text = f"time = {_spell_column(clock.name, log.time_unit, 1.0)}"
+        rows.append((text, "; ".join(filter(None, marks))))
     if log.roles.columns[log.roles.input].header.measured:
         rows.append(('hold = "first"', "the input was measured, and is no staircase"))
     return rows + _describe_clock(log)
@@ -402,8 +422,7 @@ def _describe_channel(log: _Log, role: str, actuator: Proposed, interview: Inter
     column, unit, scale = log.roles.columns[role], log.units[role], log.scales.get(role, 1.0)
     name, notes = {"torque": "I", "screw": "q"}.get(role, role), [DESCRIPTIONS[role]]
     guesses = [interview.mark(f"unit:{column.name}", f"counts:{column.name}", f"duty:{column.name}")]
-    if "roles" not in interview.answers:
-        guesses += [f"guessed: {text}" for text in log.roles.doubts if text.startswith(f"{column.name} is ")]
+    guesses.append(_mark_role(column.name, log.roles.doubts.get(column.name, ""), interview))
     if role == "screw":  # the nut goes r for a radian
         scale, unit = scale * screw_travel(actuator.lines) * factor(unit, "rad"), "m"
         notes.append("as the place of the nut, by the lead of the screw")
@@ -411,10 +430,20 @@ def _describe_channel(log: _Log, role: str, actuator: Proposed, interview: Inter
         notes.append("as a current, by K_tau")
     if role == "theta_m" and log.plant != "held" and _reads_output(log):
         scale *= next(float(line.value) for line in actuator.lines if line.name == "N")
+        interview.assume(f"gear:{column.name}")
         guesses.append("guessed: it is given behind the gear, so times N")
     if scale < 0.0:
+        interview.assume(f"sign:{column.name}")
         guesses.append("guessed: turned round, as it falls where the effort rises")
     return f"{name} = {_spell_column(column.name, unit, scale)}", "; ".join([*notes, *filter(None, guesses)])
+
+
+def _mark_role(column: str, doubt: str, interview: Interview) -> str:
+    """Return that a column's role is a guess, as the end of a comment, unless somebody has said that all are right."""
+    if not doubt or "roles" in interview.answers:
+        return ""
+    interview.assume(f"role:{column}")
+    return f"guessed: {doubt}"
 
 
 def _reads_output(log: _Log) -> bool:
@@ -482,9 +511,9 @@ def _describe_limit(logs: Sequence[_Log], interview: Interview) -> tuple[str, st
     unit = "N m, as K_tau takes it" if role == "torque" else unit
     guess = 1.0 if role == "duty" else float(f"{largest:.2g}")
     why = "the whole bridge" if role == "duty" else "the largest of the logs"
-    limit = interview.number("limit", f"Largest {what} that the drive may give ({unit})", guess, why)
     key = "current_limit_A" if role in ("I", "torque") else "command_limit"
-    return f"{key} = {limit:.10g}", interview.mark("limit")
+    limit = interview.number(key, f"Largest {what} that the drive may give ({unit})", guess, why)
+    return f"{key} = {limit:.10g}", interview.mark(key)
 
 
 def _describe_robustness(logs: Sequence[_Log], actuator: Proposed) -> list[tuple[str, str]]:

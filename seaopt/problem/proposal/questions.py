@@ -11,6 +11,10 @@ from seaopt.formatting import printable
 from seaopt.records import record
 
 UNKNOWN = "unknown"
+WISHES = (
+    "roles",
+    "bandwidth_hz",
+)  # questions whose guesses are no facts: the one sums others up, the other is asked for
 THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})")  # or a German decimal
 
 
@@ -85,6 +89,7 @@ class Interview:
     def __init__(self, answers: Mapping[str, str]) -> None:
         self.answers = dict(answers)
         self.questions: list[Question] = []
+        self.assumed: list[str] = []
 
     def ask(
         self, key: str, text: str, guess: str, why: str = "", choices: Sequence[str] = (), *, open: bool = False
@@ -104,7 +109,28 @@ class Interview:
         answer = self.ask(key, text, UNKNOWN, why, open=True)
         return None if answer == UNKNOWN else float(answer)
 
+    def assume(self, key: str) -> None:
+        """Note a guess that no answer has put right, be it that nobody was asked or that nobody knew."""
+        if key not in self.assumed:
+            self.assumed.append(key)
+
     def mark(self, *keys: str) -> str:
         """Return what of these answers is a guess, as the end of a comment."""
-        reasons = [one.why or one.text for one in self.questions if one.key in keys and one.key not in self.answers]
+        reasons = [
+            one.why or one.text
+            for one in self.questions
+            if one.key in keys and (one.key not in self.answers or one.key in self.assumed)
+        ]
         return f"guessed: {'; '.join(reasons)}" if reasons else ""
+
+    def list_guessed(self) -> list[str]:
+        """Return what results rest on and nobody knew: parameters, and other entries such as "unit of F1".
+
+        What nobody knows and a fit finds is none of it, nor is the bandwidth that is asked for.
+        """
+        open_keys = [
+            one.key
+            for one in self.questions
+            if one.key not in self.answers and one.guess != UNKNOWN and one.key not in WISHES
+        ]
+        return list(dict.fromkeys(key.replace(":", " of ", 1) for key in (*open_keys, *self.assumed)))

@@ -9,6 +9,7 @@ from seaopt.formatting import join_words
 from seaopt.problem.proposal.survey import Survey, SurveyedColumn, find_leader, regress
 from seaopt.problem.proposal.vocabulary import UNITS_OF, Quantity
 from seaopt.records import record
+from seaopt.units import header_unit
 
 INPUTS = ("I", "torque", "V", "duty", "goal")  # what may drive a motor; of each kind of command its own plant
 LINEAR_OUTPUTS = ("F1", "F2", "q", "screw", "phi")  # screw: the motor's angle, which is q over the lead
@@ -28,6 +29,7 @@ DESCRIPTIONS = {
     "deflection": "deflection of the spring",
 }  # fmt: skip
 FOLLOWS = 0.9  # share of variance from which two channels are one but for a factor
+BY_SIZE, BY_DEFAULT = "by the size of its numbers", "the usual one"  # why a unit is guessed
 STILL = 0.02  # of the motor's motion: a link that moves less is held
 
 
@@ -44,8 +46,8 @@ class Assignment:
     columns : mapping of role to SurveyedColumn
         The input's and the outputs'.
     unused : tuple of SurveyedColumn
-    doubts : tuple of str
-        What of it is a guess, one sentence each.
+    doubts : mapping of column to str
+        What of it is a guess, in a sentence.
 
     """
 
@@ -53,7 +55,7 @@ class Assignment:
     input: str
     columns: Mapping[str, SurveyedColumn]
     unused: tuple[SurveyedColumn, ...]
-    doubts: tuple[str, ...]
+    doubts: Mapping[str, str]
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -61,35 +63,37 @@ class Assignment:
         return tuple(role for role in self.columns if role != self.input)
 
 
-def is_rotary(columns: Sequence[SurveyedColumn]) -> tuple[bool, bool]:
-    """Return whether an actuator turns, and whether its columns leave no doubt of it."""
+def is_rotary(columns: Sequence[SurveyedColumn]) -> tuple[bool, str]:
+    """Return whether an actuator turns, and why that is a guess; "" where its columns leave no doubt."""
     kinds = {one.header.quantity for one in columns}
     linear, turning = kinds & {"force", "length"}, kinds & {"torque"}
     if linear and not turning:
-        return False, "force" in kinds
-    return True, bool(turning) and not linear
+        return False, "" if "force" in kinds else "a column is a length, and none a torque"
+    if turning:
+        return True, "a column is a torque, and another a force or a length" if linear else ""
+    return True, "a column is an angle" if "angle" in kinds else "the usual one; no column tells"
 
 
 def assign(survey: Survey, *, rotary: bool, given: Mapping[str, str]) -> Assignment:
     """Return the roles of a log's columns; `given` are those that are known, column to role ("" for none)."""
     free = [one for one in survey.columns if one.name not in given and one.header.quantity not in ("other", "time")]
     columns = {given[one.name]: one for one in survey.columns if given.get(one.name)}
-    doubts: list[str] = []
+    doubts: dict[str, str] = {}
     role = next((role for role in columns if role in INPUTS), None)
     if role is None:
         role, column, doubt = _find_input(free, survey)
         columns = {role: column, **columns}
         free.remove(column)
-        doubts += [doubt] if doubt else []
+        doubts |= {column.name: doubt} if doubt else {}
     else:
         columns = {role: columns.pop(role), **columns}
     # Of two columns of one role, the measured one, and then the first, is taken.
     free.sort(key=lambda one: (one.header.commanded, not one.header.measured))
     place = _place_rotary if rotary else _place_linear
-    doubts += place([one for one in free if not one.header.commanded], columns)
+    doubts |= place([one for one in free if not one.header.commanded], columns)
     used = {one.name for one in columns.values()}
     return Assignment(
-        rotary=rotary, input=role, columns=columns, doubts=tuple(doubts),
+        rotary=rotary, input=role, columns=columns, doubts=doubts,
         unused=tuple(one for one in survey.columns if one.name not in used),
     )  # fmt: skip
 
@@ -114,7 +118,7 @@ def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str,
         # A current that was commanded is there before the one that was measured.
         best = min(named, key=lambda one: (not one.header.commanded, one.header.side == "link"))
         others = [one.name for one in named if one is not best]
-        return role, best, f"{best.name} is the input, and not {', '.join(others)}" if others else ""
+        return role, best, f"the input, and not {', '.join(others)}" if others else ""
     likely = [one for one in columns if not one.header.quantity]
     likely = likely or [one for one in columns if one.header.quantity in ("torque", "angle")]
     if not likely:
@@ -125,12 +129,12 @@ def _find_input(columns: Sequence[SurveyedColumn], survey: Survey) -> tuple[str,
         )
     leader = find_leader(likely)
     role = "torque" if leader.header.quantity == "torque" else "goal" if leader.header.quantity == "angle" else "I"
-    return role, leader, f"{leader.name} is the input: the other columns follow it"
+    return role, leader, "the input, as the other columns follow it"
 
 
-def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> list[str]:
+def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> dict[str, str]:
     """Give a rotary actuator's columns their roles; return what is a guess."""
-    doubts: list[str] = []
+    doubts: dict[str, str] = {}
     torques = [one for one in columns if one.header.quantity == "torque"]
     if torques and "tau_s" not in roles:
         # A drive's own torque is its current times a constant; the sensor's is the spring's.
@@ -138,7 +142,7 @@ def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn
         best = min(torques, key=lambda one: order[one.header.side])
         roles["tau_s"] = best
         if len(torques) > 1 and best.header.side != "spring":
-            doubts.append(f"{best.name} is the torque at the spring, of {len(torques)} torques")
+            doubts[best.name] = f"the torque at the spring, of {len(torques)} torques"
     angles = [one for one in columns if one.header.quantity == "angle"]
     for one in angles:
         side = "deflection" if one.header.deflection else {"motor": "theta_m", "link": "theta_l"}.get(one.header.side)
@@ -151,13 +155,13 @@ def _place_rotary(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn
     )
     for one, role in zip(open_angles, [r for r in ("theta_m", "theta_l") if r not in roles], strict=False):
         roles[role] = one
-        doubts.append(f"{one.name} is the {DESCRIPTIONS[role]}")
-    return doubts + _place_unnamed(columns, roles, ("tau_s", "theta_m", "theta_l"))
+        doubts[one.name] = f"the {DESCRIPTIONS[role]}, as its header does not say which angle"
+    return doubts | _place_unnamed(columns, roles, ("tau_s", "theta_m", "theta_l"))
 
 
-def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> list[str]:
+def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn]) -> dict[str, str]:
     """Give a screw's columns their roles; return what is a guess."""
-    doubts: list[str] = []
+    doubts: dict[str, str] = {}
     forces = [one for one in columns if one.header.quantity == "force"]
     for one in forces:
         if one.header.number is not None:
@@ -166,44 +170,56 @@ def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn
         rest = [role for role in ("F1", "F2") if role not in roles]
         if one not in roles.values() and rest:
             roles[rest[0]] = one
-            doubts += [f"{one.name} is the {DESCRIPTIONS[rest[0]]}, {rest[0]}"]
+            doubts[one.name] = f"the {DESCRIPTIONS[rest[0]]}, {rest[0]}, as its header has no number"
     for one in columns:
         link = one.header.side == "link"
         if one.header.quantity == "length":
             roles.update({} if link or "q" in roles else {"q": one})
         elif one.header.quantity == "angle":
             roles.setdefault("phi" if link else "screw", one)
-    return doubts + _place_unnamed(columns, roles, ("F1", "F2"))
+    return doubts | _place_unnamed(columns, roles, ("F1", "F2"))
 
 
-def _place_unnamed(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn], wanted: Sequence[str]) -> list[str]:
+def _place_unnamed(
+    columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn], wanted: Sequence[str]
+) -> dict[str, str]:
     """Take columns whose headers say nothing as what is measured, where nothing else is."""
     if len(roles) > 1:
-        return []
+        return {}
     blank = [one for one in columns if not one.header.quantity and one not in roles.values()]
     for role, one in zip(wanted, blank, strict=False):
         roles[role] = one
-    return [f"{one.name} is the {DESCRIPTIONS[role]}" for role, one in zip(wanted, blank, strict=False)]
+    return {
+        one.name: f"the {DESCRIPTIONS[role]}, as nothing else is measured"
+        for role, one in zip(wanted, blank, strict=False)
+    }
 
 
-def guess_unit(role: str, column: SurveyedColumn) -> tuple[str, bool]:
-    """Return a column's unit, and whether its header says so; else the sizes of its numbers suggest one."""
+def guess_unit(role: str, column: SurveyedColumn) -> tuple[str, str]:
+    """Return a column's unit, and why that is a guess; "" where its header says so."""
+    unit, why = _guess_unit(role, column)
+    stated = header_unit(column.name)
+    return unit, f'"{stated}" is not a known unit; {why}' if why and stated and not column.header.unit else why
+
+
+def _guess_unit(role: str, column: SurveyedColumn) -> tuple[str, str]:
     unit, quantity = column.header.unit, OF_INPUT.get(role) or OF_OUTPUT[role]
     if unit and not (role == "duty" and unit != "percent"):
-        return unit, True
+        return unit, ""
     large = column.largest
     if quantity == "current":
-        return ("mA", False) if large > 100.0 else ("A", False)
+        return "mA" if large > 100.0 else "A", BY_SIZE
     if quantity == "duty":
-        return ("percent", False) if 1.5 < large <= 100.0 else ("-", False)
+        return "percent" if 1.5 < large <= 100.0 else "-", BY_SIZE
     if quantity == "angle":
         if column.whole and large > 50.0:
-            return "counts", False
-        turning = role in ("theta_m", "screw", "goal")
-        return ("deg", False) if not turning and large > 6.5 else ("rad", False)
+            return "counts", "all its numbers are whole"
+        if role in ("theta_m", "screw", "goal"):  # a motor turns many times, in radians as in degrees
+            return "rad", BY_DEFAULT
+        return "deg" if large > 6.5 else "rad", BY_SIZE
     if quantity == "length":
-        return ("mm", False) if large > 0.5 else ("m", False)
-    return UNITS_OF[quantity], False
+        return "mm" if large > 0.5 else "m", BY_SIZE
+    return UNITS_OF[quantity], BY_DEFAULT
 
 
 def is_held(assignment: Assignment, link_unit: float, motor_unit: float) -> tuple[bool, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,12 +35,13 @@ class SurveyedColumn:
     @property
     def swing(self) -> float:
         """Robust spread of the samples: half of what lies between their 1 % and 99 % quantiles."""
-        return float(np.subtract(*np.nanquantile(self.values, [0.99, 0.01])) / 2.0) if self.values.size else 0.0
+        present = self.values[np.isfinite(self.values)]
+        return float(np.subtract(*np.quantile(present, [0.99, 0.01])) / 2.0) if present.size else 0.0
 
     @property
     def largest(self) -> float:
         """The largest magnitude."""
-        return float(np.nanmax(np.abs(self.values), initial=0.0))
+        return float(np.max(np.abs(self.values[np.isfinite(self.values)]), initial=0.0))
 
     @property
     def noise(self) -> float:
@@ -64,11 +65,11 @@ class Survey:
     clock : SurveyedColumn or None
         The column of times; None where the file has none.
     clocks : tuple of str
-        Columns that may be the time.
+        Columns that may be the time by their names; none where the clock was found by its samples.
     columns : tuple of SurveyedColumn
         All others that hold numbers and vary.
-    left_out : tuple of str
-        Columns of text, and those that are constant.
+    left_out : mapping of column to str
+        Why other columns cannot be used: text, constants, and those without a number.
 
     """
 
@@ -76,7 +77,7 @@ class Survey:
     clock: SurveyedColumn | None
     clocks: tuple[str, ...]
     columns: tuple[SurveyedColumn, ...]
-    left_out: tuple[str, ...]
+    left_out: Mapping[str, str]
 
     @property
     def name(self) -> str:
@@ -108,7 +109,7 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     >>> _ = file.write_text("t_ms,cur_mA,note\n0,100,a\n2,150,b\n4,120,c\n")
     >>> survey = survey_log(file)
     >>> survey.clock.name, [column.header.quantity for column in survey.columns], survey.left_out
-    ('t_ms', ['current'], ('note',))
+    ('t_ms', ['current'], {'note': 'text'})
 
     """
     held = contents(path)
@@ -126,11 +127,15 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     moving = [one for name, one in columns.items() if name != chosen and name not in times and one.swing > 0.0]
     if not moving:
         raise LogError(f"{path}: no column varies; record a log in which the actuator moves")
-    still = [name for name, one in columns.items() if one.swing == 0.0 and name != chosen]
-    words = [field.name for field in held.fields if not field.numeric]
+    still = {
+        name: "constant" if np.any(np.isfinite(one.values)) else "holds no number"
+        for name, one in columns.items()
+        if one.swing == 0.0 and name != chosen
+    }
+    words = {field.name: "text" for field in held.fields if not field.numeric}
     return Survey(
         path=path, clock=columns[chosen] if chosen is not None else None, clocks=tuple(times or own),
-        columns=tuple(moving), left_out=(*words, *still),
+        columns=tuple(moving), left_out=words | still,
     )  # fmt: skip
 
 
