@@ -273,9 +273,9 @@ def _reached(spec: Limits, verdict: Verdict, loop: Loop | DiscLoop) -> str:
     assert curve is not None and curve.until_hz is not None
     until, grid = curve.until_hz(verdict.allowed, spec.bandwidth_hz), loop.grid()
     f = np.append(grid[grid < until], until)
-    p, (c_r, response) = loop.plant.response(f), loop.law.responses(f)
-    c_y = -response
-    values = np.abs(curve.numerator(p, c_y, c_r, p * c_y)) / np.abs(1.0 + p * c_y)
+    p, c_r, c_y = loop.plant.response(f), loop.law.reference_response(f), loop.law.measurement_response(f)
+    open_loop = loop.open_loop(f)
+    values = np.abs(curve.numerator(p, c_y, c_r, open_loop)) / np.abs(1.0 + open_loop)
     if isinstance(loop, DiscLoop):
         least, most = bound_disc(curve.of, p, loop.plant.discs(f), c_y, c_r)
         values = least if curve.floor else most

@@ -30,13 +30,15 @@ class LinearView:
     Parameters
     ----------
     loop : Loop
-    noise_N, step_N : float
-        Standard deviations of the white noises that represent the sensor and the rounded current.
+    noise : tuple of float
+        Standard deviation of the white noise that represents each sensor, in its unit, the regulated one's first.
+    step_N : float
+        The same of the rounded current.
 
     """
 
     loop: Loop
-    noise_N: float
+    noise: tuple[float, ...]
     step_N: float
 
     @property
@@ -56,12 +58,13 @@ class LinearView:
 
     def force_std(self, lowest_hz: float = 0.0) -> float:
         """Return the standard deviation (N) of the force that noise makes above a frequency; the loop is stable."""
-        if not (self.noise_N or self.step_N):
+        if not (any(self.noise) or self.step_N):
             return 0.0
         f = self.loop.grid()
         f = np.concatenate([[lowest_hz], f[f > lowest_hz]]) if lowest_hz else f
-        s = self.loop.sensitivity(f)
-        power = self.noise_N**2 * np.abs(1.0 - s) ** 2 + self.step_N**2 * np.abs(self.loop.plant.response(f) * s) ** 2
+        by_effort = np.abs(self.loop.plant.response(f) * self.loop.sensitivity(f))
+        by_noise = np.array(self.noise) ** 2 @ np.abs(self.loop.law.feedback_responses(f)) ** 2
+        power = by_effort**2 * (by_noise + self.step_N**2)
         return math.sqrt(float(np.trapezoid(power, f)) / self.loop.plant.nyquist_hz)
 
 
@@ -99,7 +102,7 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
         params = apply_load(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
     return LinearView(
         loop=Loop(plant=controller.plant(plant, params), law=controller.law),
-        noise_N=_combine_std(*stage.reading_errors),
+        noise=tuple(_combine_std(*stage.find_errors(name)) for name in controller.signals),
         step_N=_combine_std(0.0, stage.current_step_A / controller.command.per_effort),
     )
 

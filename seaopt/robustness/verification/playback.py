@@ -83,19 +83,23 @@ class Stage:
 
     @property
     def is_ideal(self) -> bool:
-        """Whether sensor and amplifier add nothing of their own."""
-        measured = self.controller.spec.regulated
-        offset = any(self.sensors.offset.get(name) for name in (measured, *weigh_encoders(self.plant, measured)))
-        return not (self.current_step_A or offset or any(self.reading_errors))
+        """Whether sensors and amplifier add nothing of their own."""
+        signals = self.controller.signals
+        sources = {*signals, *(name for signal in signals for name in weigh_encoders(self.plant, signal))}
+        offset = any(self.sensors.offset.get(name) for name in sources)
+        return not (self.current_step_A or offset or any(any(self.find_errors(name)) for name in signals))
 
     @property
     def reading_errors(self) -> tuple[float, float]:
-        """Noise (std) and rounding (step) of what is fed back, of the encoders included that it is computed from."""
-        measured = self.controller.spec.regulated
+        """Noise (std) and rounding (step) of the regulated output."""
+        return self.find_errors(self.controller.spec.regulated)
+
+    def find_errors(self, name: str) -> tuple[float, float]:
+        """Return noise and rounding of what is fed back, of the encoders included that it is computed from."""
         if self.controller.design is None:
-            return self.sensors.noise_std.get(measured, 0.0), self.sensors.quantisation.get(measured, 0.0)
+            return self.sensors.noise_std.get(name, 0.0), self.sensors.quantisation.get(name, 0.0)
         plant, params = self.controller.design
-        return self.sensors.combine_errors(plant, plant.complete(params), measured)
+        return self.sensors.combine_errors(plant, plant.complete(params), name)
 
 
 @record(eq=False)

@@ -25,6 +25,9 @@ from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.robustness.uncertainty.severity import severity_slopes
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
+from seaopt.robustness.verification.linear import linearise_last_phase
+from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.scenarios import default_scenarios
 from tests.c_code import CompiledLaw
 
 TS = 1e-3
@@ -234,6 +237,25 @@ def test_a_cascade_is_measured_like_any_law():
     assert {"design sliding", "design stuck", "swing sliding", "swing stuck"} == set(certificate.plants)
     assert certificate.simulated.verification is not None
     assert certificate.simulated.passivity is not None
+
+
+def test_the_noise_of_every_signal_reaches_the_force(two):
+    """Of two signals with noises of their own: against the root of summed powers of the loop written out."""
+    stage = Stage(controller=two, plant=STAND, sensors=so.Sensors(noise_std={"tau_s": 0.02, "deflection": 3e-4}))
+    assert not stage.is_ideal
+    assert not Stage(controller=two, plant=STAND, sensors=so.Sensors(quantisation={"deflection": 1e-5})).is_ideal
+    view = linearise_last_phase(stage, default_scenarios(two, STAND)[0], VALUES)
+    f = np.linspace(1e-3, 499.99, 60_000)
+    t = np.abs(1.0 - view.loop.sensitivity(f))
+    wanted = np.sqrt(np.mean(t**2) * ((0.6 * 0.02) ** 2 + (0.4 * 300.0 * 3e-4) ** 2))
+    assert view.force_std() == pytest.approx(wanted, rel=0.02)
+
+
+def test_a_limit_that_is_missed_is_explained():
+    law = cascade_pid(k_v=0.1, k_p=0.5, k_i=1.0, feedforward=1.0, sample_time_s=TS)
+    weak = assess(STAND, VALUES, law, so.ControllerSpec(measured=("tau_s", "thetad_m"), bandwidth_hz=15))
+    assert not weak.feasible
+    assert any("|S| reaches" in line for line in weak.blocked_by)
 
 
 def test_what_does_not_fit_is_refused(speed):
