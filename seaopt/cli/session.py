@@ -315,9 +315,8 @@ class Session:
     def controller(self) -> Controller:
         """Return the controller of this run or of the folder; one for other limits than the problem's is refused."""
         if "tune" not in self.results:
-            content = self._read("tune")
             design, _ = list_plants(self.problem, self.parameters())
-            controller = Controller.from_dict(content, design, self.values())
+            controller = Controller.from_dict(self._read("tune"), design, self.values())
             self._check_spec(controller.spec)
             self.results["tune"] = controller
         return self.results["tune"]
