@@ -20,6 +20,7 @@ from seaopt.fleet.worker import FAILED, Row, describe_limit, fit_batch
 
 BATCH_S = 0.1  # of work in a batch
 LARGEST = 1000  # logs in a batch
+LOOK_S = 1.0  # between looks at what is in flight, where nothing is said to be done
 DEATHS = 2  # of a worker that works on one log alone, until that log is given up
 PATIENCE_S, AGAIN_S = 120.0, 1.0  # how long, and how often, work is offered to an executor that takes none
 
@@ -60,8 +61,9 @@ class Dispatcher:
         try:
             while self.waiting or self.suspects or self.flying:
                 self._fill()
-                done, _ = wait(self.flying, return_when=FIRST_COMPLETED)
-                for future in done:
+                wait(self.flying, LOOK_S, return_when=FIRST_COMPLETED)
+                # `wait` is not told of a future that Dask has cancelled, as it does where the scheduler is lost.
+                for future in [future for future in self.flying if future.done()]:
                     yield self._take(future)
         finally:
             for future in self.flying:
@@ -86,13 +88,14 @@ class Dispatcher:
 
     def _submit(self, batch: tuple[FleetLog, ...]) -> None:
         known = {log.path: self.known[log.path] for log in batch if log.path in self.known}
-        started = monotonic()
+        patience = PATIENCE_S if hasattr(self.executor, "_client") else 0.0  # a scheduler that restarts is back soon
+        end = monotonic() + patience
         while True:
             try:
                 self.flying[self.executor.submit(fit_batch, self.plan, batch, known)] = batch
                 return
-            except Exception as error:  # each engine has its own; a scheduler that restarts is back in a while
-                if monotonic() - started > PATIENCE_S or isinstance(error, RuntimeError):
+            except Exception as error:  # each engine has its own
+                if monotonic() >= end:
                     raise SeaoptError(
                         f"the executor takes no more work ({type(error).__name__}: {error}); start the workers again"
                     ) from error
@@ -103,7 +106,10 @@ class Dispatcher:
         batch = self.flying.pop(future)
         try:
             rows = future.result()
-        except (Exception, CancelledError):  # `fit_batch` raises nothing: a worker, or the way to it, was lost
+        except CancelledError:  # the scheduler was lost, which is no log's fault
+            self.waiting.extend(batch)
+            return []
+        except Exception:  # `fit_batch` raises nothing: a worker was lost
             return self._suspect(batch)
         mean = sum(row["total_s"] for row in rows) / len(rows)
         self.log_s = mean if self.log_s is None else 0.7 * self.log_s + 0.3 * mean

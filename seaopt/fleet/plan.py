@@ -16,6 +16,7 @@ from seaopt.problem.problem import make_problem
 from seaopt.problem.schema import ProblemTable, UnknownTable
 from seaopt.records import record
 
+VERSION = version("seaopt")
 _PARTS = {"version", "parameters", "plant", "fit"}  # of a problem, that a fit reads besides its experiment
 
 
@@ -33,6 +34,8 @@ class Plan:
         For a log.
     client : str
         Which process asks; that one a worker must not end.
+    version : str
+        Of the client's seaopt; a worker of another one would give other results.
 
     """
 
@@ -41,16 +44,12 @@ class Plan:
     folder: str
     time_limit_s: float | None
     client: str
+    version: str
 
     @property
     def digest(self) -> str:
         """SHA-256 of the problem."""
         return hashlib.sha256(self.problem.encode()).hexdigest()
-
-    @property
-    def version(self) -> str:
-        """Of the package, whose results are taken up again."""
-        return version("seaopt")
 
     def make_problem(self) -> Problem:
         """Return the problem."""
@@ -93,7 +92,7 @@ def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, cl
     table["experiment"] = [template.model_dump(mode="json", by_alias=True, exclude_unset=True) | {"use": "fit"}]
     return Plan(
         problem=json.dumps(table), source=problem.source, folder=str(problem.folder.resolve()),
-        time_limit_s=time_limit_s, client=client,
+        time_limit_s=time_limit_s, client=client, version=VERSION,
     )  # fmt: skip
 
 

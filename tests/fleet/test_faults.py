@@ -236,3 +236,10 @@ def test_a_full_disk_loses_nothing_that_was_written(made, small_disk, undisturbe
         fleet = so.fit_fleet(made / "stand.toml", [made / "logs/*.csv"], out, executor=executor)
     assert fleet.unchanged == 4
     compare(pl.read_parquet(out / "fleet"), undisturbed.rows)
+
+
+def test_a_worker_of_another_version_is_refused(made, monkeypatch):
+    monkeypatch.setattr(worker, "VERSION", "0.0.1")
+    with ThreadPoolExecutor(1) as executor:
+        fleet = so.fit_fleet(made / "stand.toml", [made / "logs/r0_j0.csv"], executor=executor)
+    assert "has seaopt 0.0.1, the client" in fleet.rows["reason"][0]
