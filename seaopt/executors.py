@@ -132,18 +132,34 @@ def connect_dask(address: str, timeout_s: float = 30.0) -> Generator[Executor]:
 
     """
     try:
-        from distributed import Client
+        import distributed
     except ImportError as error:
         raise SeaoptError("a Dask scheduler needs the package distributed: pip install seaopt[dask]") from error
     try:
-        client = Client(address, timeout=timeout_s, set_as_default=False)
+        executor = _Cluster(lambda: distributed.Client(address, timeout=timeout_s, set_as_default=False))
     except (OSError, TimeoutError, ValueError, TypeError) as error:
         raise SeaoptError(f"scheduler {address}: does not answer ({error}); check the address, and TLS") from error
     try:
-        yield client.get_executor(pure=False)
+        yield executor
     finally:
+        executor.shutdown()
+
+
+class _Cluster(Executor):
+    """Dask's executor; where its client has given up a scheduler, what is submitted next connects to it anew."""
+
+    def __init__(self, connect: Callable[[], Any]) -> None:
+        self._connect = connect
+        self._client = connect()
+
+    def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
+        if self._client.status == "closed":
+            self._client = self._connect()
+        return self._client.get_executor(pure=False).submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         with suppress(Exception):  # a scheduler that is gone needs no goodbye
-            client.close(timeout=2)
+            self._client.close(timeout=2)
 
 
 def map_ordered(

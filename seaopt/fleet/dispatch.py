@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from contextlib import suppress
 from time import monotonic, sleep
 
 from seaopt.errors import SeaoptError
@@ -21,6 +22,7 @@ from seaopt.fleet.worker import FAILED, Row, describe_limit, fit_batch
 BATCH_S = 0.1  # of work in a batch
 LARGEST = 1000  # logs in a batch
 LOOK_S = 1.0  # between looks at what is in flight, where nothing is said to be done
+COUNT_S = 5.0  # between counts of the workers
 DEATHS = 2  # of a worker that works on one log alone, until that log is given up
 PATIENCE_S, AGAIN_S = 120.0, 1.0  # how long, and how often, work is offered to an executor that takes none
 
@@ -48,6 +50,7 @@ class Dispatcher:
         self.flying: dict[Future[list[Row]], tuple[FleetLog, ...]] = {}
         self.alone = False  # whether what is in flight is one suspect
         self.log_s: float | None = None  # a log's mean time, of late
+        self.workers, self.counted = 1, float("-inf")
 
     def run(self) -> Generator[list[Row]]:
         """Yield the rows of each batch as it is done.
@@ -71,7 +74,11 @@ class Dispatcher:
 
     def _fill(self) -> None:
         """Submit batches until enough are in flight; a suspect only where nothing else is."""
-        most = QUEUED * count_workers(self.executor)
+        if monotonic() - self.counted >= COUNT_S:  # a cluster's come and go, and counting asks the scheduler
+            with suppress(Exception):  # which may be gone, too
+                self.workers = count_workers(self.executor)
+            self.counted = monotonic()
+        most = QUEUED * self.workers
         self.alone = self.alone and bool(self.flying)
         while self.waiting and len(self.flying) < most:
             size = self._choose_size(most)

@@ -19,7 +19,8 @@ are made, and a log of a minute takes a second), or a refit of model output minu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
@@ -35,6 +36,7 @@ from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, R
 from seaopt.estimation.result.covariance import Covariance, compute_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
+from seaopt.executors import map_ordered
 from seaopt.formatting import html_text
 from seaopt.records import record
 from seaopt.units import unit_after
@@ -112,7 +114,10 @@ class Bootstrap:
     _repr_html_ = html_text
 
 
-def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False, block: int | None = None) -> Bootstrap:
+def bootstrap(
+    fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False, block: int | None = None,
+    executor: Executor | None = None,
+) -> Bootstrap:  # fmt: skip
     """Return how the parameters vary when blocks of the residuals are resampled.
 
     Parameters
@@ -127,6 +132,8 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
         Make a fit for each draw, from the minimum, instead of one Gauss-Newton step: slower; it includes nonlinearity.
     block : int, optional
         Length of the blocks in samples; from the residuals' correlation if left out.
+    executor : concurrent.futures.Executor, optional
+        Where refits are made; here, if left out. The numbers are the same, bit for bit (`seaopt.executors`).
 
     Returns
     -------
@@ -158,7 +165,10 @@ def bootstrap(fit: Fit, draws: int = 200, seed: int = 0, *, refit: bool = False,
     rng = np.random.default_rng(seed)
     names = problem.unknowns.names[: problem.unknowns.shared]
     lengths = {name: _choose_length(own, block) for name, own in residuals.items()}
-    values = (_draw_refits if refit else _draw_steps)(minimum, residuals, lengths, draws, rng)
+    if refit:
+        values = _draw_refits(minimum, residuals, lengths, draws, rng, executor)
+    else:
+        values = _draw_steps(minimum, residuals, lengths, draws, rng)
     return Bootstrap(
         names=names, units=tuple(fit.parameters[name].unit for name in names), estimates=minimum.z[: len(names)],
         draws=values, blocks=lengths, refit=refit, reference=fit.covariance,
@@ -292,7 +302,7 @@ def _compute_influence(
 
 def _draw_refits(
     minimum: Minimum, residuals: ResidualsByExperiment, lengths: Mapping[str, int], draws: int,
-    rng: np.random.Generator,
+    rng: np.random.Generator, executor: Executor | None,
 ) -> Float[np.ndarray, "draws p"]:  # fmt: skip
     """Return one fit per draw, of the model's outputs with the drawn residuals, from the minimum."""
     problem, z = minimum.problem, minimum.z
@@ -302,19 +312,29 @@ def _draw_refits(
         for name, own in residuals.items()
     }
     blocks = _draw_blocks(problem, lengths, pools, draws, rng)
+
+    def make_trials() -> Iterator[tuple[FitProblem, Float[np.ndarray, " n"]]]:
+        for d in range(draws):
+            experiments = tuple(
+                _with_drawn(experiment, residuals[experiment.name], blocks[experiment.name], d)
+                for experiment in problem.experiments
+            )
+            shift = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0) * rng.normal(size=z.size)
+            yield replace(problem, experiments=experiments, unknowns=replace(unknowns, start=z + shift)), z
+
     values: list[Float[np.ndarray, " p"]] = []
-    for d in range(draws):
-        experiments = tuple(
-            _with_drawn(experiment, residuals[experiment.name], blocks[experiment.name], d)
-            for experiment in problem.experiments
-        )
-        shift = np.where(np.isfinite(unknowns.prior_std), unknowns.prior_std, 0.0) * rng.normal(size=z.size)
-        trial = replace(problem, experiments=experiments, unknowns=replace(unknowns, start=z + shift))
-        solution = minimise(trial, z, unknowns.low, unknowns.high)
-        if not np.isfinite(solution.evaluation.cost):
+    for d, (cost, found) in enumerate(map_ordered(_refit, make_trials(), executor)):
+        if not np.isfinite(cost):
             raise EstimationError(f"bootstrap: draw {d} overflows the simulation; use refit = False")
-        values.append(solution.z[:p])
+        values.append(found[:p])
     return np.array(values)
+
+
+def _refit(trial: tuple[FitProblem, Float[np.ndarray, " n"]]) -> tuple[float, Float[np.ndarray, " n"]]:
+    """Return the least cost of a problem, searched from a point, and where it is."""
+    problem, z = trial
+    solution = minimise(problem, z, problem.unknowns.low, problem.unknowns.high)
+    return float(solution.evaluation.cost), solution.z
 
 
 def _with_drawn(experiment: FitExperiment, residuals: ExperimentResiduals, blocks: _Blocks, d: int) -> FitExperiment:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -11,6 +13,7 @@ from seaopt.bench import PAPER_STAND
 from seaopt.errors import EstimationError
 from seaopt.estimation import bootstrap
 from seaopt.estimation.uncertainty.bootstrap import estimate_block_length
+from seaopt.executors import Processes
 
 FREE = ("J", "b_r", "eta")
 DRAWS = 400
@@ -67,6 +70,17 @@ def test_a_step_is_a_refit_where_noise_is_small(noisy):
     for i, name in enumerate(FREE):
         away = np.abs(steps.draws[:, i] - refits.draws[:, i])
         assert np.max(away) < 0.02 * noisy.covariance.std(name)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: ThreadPoolExecutor(3), pytest.param(lambda: Processes(2), marks=pytest.mark.slow)]
+)
+def test_refits_are_the_same_bit_for_bit_wherever_they_are_made(stand, thor, short_log, make):
+    fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], thor.free("J", "b_r"))
+    here = bootstrap(fit, 20, refit=True)
+    with make() as executor:
+        there = bootstrap(fit, 20, refit=True, executor=executor)
+    np.testing.assert_array_equal(there.draws, here.draws)
 
 
 def test_percentiles_and_priors_are_the_gaussian_ones(stand, thor, short_log):
