@@ -24,7 +24,7 @@ pytest.importorskip("distributed")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
 ROOT = Path(__file__).resolve().parents[2]
 SITE = os.pathsep.join(filter(None, [str(ROOT / "tests/fleet/site"), str(ROOT), os.environ.get("PYTHONPATH")]))
-STARTED_S = 120.0
+STARTED_S = 180.0
 
 
 def find_port():
@@ -47,14 +47,18 @@ def start_scheduler(port, *arguments):
     )
 
 
+def start_workers(address, folder):
+    options = ("--nworkers", 2, "--nthreads", 1, "--no-dashboard", "--local-directory", folder)
+    return run_module("distributed.cli.dask_worker", address, *options)
+
+
 @contextmanager
-def cluster(folder, scheme="tcp", arguments=()):
+def cluster(folder, scheme="tcp"):
     """Yield address, scheduler's and worker's processes of a cluster with two workers under nannies."""
     port = find_port()
     address = f"{scheme}://127.0.0.1:{port}"
-    processes = [start_scheduler(port, *(("--protocol", scheme, *arguments) if scheme == "tls" else ()))]
-    options = ("--nworkers", 2, "--nthreads", 1, "--no-dashboard", "--local-directory", folder, *arguments)
-    processes.append(run_module("distributed.cli.dask_worker", address, *options))
+    processes = [start_scheduler(port, *(("--protocol", scheme) if scheme == "tls" else ()))]
+    processes.append(start_workers(address, folder))
     try:
         yield address, processes, port
     finally:
@@ -114,9 +118,10 @@ def test_what_dies_mid_run_loses_nothing(made, tmp_path, undisturbed, what):
         if what == "worker":
             os.kill(pids[0], signal.SIGKILL)
         else:
-            os.killpg(processes[0].pid, signal.SIGKILL)
-            processes[0].wait()
-            processes[0] = start_scheduler(port)
+            for old in processes:  # Dask's workers end with their scheduler
+                os.killpg(old.pid, signal.SIGKILL)
+                old.wait()
+            processes[:] = [start_scheduler(port), start_workers(address, tmp_path / "again")]
         _, told = process.communicate(timeout=STARTED_S)
     assert process.returncode == 0, told
     compare(local(pl.read_parquet(tmp_path / "out/fleet")), undisturbed.rows)
