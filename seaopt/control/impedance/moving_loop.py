@@ -83,7 +83,8 @@ def close_link(link: Link, velocity_filter_s: float, load: Load | None = None) -
     load = link.load if load is None else load
     port, law, period = link.port, link.law, link.sample_time_s
     n = port.motor.size
-    share = port.mass / load.inertia  # F_e of the load acts on the probe's inertia, which is part of the load's
+    # F_e = -(m - m_0) v' - d v - k x, m_0 being the probe's inertia, and v' = a x + b u + force F_e.
+    share = 1.0 / (1.0 + (load.inertia - port.mass) * port.force[port.speed])
     taken = -share * ((load.inertia - port.mass) * port.a[port.speed])
     taken[port.speed] -= share * load.damping
     taken[port.place] -= share * load.stiffness

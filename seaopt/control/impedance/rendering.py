@@ -29,7 +29,6 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.units import Mechanics, mechanics_of
 
-WITNESS_FACTORS = np.geomspace(0.3, 3.0, 25)  # of the environment that the condition names, looked through
 NEAR_AS_ASKED = math.sqrt(2.0)  # 3 dB
 BAND_POINTS = 4000
 LOWEST_BAND_HZ = 1e-3
@@ -206,7 +205,8 @@ def render(
     return Rendering(
         impedance=impedance, outer=outer, passive=passive, needed_damper=needed_damper(port, impedance),
         link_damping=load.damping, stable=radius <= GROWING, spectral_radius=radius,
-        breaking=None if passive else find_breaking(link, outer, worst_hz), worst_hz=worst_hz,
+        breaking=None if passive else find_breaking(link, outer, port.find_failing_hz(impedance, load.damping)),
+        worst_hz=worst_hz,
         band_hz=_find_band(link, outer), overshoot=_find_overshoot(loop, impedance, radius),
         called=mechanics_of(link.port.place_unit),
     )  # fmt: skip
@@ -264,28 +264,25 @@ def apparent_impedance(link: Link, outer: OuterLoop, f: Float[np.ndarray, " m"])
     return response.motion_to_port + response.motor_to_port * motor
 
 
-def find_breaking(link: Link, outer: OuterLoop, frequency_hz: float) -> BreakingEnvironment | None:
-    """Return the mass or the spring at the link that makes it oscillate about a frequency; None where none is found."""
-    omega = 2 * np.pi * frequency_hz
-    wanted = -float(np.imag(apparent_impedance(link, outer, np.array([frequency_hz]))[0]))
-    load = link.load
-    more = wanted - (omega * load.inertia - load.stiffness / omega)
-    inertia, stiffness = (more / omega, 0.0) if more > 0.0 else (0.0, -more * omega)
-    best: tuple[float, float, Load] | None = None
-    for factor in WITNESS_FACTORS:
-        added = Load(inertia=factor * inertia, stiffness=factor * stiffness)
+def find_breaking(link: Link, outer: OuterLoop, frequencies_hz: Float[np.ndarray, " m"]) -> BreakingEnvironment | None:
+    """Return the mass or the spring at the link that makes it oscillate most of those that some frequencies name."""
+    load, best = link.load, None
+    reactances = -np.imag(apparent_impedance(link, outer, frequencies_hz))
+    for frequency, wanted in zip(frequencies_hz, reactances, strict=True):
+        omega = 2 * np.pi * float(frequency)
+        more = float(wanted) - (omega * load.inertia - load.stiffness / omega)
+        inertia, stiffness = (more / omega, 0.0) if more > 0.0 else (0.0, -more * omega)
         whole = Load(
-            inertia=load.inertia + added.inertia, damping=load.damping, stiffness=load.stiffness + added.stiffness
-        )
+            inertia=load.inertia + inertia, damping=load.damping, stiffness=load.stiffness + stiffness
+        )  # fmt: skip
         poles = close_link(link, outer.velocity_filter_s, whole).eigenvalues(outer.stiffness, outer.damping)
-        fastest = poles[int(np.argmax(np.abs(poles)))]
-        if best is None or abs(fastest) > best[0]:
-            best = float(abs(fastest)), float(abs(np.angle(fastest)) / (2 * np.pi * link.sample_time_s)), added
-    if best is None or best[0] <= GROWING:
-        return None
-    return BreakingEnvironment(
-        inertia=best[2].inertia, stiffness=best[2].stiffness, frequency_hz=best[1], spectral_radius=best[0]
-    )
+        fastest = complex(poles[int(np.argmax(np.abs(poles)))])
+        if best is None or abs(fastest) > best.spectral_radius:
+            best = BreakingEnvironment(
+                inertia=inertia, stiffness=stiffness, spectral_radius=abs(fastest),
+                frequency_hz=float(abs(np.angle(fastest)) / (2 * np.pi * link.sample_time_s)),
+            )  # fmt: skip
+    return None if best is None or best.spectral_radius <= GROWING else best
 
 
 def _find_band(link: Link, outer: OuterLoop) -> tuple[float, float] | None:

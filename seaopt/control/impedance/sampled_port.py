@@ -52,6 +52,7 @@ LOWEST_HZ = 0.01
 NEAR_MODES = np.geomspace(0.05, 20.0, 12)  # half widths of a mode
 BLOCK = 500  # points that are looked at together
 REFINEMENTS, DIPS, POINTS_PER_DIP = 3, 6, 17
+FAILING = 40  # frequencies at which an environment is looked for
 
 
 @record(eq=False)
@@ -204,6 +205,18 @@ class SampledPort:
                 least, found = float(margin[at]), float(place[at])
             place = _about_dips(place, margin)
         return least, found
+
+    def find_failing_hz(self, impedance: Impedance, damper: float) -> Float[np.ndarray, " m"]:
+        """Return frequencies at which an impedance is not passive, at most `FAILING`, and where it is least so."""
+        theta = self.angles()
+        terms, worst = self.terms(theta, damper), self.worst(impedance, damper, theta)[1]
+        failing = theta[:0]
+        if terms is not None:
+            margin = terms.margin(np.array([impedance.stiffness]), np.array([impedance.damping]))[0]
+            failing = theta[margin <= 0.0]
+        if failing.size:
+            failing = failing[np.unique(np.linspace(0, failing.size - 1, FAILING).astype(int))]
+        return np.union1d(failing, [worst]) / (2 * np.pi * self.link.sample_time_s)
 
     def refine(self, impedance: Impedance, damper: float, theta: Angles) -> Float[np.ndarray, " new"]:
         """Return new angles about those at which an impedance is least passive."""

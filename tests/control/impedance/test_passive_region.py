@@ -15,6 +15,7 @@ import pytest
 import seaopt as so
 from seaopt.control import Impedance, ImpedanceRegion, Law, passive_region, passivity, render
 from seaopt.control.impedance.link import Link, Load, find_link
+from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.region import needed_damper
 from seaopt.control.impedance.rendering import find_breaking
 from seaopt.control.impedance.sampled_port import SampledPort
@@ -80,15 +81,14 @@ def test_the_map_agrees_with_eigenvalues_against_environments(controller: so.Con
             stiffness=rng.uniform(0, 300), damping=rng.uniform(-0.5, 5), velocity_filter_s=2e-3
         )  # fmt: skip
         gains = (impedance.stiffness, impedance.damping, 2e-3)
-        margin, angle = port.worst(impedance, 0.3, theta)
-        passive = margin > 0.0
+        passive = port.worst(impedance, 0.3, theta)[0] > 0.0
         counts[passive] += 1
         if passive:
             radii = [find_radius(KNEE, controller.law, controller.delay_samples, per_effort, gains, load)
                      for load in loads]  # fmt: skip
             assert max(radii) <= 1.0 + 1e-9
             continue
-        found = find_breaking(link, link.outer(impedance), angle / (2 * np.pi * link.sample_time_s))
+        found = find_breaking(link, link.outer(impedance), port.find_failing_hz(impedance, 0.3))
         assert found is not None
         load = (0.25 + found.inertia, 0.3, found.stiffness)
         radius = find_radius(KNEE, controller.law, controller.delay_samples, per_effort, gains, load)
@@ -253,3 +253,16 @@ def test_the_page_prints_what_comes_out() -> None:
         other = passive_region(names["force"], names["knee"], names["values"], velocity_filter_s=filter_s, points=2)
         assert other.stiffest is not None
         assert other.stiffest.stiffness == pytest.approx(stiffest, rel=0.01)
+
+
+def test_the_free_link_is_that_of_its_own_plant() -> None:
+    """Without an outer loop the poles are those of the plant whose link moves, which nothing here has built."""
+    thor, stand, swing = so.plants.thor(), so.plants.high_impedance(), so.plants.moving_output()
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+    for held, free, values, asked in ((stand, swing, thor, spec), (HELD, FREE, KNEE, SPEC)):
+        force = so.tune(held, values, asked)
+        loop = close_link(find_link(force, free, values), 1e-3)
+        expected = force.close(free, values).eigenvalues()
+        found = loop.eigenvalues(0.0, 0.0)
+        for pole in expected:
+            assert np.min(np.abs(found - pole)) < 1e-6
