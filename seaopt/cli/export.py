@@ -64,7 +64,7 @@ def export_controller(
         if not certified:
             console.wrap(f"not certified: type seaopt certify PROBLEM -o {shlex.quote(str(results))}")
         if amount != "quiet" or (met and content["feasible"] and not broken):
-            console.wrap(f"wrote {', '.join(written)}")
+            console.list_files(written)
         for note in content.get("notes") or () if amount == "verbose" else ():
             console.wrap(f"note: {note}", indent=2)
     return content["feasible"] and met and not broken

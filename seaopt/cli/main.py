@@ -72,7 +72,7 @@ def _version(wanted: bool) -> bool:
 @app.callback()
 def _add_options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, metavar=" ", help="Print the version.")
     ] = False,
 ) -> None:
     """Series elastic actuators: from raw bench logs to a certified force controller.
@@ -213,7 +213,7 @@ def inspect(
 
 @app.command()
 def new(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Raw logs, of any format.", show_default=False)],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Raw logs, of any format.", show_default=False)],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="FILE", help="The problem file; beside the log, if left out."),
@@ -372,7 +372,7 @@ def fleet(
     problem: ProblemFile,
     logs: Annotated[
         list[str] | None,
-        typer.Argument(metavar="LOGS...", help="Files, 'patterns/**/*.csv', addresses (s3://...).", show_default=False),
+        typer.Argument(metavar="LOGS", help="Files, 'patterns/**/*.csv', addresses (s3://...).", show_default=False),
     ] = None,
     output: Folder = Path("out"),
     manifest: Annotated[

@@ -600,7 +600,7 @@ class Session:
             else:
                 self._show_figures(console, stage)
         if self.written:
-            console.wrap("wrote " + ", ".join(str(path) for path in self.written))
+            console.list_files(self.written)
 
     def _show_figures(self, console: Terminal, stage: str) -> None:
         """Print one screen of a stage's figures."""

@@ -25,8 +25,7 @@ def show_verdicts(console: Terminal, verdicts: Sequence[StageVerdict], *, verbos
     """Print a line per stage, below it what is not met, and at the end what to type next."""
     for verdict in verdicts:
         word, colour = MET if verdict.met else UNMET
-        console.say(word, style=colour, end="  ")
-        console.say(verdict.text)
+        console.label(word, verdict.text, style=colour, indent=9)
         show_reasons(console, verdict.reasons, verbose=verbose)
         for text in verdict.next:
             advice, command, rest = text.partition("type seaopt")
@@ -161,7 +160,7 @@ def _show_notes(console: Terminal, notes: Sequence[str]) -> None:
 
 
 def _spread(std: float | None) -> str:
-    return f"± {std:.2g}" if std is not None else MISSING
+    return f"± {std:.2g}" if std else MISSING  # what is fixed has none
 
 
 def _state(parameter: Parameter) -> str:

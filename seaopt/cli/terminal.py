@@ -6,6 +6,7 @@ import io
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from typing import Any, Literal
 
 from rich.console import Console
@@ -13,7 +14,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from seaopt.formatting import printable
+from seaopt.formatting import format_table, printable
 
 Amount = Literal["quiet", "usual", "verbose"]  # of what is printed
 
@@ -37,6 +38,24 @@ class Terminal(Console):
         for line in self.break_lines(text, indent=indent):
             self.say(" " * indent + line, soft_wrap=True, **options)
 
+    def label(self, word: str, text: str, *, style: str, indent: int) -> None:
+        """Print a word in a colour and a text beside it, whose further lines begin below the first one."""
+        first, *rest = self.break_lines(text, indent=indent)
+        self.say(word, style=style, end=" " * (indent - len(word)))
+        self.say("\n".join([first, *(" " * indent + line for line in rest)]), soft_wrap=True)
+
+    def list_files(self, paths: Iterable[object]) -> None:
+        """Print which files were written; a path is never broken, to be copied whole."""
+        names = [printable(str(path)) for path in paths]
+        words = ["wrote", *(f"{name}," for name in names[:-1]), *names[-1:]]
+        lines = [words[0]]
+        for word in words[1:]:
+            if len(lines[-1]) + 1 + len(word) <= self.width or lines[-1] == words[0]:
+                lines[-1] += f" {word}"
+            else:
+                lines.append(word)
+        self.say("\n".join(lines), soft_wrap=True)
+
     def break_lines(self, text: str, *, indent: int = 0) -> list[str]:
         """Return a text as the lines that fit the terminal behind an indent; at least one."""
         width = max(self.width - indent, LEAST_WIDTH)
@@ -46,15 +65,20 @@ class Terminal(Console):
         self, rows: Iterable[Sequence[str]], head: Sequence[str] = (), align: str = "", *, indent: int = 2, gap: int = 2
     ) -> None:
         """Print rows in aligned columns: "<" or ">" for each; what is too wide is broken in its cell."""
-        table = Table(box=None, show_header=bool(head), pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
         cells = [[printable(cell) for cell in row] for row in rows]
-        for at in range(max(map(len, [head, *cells]))):
-            right = align[at : at + 1] == ">"
+        lines = [*([list(head)] if head else []), *cells]
+        widths = [max(map(len, column)) for column in zip_longest(*lines, fillvalue="")]
+        whole = [align[at : at + 1] == ">" or width <= NARROW for at, width in enumerate(widths)]
+        least = sum(width if kept else NARROW for width, kept in zip(widths, whole, strict=True))
+        if least + gap * (len(widths) - 1) + indent > self.width:  # nothing is cut: the terminal breaks the lines
+            for line in format_table(cells, head or None, align):
+                self.say(" " * indent + line, soft_wrap=True)
+            return
+        table = Table(box=None, show_header=bool(head), pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
+        for at, kept in enumerate(whole):
             # Figures stay whole; words are broken.
-            whole = right or max((len(row[at]) for row in cells), default=0) <= NARROW
-            table.add_column(
-                Text(head[at]) if head else "", justify="right" if right else "left", no_wrap=whole, overflow="fold"
-            )
+            side = "right" if align[at : at + 1] == ">" else "left"
+            table.add_column(Text(head[at]) if head else "", justify=side, no_wrap=kept, overflow="fold")
         for row in cells:
             table.add_row(*map(Text, row))
         self.print(Padding(table, (0, 0, 0, indent)))

@@ -213,14 +213,15 @@ def _reading(pair: Pair, drive: DriveEstimate, derived: Mapping[str, DerivedFigu
     averaged = ""
     if abs(drive.efficiency.value - 1.0) > FAR * drive.efficiency.std:
         averaged = (
-            f" The form's static gain is {drive.efficiency.value:.3f} of what the motor gives, not 1: averaging K and "
-            f"b, as the paper does, would give {m_k} = {drive.m_k_averaged.value:.4g} {drive.m_k_averaged.unit} and "
-            f"{b_m} = {drive.b_m_averaged.value:.5g} {drive.b_m_averaged.unit}."
+            f" The form's static gain is {drive.efficiency.value:.3f} of what the motor gives, not 1: the mean of its "
+            f"K and b in place of b alone would give {m_k} = {drive.m_k_averaged.value:.4g} "
+            f"{drive.m_k_averaged.unit} and {b_m} = {drive.b_m_averaged.value:.5g} {drive.b_m_averaged.unit}."
         )
     return (
-        f"Read as (16) with k known, {pair.name} gives {m_k} = {drive.m_k} and {b_m} = {drive.b_m}; the fit in time "
+        f"From the second-order fit K/(s² + a s + b) of {pair.name}, with k known, follow {m_k} = {drive.m_k} and "
+        f"{b_m} = {drive.b_m}; the fit in time "
         f"gives {mass.value:.5g} ± {mass.std:.2g} {mass.unit} and {damping.value:.5g} ± {damping.std:.2g} "
-        f"{damping.unit}. So (16) has {words}.{averaged}"
+        f"{damping.unit}. So the second-order fit has {words}.{averaged}"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -46,6 +47,23 @@ def test_of_an_unstable_plant_only_that_is_said():
     unstable, other = map(explain_failure, group_failures(rows))
     assert "swing" in unstable.what and "2 more" in unstable.where
     assert other.what.startswith("max_noise_gain 30")
+
+
+@pytest.mark.parametrize("width", [20, 40, 80])
+def test_nothing_of_a_table_or_of_a_path_is_lost_however_narrow(width, capsys):
+    console = Terminal(width=width)
+    rows = [("natural_frequency_hz", "10.665", "± 15", "Hz"), ("J", "1.6348e-06", "± 4.5e-06", "kg m^2")]
+    console.tabulate(rows, ("parameter", "value", "std", "unit"), "<>><")
+    console.label("not met", "Controller: every limit met, on a fit", style="red", indent=9)
+    console.list_files(["a b/c.json", "out with blanks/report.html"])
+    text = capsys.readouterr().out
+    lines = text.splitlines()
+    assert all(cell in text for row in rows for cell in row)
+    assert "a b/c.json" in text and lines[-1].endswith("out with blanks/report.html")
+    first = next(at for at, line in enumerate(lines) if line.startswith("not met  Controller:"))
+    rest = [line for line in lines[first + 1 :] if not line.startswith(("wrote", "out"))]
+    assert all(re.match(r" {9}\S", line) for line in rest)
+    assert all(line == line.rstrip() for line in lines[first:])
 
 
 @pytest.fixture

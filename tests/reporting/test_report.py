@@ -39,8 +39,8 @@ def test_nothing_or_two_of_a_kind_is_refused(stand, thor, tmp_path, without_draw
 def test_the_page_says_how_the_papers_form_compares_with_the_fit(stand, stand_log, thor, tmp_path, without_drawing):
     fit = so.fit([so.Experiment(plant=stand, log=stand_log, name="chirp", outputs=("F1",))], thor.free("J", "b_r"))
     page = so.write_report([fit], tmp_path / "r.html").read_text(encoding="utf-8")
-    (said,) = [line for line in page.splitlines() if "Read as (16) with k known, F1/I gives" in line]
-    mass = float(said.split("gives m_k = ")[1].split()[0])
+    (said,) = [line for line in page.splitlines() if "of F1/I, with k known, follow" in line]
+    mass = float(said.split("follow m_k = ")[1].split()[0])
     assert mass == pytest.approx(0.646 + 3.31e-6 / (0.002 / (6 * 3.141592653589793)) ** 2, rel=5e-4)  # (1), (2)
     assert "not of second order" not in said
     assert (tmp_path / "figures" / "response_chirp.svg").exists()

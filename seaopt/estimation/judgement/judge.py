@@ -130,9 +130,15 @@ def _state_shares(fit: Fit, shares: Mapping[str, Mapping[str, CoherentShare]]) -
         for output, one in row.items():
             explained = _explained(one)
             share = shares[name].get(output)
-            explainable = None if share is None or explained is None else max(share.output, explained)
+            explainable = None if share is None or explained is None else _explainable(share, explained)
             stated[name][output] = replace(one, explained=explained, explainable=explainable)
     return stated
+
+
+def _explainable(share: CoherentShare, explained: float) -> float:
+    """Return the share that the inputs account for, what they account for of the residual included."""
+    rest = share.residual if share.p < CHANCE else 0.0
+    return max(share.output, explained + (1.0 - explained) * max(rest, 0.0))
 
 
 def _score_held_out_shots(fit: Fit, outputs: dict[str, dict[str, OutputFit]]) -> dict[str, dict[str, OutputFit]]:
@@ -190,14 +196,14 @@ def _find_unexplained(
                     severity="error" if ratio < HALF else "warning", kind="explained", where=where, text=text
                 )
             elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
-                low, high = share.band_hz
+                band = " to ".join(dict.fromkeys(f"{end:.3g}" for end in share.band_hz))
                 follows = np.sqrt(share.residual) * excess[name][output]
                 bad = (share.residual > SYSTEMATIC and share.power > LARGE) or (
                     follows > FAR_ABOVE and share.power > VISIBLE
                 )
                 text = (
                     f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at "
-                    f"{low:.3g} to {high:.3g} Hz: the model lacks something, and the stds allow for noise alone"
+                    f"{band} Hz: the model lacks something, and the stds allow for noise alone"
                 )
                 yield FitFinding(severity="error" if bad else "warning", kind="residual", where=where, text=text)
 

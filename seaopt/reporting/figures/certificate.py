@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 MOST_USED = 3.0  # times a limit: what is beyond stands at the edge
 LOWEST_HZ = 0.05
 PORT_POINTS = 800
+FROM_DRAWS = {
+    "monte_carlo_failures": "draws that fail",
+    "worst_case": "worst case, of its limits",
+    "max_failure_probability": "failure probability",
+}
 
 
 def plants_of(certificate: Certificate) -> Plants:
@@ -35,6 +40,8 @@ def label_requirement(row: Requirement) -> str:
     """Return a requirement's name in words."""
     if row.name in BY_REQUIREMENT:
         return BY_REQUIREMENT[row.name].label
+    if row.name in FROM_DRAWS:
+        return FROM_DRAWS[row.name]
     name = row.name.removesuffix("_s")
     return name.replace("_", " ") + (" [s]" if name != row.name else "")
 

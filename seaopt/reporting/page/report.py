@@ -13,6 +13,7 @@ from seaopt.control import Controller, ForceMPC, Scorecard, scorecard
 from seaopt.control.deploy.export import export
 from seaopt.control.impedance.scorecard import HEADS
 from seaopt.control.laws.controller import name_gain_units
+from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.laws.verdict import list_design_figures
 from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
@@ -46,6 +47,7 @@ Result = Fit | Ranking | Controller | ForceMPC | Certificate | Verification | St
 KINDS = (Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap)
 FILED = ("controller", "fit", "ranking", "certificate", "amplitude", "contact")  # parts with figures as files
 FIGURES_SCHEMA = "seaopt/figures/1"
+DESIGN_PLANT = "design plant"
 LAW_NAME = "force_law"  # of the C header that can be copied
 
 
@@ -388,8 +390,16 @@ def list_figures(material: Material) -> list[tuple[str, str, str]]:
         ]
     if certificate is not None:
         worst = max(certificate.worst.values(), key=lambda one: one.ms)
+        level = certificate.controller.spec.level("max_sensitivity")
+        allowed = "" if level is None else f", at most {level:g}"
         draws = certificate.monte_carlo
-        figures.append(("worst Ms found", format_number(worst.ms, 3), f"on {len(certificate.plants)} plants"))
+        figures.append(
+            (
+                "worst Ms found",
+                format_number(worst.ms, 3),
+                f"on {format_count(len(certificate.plants), 'plant')}{allowed}",
+            )
+        )
         if draws.samples:
             figures.append(("draws failed", f"{draws.failures} of {draws.samples}", "all plants together"))
     if material.verification is not None:
@@ -406,6 +416,7 @@ class RequirementRow:
     value: float
     limit: float
     sense: str
+    unit: str
     met: bool
     where: str
     count: int
@@ -413,12 +424,15 @@ class RequirementRow:
 
 def group_requirements(certificate: Certificate) -> list[RequirementRow]:
     """Return what is missed, each kind once with its count, and then what is met."""
+    units = {name: limit.unit for name, limit in BY_REQUIREMENT.items()}
+    units["max_noise_gain"] = certificate.controller.command.gain_unit
     groups = [(one.worst, one.count) for one in group_failures(certificate.requirements)]
     groups += [(row, 1) for row in certificate.requirements if row.met]
     return [
         RequirementRow(
-            label=certificates.label_requirement(row), value=row.value, limit=row.limit, sense=row.sense, met=row.met,
-            where=row.where, count=count,
+            label=certificates.label_requirement(row), value=row.value, limit=row.limit, sense=row.sense,
+            unit=units.get(row.name, ""), met=row.met, where=DESIGN_PLANT if row.where == "design" else row.where,
+            count=count,
         )
         for row, count in groups
     ]  # fmt: skip
