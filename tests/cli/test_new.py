@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shlex
 
 import pytest
 
@@ -118,6 +119,22 @@ def test_a_log_in_toml_is_never_written_over_by_the_name_beside_it(folder, seaop
 def test_a_log_taken_for_a_problem_file_is_not_offered_as_the_file_to_write(folder, seaopt, held):
     out = seaopt("fit", "knee.csv")
     assert out.returncode == 2 and "seaopt new knee.csv" in out.stderr and "-o" not in out.stderr
+
+
+def test_brackets_that_are_no_unit_are_refused_with_the_command_that_reads_them(folder, seaopt):
+    rows = "\n".join(f"{k / 100},{k % 7},{k % 5}" for k in range(300))
+    (folder / "odd.csv").write_text(f't [s],I [A],F1 `a` [q"x]\n{rows}\n', encoding="utf-8")
+    out = seaopt("inspect", "odd.csv")
+    command = out.stderr.strip().split("as in seaopt ")[1]
+    assert out.returncode == 2 and seaopt(*shlex.split(command)).returncode == 0
+
+
+def test_a_header_with_a_line_break_in_quotes_is_read(folder, seaopt):
+    rows = "\n".join(f"{k / 100},{k % 7},{k % 5}" for k in range(300))
+    (folder / "lines.csv").write_text(f't [s],"I\n[A]",F1 [N]\n{rows}\n', encoding="utf-8")
+    log = so.read_log(folder / "lines.csv", time="t [s]", channels={"I": "I [A]", "F1": "F1 [N]"})
+    assert len(log) == 300 and log["I"][:8].tolist() == [0, 1, 2, 3, 4, 5, 6, 0]
+    assert seaopt("inspect", "lines.csv").returncode == 0
 
 
 def test_a_folder_is_no_log(folder, seaopt):

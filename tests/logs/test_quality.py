@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import scipy.io
+import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -338,3 +339,43 @@ def test_whatever_the_numbers_a_report_or_a_seaopt_error(seed, pool, steps, n):
         return
     json.loads(to_json(quality.to_dict()))
     assert repr(quality)
+
+
+def answer_of_second_order(damping, rate=400.0, hz=8.0):
+    """Return a log of noise through a second-order lag with a static gain of 3, by its exact discretisation."""
+    omega, rng = 2 * np.pi * hz, np.random.default_rng(4)
+    lag = scipy.signal.cont2discrete(([3 * omega**2], [1, 2 * damping * omega, omega**2]), 1 / rate)
+    drive = rng.normal(size=16000)
+    answer = scipy.signal.lfilter(lag[0].ravel(), lag[1], drive)
+    return so.Log.from_arrays(
+        time=np.arange(drive.size) / rate, I=drive, F1=answer + 0.01 * rng.normal(size=drive.size)
+    )
+
+
+@pytest.mark.parametrize(("damping", "peak", "half"), [(0.2, 8.0, 13.5), (1.0, None, 8.0), (4.0, None, 1.75)])
+def test_a_peak_is_named_only_where_there_is_one(damping, peak, half):
+    """Half of the largest gain, in closed form: of damping 0.2 at 13.5 Hz, of 1 at 8 Hz, of 4 at 1.75 Hz."""
+    excitation = answer_of_second_order(damping).quality.excitation["I"]
+    third = 2 ** (1 / 3)
+    assert half / third < excitation.rolls_off_hz < half * third**2  # the first whole band that is below
+    if peak is None:
+        assert excitation.peak_hz is None and "without a peak" in excitation.sentence
+    else:
+        assert peak / third < excitation.peak_hz < peak * third
+    assert "the response of F1 " in excitation.sentence
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_beyond_any_sensor_are_an_error_and_in_no_figure():
+    t = np.arange(4000) / 400
+    rng = np.random.default_rng(0)
+    drive, force = rng.normal(size=t.size), rng.normal(size=t.size)
+    plain = so.Log.from_arrays(
+        time=t, I=drive, F1=np.where(np.isin(np.arange(t.size), [50, 51]), np.nan, force)
+    ).quality
+    force[[50, 51]] = 1e300, -1e308
+    quality = so.Log.from_arrays(time=t, I=drive, F1=force).quality
+    (finding,) = quality.of("beyond")
+    assert (finding.severity, finding.count, finding.where_s[0][0]) == ("error", 2, t[50])
+    assert not quality.of("missing") and quality.channels["F1"].std == plain.channels["F1"].std
+    assert not any("inf" in one.sentence or "nan" in one.sentence or "∞" in one.sentence for one in quality.findings)

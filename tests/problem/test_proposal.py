@@ -317,6 +317,26 @@ def test_what_results_rest_on_and_nobody_knew_is_data(tmp_path, logs):
     )
 
 
+@pytest.mark.parametrize(
+    ("names", "answers", "roles"),
+    [
+        (("q_m", "q_l", "tau_s"), {}, ("theta_m", "theta_l", "tau_s")),
+        (("pos_m", "q_l", "u"), {"actuator": "rotary"}, ("theta_m", "theta_l", "")),
+        (("pos_m", "", "tau"), {}, ("theta_m", None, "tau_s")),
+        (("x_m", "", "F1 [N]"), {}, ("q", None, "F1")),
+        (("x_m", "", "F1 [N]"), {"m:x_m": "motor"}, ("screw", None, "F1")),
+    ],
+)
+def test_an_m_is_the_motor_beside_a_gear_and_else_asked_for(tmp_path, logs, names, answers, roles):
+    free = logs["free"]
+    signals = dict(zip(names, (free["theta_m"], free["theta_l"], free["tau_s"]), strict=True))
+    columns = {"t": logs["t"], "iq": free["I"], **{name: one for name, one in signals.items() if name}}
+    proposal = propose([write_csv(tmp_path / "a.csv", columns)], answers, tmp_path)
+    got = {row.column: row.role for row in proposal.columns}
+    assert tuple(got.get(name) for name in names) == roles
+    assert ("m:x_m" in {one.key for one in proposal.guesses}) == (names[0] == "x_m" and not answers)
+
+
 def test_reasons_of_guesses_are_true(tmp_path, logs):
     screw = logs["screw"]
     path = write_csv(

@@ -43,6 +43,7 @@ from seaopt.plants import Plant
 from seaopt.units import unit_after
 
 CHANCE_POWER = 200.0  # N R^2 below which a model explains nothing: some parameters' worth of chance, and noise's colour
+TOLD_STDS = 2.0  # standard deviations from which a value is told from zero
 ANOTHER_SIZE = 100.0  # times the start, which hints at a unit rather than at a bad guess
 # Samples below which intervals are too narrow: in 100 windows of the stand's log 90 to 96 % at 40, 92 % at 100.
 FEW_SAMPLES = 400
@@ -140,7 +141,9 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
             continue
         ratio = parameter.value / start
         times, way = (ratio, "above") if ratio > 1.0 else (start / parameter.value, "below")
-        if times > ANOTHER_SIZE:
+        # What is not told from zero is small by chance: no unit explains it.
+        told = parameter.std is None or parameter.std < abs(parameter.value) / TOLD_STDS
+        if times > ANOTHER_SIZE and (ratio > 1.0 or told):
             odd.append(
                 f"{name} = {parameter.value:.3g} is {format_number(times)} times {way} its start of {start:.3g}: "
                 "check the units of time, inputs and outputs"

@@ -10,7 +10,7 @@ import codecs
 import csv
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from seaopt.errors import LogError
@@ -253,6 +253,7 @@ def _find_headers(
 ) -> tuple[list[str], list[str | None], list[str]]:
     """Return header and unit of each column, and what was found above the data."""
     notes: list[str] = []
+    above = _join_quoted_lines(above)
     candidates = [(at, _split_header(line, delimiter)) for at, line in enumerate(above) if line.strip()]
     table = [(at, row) for at, row in candidates if not _is_comment(above[at])]
     header_rows = [
@@ -283,6 +284,27 @@ def _find_headers(
     names = zip(*(_pad(row, width) for _, row in header_rows), strict=True)
     headers = [" ".join(cell for cell in column if cell) for column in names]
     return headers, [unit or header_unit(name) for unit, name in zip(units, headers, strict=True)], notes
+
+
+def _join_quoted_lines(lines: Sequence[str]) -> list[str]:
+    """Return lines of which one that a quoted cell breaks (RFC 4180) is whole, with empty ones for the rest of it.
+
+    Examples
+    --------
+    >>> _join_quoted_lines(['t,"I', '[A]",F1', "x"])
+    ['t,"I [A]",F1', '', 'x']
+
+    """
+    joined = list(lines)
+    start: int | None = None
+    for at, line in enumerate(lines):
+        broken = line.count('"') % 2 == 1
+        if start is None:
+            start = at if broken else None
+        elif broken:
+            joined[start : at + 1] = [" ".join(lines[start : at + 1]), *[""] * (at - start)]
+            start = None
+    return joined
 
 
 def _split_header(line: str, delimiter: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,6 +14,7 @@ from seaopt.logs.quality.spectra import Hum
 from seaopt.records import record
 from seaopt.signals import Signal
 
+BEYOND = 1e30  # in SI: more than any sensor gives, and with a square that is still a number
 MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
 
 
@@ -27,6 +29,8 @@ class ChannelQuality:
         Of the samples that are there; NaN where none is.
     missing : RowRanges
         Samples that are not finite.
+    beyond : array of int
+        Rows of numbers that no sensor gives; no figure is made of them.
     quantum : float
         Quantisation step; 0 where none is seen.
     still : float
@@ -60,6 +64,7 @@ class ChannelQuality:
     outliers: Int[np.ndarray, " k"]
     counter: CounterLosses | None
     hum: Hum | None = None
+    beyond: Int[np.ndarray, " b"] = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     @property
     def constant(self) -> bool:
@@ -85,14 +90,16 @@ def assess_channel(signal: Signal) -> ChannelQuality:
     values = signal.values
     finite = np.isfinite(values)
     missing = RowRanges() if np.all(finite) else faults.find_runs(~finite)
-    present = values if not len(missing) else values[finite]
-    values = values if not np.any(np.isinf(values)) else np.where(finite, values, np.nan)
+    beyond = np.flatnonzero(finite & (np.abs(values) > BEYOND))
+    finite[beyond] = False
+    present = values[finite]
+    values = values if np.all(finite) else np.where(finite, values, np.nan)
     if not present.size or present.min() == present.max():
         edge = float(present[0]) if present.size else np.nan
         return ChannelQuality(
             name=signal.name, unit=signal.unit, low=edge, high=edge, mean=edge, std=0.0 if present.size else np.nan,
             missing=missing, quantum=0.0, still=1.0, held=1, stuck=RowRanges(), rails=(),
-            outliers=np.zeros(0, dtype=int), counter=None,
+            outliers=np.zeros(0, dtype=int), counter=None, beyond=beyond,
         )  # fmt: skip
     quantum, still = faults.find_quantisation(values), faults.measure_stillness(values)
     losses = faults.find_counter_losses(values)
@@ -107,7 +114,7 @@ def assess_channel(signal: Signal) -> ChannelQuality:
         mean=float(present.mean()), std=float(present.std()), missing=missing, quantum=quantum, still=still,
         held=faults.count_repeats(values) if still >= faults.HOLDS else 1,
         stuck=_off_rails(faults.find_stuck(values, quantum, still), values, rails) if losses is None else RowRanges(),
-        rails=rails, outliers=outliers, counter=losses,
+        rails=rails, outliers=outliers, counter=losses, beyond=beyond,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from seaopt.records import record
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
 DIP_BANDS = 3  # of a third of an octave, between usable ones: the coherence may be low in them
 REACHED = 0.1  # of the largest power in a band; what is weaker is the window's
+PEAK = 1.2  # times the response in the lowest usable band, from which a largest one is a peak
 LEAST_COHERENCE = 0.5  # of an output with the input, power-weighted; below it most of the output is something else
 
 
@@ -47,14 +48,20 @@ class ThirdOctave:
     gain: float | None
     usable: bool
 
+    @property
+    def middle_hz(self) -> float:
+        """Its middle, on a logarithmic axis."""
+        return float(np.sqrt(self.low_hz * self.high_hz))
+
 
 @record
 class InputExcitation:
-    """The bands of one input."""
+    """The bands of one input; `output` is the one whose gains they have, "" where there is none."""
 
     channel: str
     bands: tuple[ThirdOctave, ...]
     nyquist_hz: float
+    output: str = ""
 
     @property
     def usable_hz(self) -> tuple[float, float] | None:
@@ -79,15 +86,30 @@ class InputExcitation:
         return best
 
     @property
-    def rolls_off_above_hz(self) -> float | None:
-        """Where the response is largest within the usable bands, if it falls to half above; else None."""
+    def rolls_off_hz(self) -> float | None:
+        """Where the response has fallen to half of its largest value, above that and within the usable bands."""
+        places = self._find_roll_off()
+        return None if places is None else places[1].middle_hz
+
+    @property
+    def peak_hz(self) -> float | None:
+        """Where the response is largest, if that is a peak: it falls to half above, and is less below."""
+        places = self._find_roll_off()
+        if places is None:
+            return None
+        top, lowest = places[0], next(band for band in self.bands if band.usable)
+        return top.middle_hz if (top.gain or 0.0) > PEAK * (lowest.gain or 0.0) else None
+
+    def _find_roll_off(self) -> tuple[ThirdOctave, ThirdOctave] | None:
+        """Return the band of the largest response and the first above it of half as much; None where none is."""
         usable = self.usable_hz
         inside = [band for band in self.bands if band.usable and usable and usable[0] <= band.low_hz < usable[1]]
         gains = [band.gain for band in inside if band.gain is not None]
-        if len(gains) < 3 or len(gains) < len(inside) or min(gains[int(np.argmax(gains)) :]) > 0.5 * max(gains):
+        if len(gains) < 3 or len(gains) < len(inside):
             return None
-        top = inside[int(np.argmax(gains))]
-        return float(np.sqrt(top.low_hz * top.high_hz))
+        top = int(np.argmax(gains))
+        half = next((at for at in range(top, len(gains)) if gains[at] <= 0.5 * gains[top]), None)
+        return None if half is None else (inside[top], inside[half])
 
     @property
     def sentence(self) -> str:
@@ -103,9 +125,11 @@ class InputExcitation:
         sentence = f"{self.channel} is {what} from {low:.3g} to {high:.3g} Hz"
         if high < 0.8 * self.nyquist_hz:
             sentence += f"; nothing above {high:.3g} Hz"
-        top = self.rolls_off_above_hz
-        if top is not None:
-            sentence += f"; the response is largest near {top:.2g} Hz and falls to half above"
+        peak, half = self.peak_hz, self.rolls_off_hz
+        if peak is not None:
+            sentence += f"; the response of {self.output} is largest near {peak:.2g} Hz and falls to half above"
+        elif half is not None:
+            sentence += f"; the response of {self.output} has fallen to half near {half:.2g} Hz, without a peak"
         elif self.bands[0].gain is not None:
             sentence += "; no response falls to half in there: inertia and stiffness (J and k) cannot be identified"
         if low > 4.0 * self.bands[0].low_hz:
@@ -160,4 +184,4 @@ def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) ->
                 usable=bool(levels[k] >= -RANGE_DB and (best is None or best >= LEAST_COHERENCE)),
             )
         )  # fmt: skip
-    return InputExcitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]))
+    return InputExcitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]), output=loudest or "")

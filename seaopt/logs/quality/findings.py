@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.formatting import format_count, format_figure
-from seaopt.logs.quality.channel import ChannelQuality
+from seaopt.logs.quality.channel import BEYOND, ChannelQuality
 from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality
 from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.faults import CounterLosses, RowRanges
@@ -105,7 +105,16 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
     name = channel.name
     if len(channel.missing):
         yield _missing_finding(channel, time)
-    if channel.missing.samples == time.size:
+    if channel.beyond.size:
+        count = format_count(channel.beyond.size, "sample")
+        text = (
+            f"{name} has {count} beyond any sensor (above {BEYOND:g}): nothing else here counts them; set them to NaN"
+        )
+        yield Finding(
+            kind="beyond", severity="error", channel=name, count=int(channel.beyond.size), sentence=text,
+            where_s=_places(time, channel.beyond),
+        )  # fmt: skip
+    if channel.missing.samples + channel.beyond.size == time.size:
         return
     if channel.constant:
         text = f"{name} is {format_figure(channel.low, channel.unit)} throughout; check its wiring, or leave it out"

@@ -11,6 +11,7 @@ from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
 from seaopt.formatting import format_table, html_list, html_paragraph, html_table
@@ -182,7 +183,8 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
         for name, channel in channels.items()
     }
     # A constant has no spectrum, and a counter one that means nothing.
-    varying = {name: data.signals[name].values for name, channel in channels.items() if _varies(channel)}
+    varying = {name: _drop_beyond(data.signals[name].values, channel) for name, channel in channels.items()
+               if _varies(channel)}  # fmt: skip
     inputs = tuple(inputs) if inputs is not None else _likely_inputs(channels)
     spectra = compute_spectra(varying, _stretches(clock, len(data)), clock.period)
     if spectra is not None:
@@ -200,6 +202,15 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None) -> Q
         source=data.source, duration_s=float(np.ptp(finite)), clock=clock, channels=channels, inputs=inputs,
         pairs=pairs, excitation=excitation, spectra=spectra, findings=sort_findings(findings), notes=data.notes,
     )  # fmt: skip
+
+
+def _drop_beyond(values: Float[np.ndarray, " n"], channel: ChannelQuality) -> Float[np.ndarray, " n"]:
+    """Return a channel's samples without those that no sensor gives."""
+    if not channel.beyond.size:
+        return values
+    tame = values.copy()
+    tame[channel.beyond] = np.nan
+    return tame
 
 
 def _varies(channel: ChannelQuality) -> bool:
@@ -279,7 +290,8 @@ def _list_unjudged(
     elif spectra is None:
         text = f"{len(data)} samples are too few for spectra: hum, delays, signs and excitation were not looked at"
     elif not inputs:
-        text = "no channel is known to be an input: excitation and delays were not looked at; name it (inputs)"
+        text = "no channel is known to be an input: excitation and delays were not looked at; name it: --input NAME "
+        text += '(inputs=["NAME"])'
     else:
         return []
     return [Finding(kind="unjudged", severity="note", sentence=text)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -454,7 +455,7 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
     for source, field in chosen:
         known = any(unit and is_unit(unit) for unit in declared)
         if source.format == "CSV" and known and _is_unit_bracket(field) and not is_unit(field.unit or ""):
-            resolve_unit(source, Column(column=field.name), field)
+            _check_bracket(source, field)
     if any(csv and unit is not None and not is_unit(unit) for csv, unit in zip(text, declared, strict=True)):
         notes = ["brackets in the headers that are not units were taken as names; no unit is known"]
         return [""] * len(declared), notes
@@ -464,6 +465,18 @@ def _find_units(chosen: list[tuple[Source, Field]]) -> tuple[list[str], list[str
     ]
     notes = [f"units that are not known were left out: {_list_names(lost)}"] if lost else []
     return units, notes
+
+
+def _check_bracket(source: Source, field: Field) -> None:
+    """Refuse brackets that hold no unit, with the command that gives one."""
+    try:
+        resolve_unit(source, Column(column=field.name), field)
+    except SeaoptError as error:
+        bare = bare_name(field.name)
+        name = bare if bare.isidentifier() else "F1"
+        options = ["--channel", f"{name}={field.name}", "--unit", f"{name}=N"]
+        command = shlex.join(["seaopt", "inspect", str(source.path), *options])
+        raise UnitError(f"{error}; or name the column, and give its own unit, as in {command}") from error
 
 
 def _is_unit_bracket(field: Field) -> bool:

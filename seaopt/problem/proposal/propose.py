@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -48,8 +49,8 @@ from seaopt.problem.proposal.roles import (
     is_held,
     is_rotary,
 )
-from seaopt.problem.proposal.survey import Survey, regress, slow_sign, survey_log
-from seaopt.problem.proposal.vocabulary import COUNTS
+from seaopt.problem.proposal.survey import Survey, SurveyedColumn, regress, slow_sign, survey_log
+from seaopt.problem.proposal.vocabulary import COUNTS, is_m_open, read_header
 from seaopt.records import record
 from seaopt.signals import Signal, Table
 from seaopt.units import factor, header_unit
@@ -63,6 +64,7 @@ HOLDOUT_S = 10.0  # a log from which a fifth can be kept back
 GEARED = (1.5, 1000.0)  # slopes of motor over link that are a gear's
 BRIDGE = 5.0  # periods that an irregular clock may skip
 RETUNE = 4
+LINK_END = re.compile(r"[\s_.\-/]l$")  # of a name, beside one that ends in m: the link, and the motor
 COMMENT_AT = 56  # column of the comments
 
 
@@ -173,7 +175,20 @@ def _survey(path: Path, interview: Interview) -> Survey:
     if len(survey.clocks) > 1 and survey.clock is not None:
         interview.ask(key, f"Which column of {path.name} is the time?", survey.clock.name, "the first of them",
                       survey.clocks)  # fmt: skip
-    return survey
+    columns = tuple(_settle_m(one, survey, interview) for one in survey.columns)
+    return replace(survey, columns=columns)
+
+
+def _settle_m(column: SurveyedColumn, survey: Survey, interview: Interview) -> SurveyedColumn:
+    """Return a column of which the m at the end of its name is settled: beside signs of a gear it is the motor."""
+    if not is_m_open(column.header):
+        return column
+    geared = any(one.header.quantity == "torque" or LINK_END.search(one.name) for one in survey.columns)
+    meaning = "motor" if geared else interview.ask(
+        f"m:{column.name}", f'Is "{column.name}" in metres, or an angle of the motor?', "metres",
+        "no column is a torque, nor of a link", ("metres", "motor"),
+    )  # fmt: skip
+    return replace(column, header=read_header(column.name, metres=False)) if meaning == "motor" else column
 
 
 def _assign(survey: Survey, interview: Interview, turns: bool) -> Assignment:
@@ -483,10 +498,7 @@ def _describe_controller(logs: Sequence[_Log], actuator: Proposed, interview: In
         (f"measured = {_quote(actuator.measured)}", "what is regulated"),
     ]
     rows.append(('structure = "pid"', ""))
-    peak, guess, why = _find_peak_hz(logs), DEFAULT_BANDWIDTH_HZ, "a usual one"
-    if peak is not None:
-        guess = min(max(5.0 * round(ABOVE_RESONANCE * peak / 5.0), USUAL_BANDWIDTHS_HZ[0]), USUAL_BANDWIDTHS_HZ[1])
-        why = f"above the resonance, which the log has near {peak:.2g} Hz"
+    guess, why = _guess_bandwidth(logs)
     band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
     rows.append((f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")))
     low, high = USUAL_BANDWIDTHS_HZ
@@ -539,8 +551,8 @@ def _describe_robustness(logs: Sequence[_Log], actuator: Proposed) -> list[tuple
     return rows
 
 
-def _find_peak_hz(logs: Sequence[_Log]) -> float | None:
-    """Return where the effort answers most to the input, of the first log that shows it."""
+def _guess_bandwidth(logs: Sequence[_Log]) -> tuple[float, str]:
+    """Return a bandwidth above where the effort's response peaks, or falls off, in the first log that shows it."""
     for log in logs:
         signals = log.signals
         role = next((role for role in ("tau_s", "F1", "F2") if role in signals), None)
@@ -551,9 +563,13 @@ def _find_peak_hz(logs: Sequence[_Log]) -> float | None:
         table = Table(time=time, signals=channels, source=log.survey.name)
         excitation = assess_quality(table, inputs=[log.roles.input]).excitation
         for one in excitation.values():
-            if one.rolls_off_above_hz is not None:
-                return one.rolls_off_above_hz
-    return None
+            if one.rolls_off_hz is not None:
+                place = one.peak_hz or one.rolls_off_hz
+                low, high = USUAL_BANDWIDTHS_HZ
+                guess = min(max(5.0 * round(ABOVE_RESONANCE * place / 5.0), low), high)
+                shown = f"above the resonance, which the log has near {place:.2g} Hz"
+                return guess, shown if one.peak_hz else f"above {place:.2g} Hz, where the response has fallen to half"
+    return DEFAULT_BANDWIDTH_HZ, "a usual one"
 
 
 def _spell_column(name: str, unit: str, scale: float) -> str:

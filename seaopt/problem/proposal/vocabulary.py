@@ -108,8 +108,10 @@ class Header:
     number: int | None = None
 
 
-def read_header(name: str, unit: str | None = None) -> Header:
+def read_header(name: str, unit: str | None = None, *, metres: bool = True) -> Header:
     """Return what a column's header says; `unit` is what the file itself states.
+
+    Without `metres` an m at the end of a name is the motor.
 
     Examples
     --------
@@ -122,6 +124,8 @@ def read_header(name: str, unit: str | None = None) -> Header:
     """
     stated, bare = _clean_unit(unit), bare_name(name)
     suffix, rest = ("", bare) if stated else _split_suffix(bare)
+    if suffix == "m" and not metres:
+        suffix, rest = "", bare
     words = split_words(rest)
     kinds = _list_quantities(words)
     place = bool(_matches(words, PLACE_WORDS | DEFLECTION_WORDS))
@@ -139,6 +143,18 @@ def read_header(name: str, unit: str | None = None) -> Header:
         commanded=bool(_matches(words, COMMAND_WORDS)), measured=bool(_matches(words, MEASURED_WORDS)),
         deflection=bool(_matches(words, DEFLECTION_WORDS)), number=_find_number(words),
     )  # fmt: skip
+
+
+def is_m_open(header: Header) -> bool:
+    """Tell whether the m at the end of a name is metres or the motor, which the name alone does not say.
+
+    Examples
+    --------
+    >>> is_m_open(read_header("pos_m")), is_m_open(read_header("weg_m")), is_m_open(read_header("pos [m]"))
+    (True, False, False)
+
+    """
+    return header.unit == "m" and read_header(header.name, metres=False).quantity == "angle"
 
 
 def split_words(name: str) -> list[str]:
