@@ -202,7 +202,7 @@ KEYS: dict[str, dict[str, str]] = {
         "parameters": "Values, or free ones, of this log alone.",
         "delay_s": "From the input's column to its effect.",
         "gain": "Of each output's sensor.",
-        "hold": '"first" for a measured input, which is no staircase.',
+        "hold": '"first" for a measured input: straight lines between its samples.',
         "drift": "Order of a polynomial that each output may drift by.",
         "shots": "Pieces with initial states of their own.",
         "slice_s": "What is used, from the log's start.",

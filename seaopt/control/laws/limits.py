@@ -381,8 +381,8 @@ LIMITS = (
         remedy="ask for the bandwidths that the result names",
     ),
     Limit(
-        name="min_filter_samples", label="derivative's filter (sample times)", figure=lambda loop: loop.filter_samples,
-        sense="at least", scope="design plant", unit="", default=1.0, reserve="none",
+        name="min_filter_samples", label="derivative's filter", figure=lambda loop: loop.filter_samples,
+        sense="at least", scope="design plant", unit="T_s", default=1.0, reserve="none",
         meaning="T_f in samples: a faster filter lets the derivative amplify what lies between two samples",
         remedy="tune again",
     ),

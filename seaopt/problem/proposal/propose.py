@@ -428,7 +428,7 @@ def _describe_experiment(log: _Log, name: str, interview: Interview) -> list[tup
         text = f"time = {_spell_column(clock.name, log.time_unit, 1.0)}"
         rows.append((text, "; ".join(filter(None, marks))))
     if log.roles.columns[log.roles.input].header.measured:
-        rows.append(('hold = "first"', "the input was measured, and is no staircase"))
+        rows.append(('hold = "first"', "the input was measured: straight lines between its samples"))
     return rows + _describe_clock(log)
 
 
