@@ -341,7 +341,7 @@ class Session:
             if name not in given and value != asked[name]:
                 raise ProblemError(
                     f"{path}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
-                    f"{asked[name]}; correct one of them, or run seaopt tune {self.problem.source} again"
+                    f"{asked[name]}; correct one of them, or run {self._spell('tune')} again"
                 )
 
     def fit_met(self) -> bool:
@@ -364,7 +364,7 @@ class Session:
         A file that does not say what it was made from (written by hand) is taken as it is; and a controller made for
         another [robustness], which a certificate may ask about.
         """
-        path, again = self.folder / FILES[stage], f"run seaopt {stage} {self.problem.source} -o {self.folder}"
+        path, again = self.folder / FILES[stage], f"run {self._spell(stage)}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
         content = read_json(path, SCHEMAS[stage], remedy=again)
