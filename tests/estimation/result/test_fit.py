@@ -436,6 +436,14 @@ def test_a_unit_that_a_parameter_can_absorb_is_asked_about(stand, short_log, tho
     assert any("1000 times below its start of 1: check the units" in note for note in fit.notes)
 
 
+def test_a_value_that_is_not_told_from_zero_is_no_question_of_units(stand, short_log, thor):
+    """There is no dry friction in the log: what is left of its start is chance."""
+    fit = so.fit([experiment(stand, short_log)], thor.update(f_c=100.0).free("f_c", "b_r"))
+    friction = fit.parameters["f_c"]
+    assert abs(friction.value) < min(1.0, 2.0 * friction.std)
+    assert not any("check the units" in note for note in fit.notes)
+
+
 def test_how_far_a_value_is_from_its_start_has_few_digits(stand, short_log, thor):
     fit = so.fit([experiment(stand, short_log)], thor.update(b_r=1e-134).free("b_r"), diagnostics=False)
     (note,) = (note for note in fit.notes if "times above its start of 1e-134" in note)
