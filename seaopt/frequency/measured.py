@@ -77,7 +77,7 @@ class MeasuredResponse:
     ...     stand, thor, PAPER_STAND, duration_s=60, rate_hz=1000, seed=1, sensors=so.Sensors(noise_std={"F1": 2.0})
     ... )
     >>> measured = measure_response(stand, log, "F1")
-    >>> measured.confidence, measured.frequency_hz[-1] > 100.0
+    >>> measured.confidence, bool(measured.frequency_hz[-1] > 100.0)
     (0.95, True)
 
     """
