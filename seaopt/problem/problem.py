@@ -666,15 +666,23 @@ def _read_table(source: Path) -> ProblemTable:
     return check_table(ProblemTable, _read_toml(source), str(source), error=ProblemError)
 
 
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no file can have
+        return False
+
+
 def _read_toml(source: Path) -> dict[str, Any]:
     try:
         check_regular(source)
     except FileError as error:
-        found = next(iter(sorted(source.glob("*.toml"))), "problem.toml")
-        raise ProblemError(f"{error}: seaopt run {shlex.quote(str(found))}") from error
+        found = shlex.quote(str(next(iter(sorted(source.glob("*.toml"))), "problem.toml")))
+        folder = f" -o {shlex.quote(str(source))}" if any(source.glob("fit.json")) else ""
+        raise ProblemError(f"{error}, the problem's: seaopt run {found}{folder}") from error
     # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
     is_log = source.suffix.lower() != ".toml"
     remedy = "write one from a log: " + shlex.join(
-        ["seaopt", "new", str(source)] if is_log and source.exists() else ["seaopt", "new", "LOG", "-o", str(source)]
+        ["seaopt", "new", str(source)] if is_log and _exists(source) else ["seaopt", "new", "LOG", "-o", str(source)]
     )
     return parse_file(source, tomllib.loads, "TOML", remedy=remedy, error=ProblemError)

@@ -63,8 +63,8 @@ def fit_problem(
         fitted, problem.parameters, progress=progress, alternatives=tuple(problem.plants.values()),
         **problem.fit_options,
     )  # fmt: skip
-    findings = order_findings((*result.findings, *find_guesses(problem.table.guessed)))
-    return replace(result, findings=findings)
+    guesses = find_guesses(problem.table.guessed)
+    return replace(result, findings=order_findings((*result.findings, *guesses))) if guesses else result
 
 
 def score_problem(problem: Problem, result: Fit, experiments: Sequence[Experiment]) -> list[ModelledOutputs]:

@@ -177,7 +177,7 @@ def check_values(log, logs, name):
         ("JointAngle_deg", "angle", "link", "deg"), ("t_us", "time", "", "us"),
         ("motor_current", "current", "motor", ""),
         ("cell2_N", "force", "", "N"), ("vel_rad_s", "speed", "", "rad/s"), ("v_bus", "other", "", ""),
-        ("pwm_percent", "duty", "", "percent"), ("enc_motor_counts", "angle", "motor", "counts"),
+        ("pwm_percent", "duty", "", "percent"), ("cmd_A", "current", "", "A"), ("phase_A", "", "", ""), ("enc_motor_counts", "angle", "motor", "counts"),
         ("Sollposition", "angle", "", ""), ("/joint_states.position[0]", "angle", "link", ""), ("ch1", "", "", ""),
     ],
 )  # fmt: skip
@@ -359,6 +359,16 @@ def test_a_column_without_numbers_is_listed_as_such(tmp_path, logs):
     })  # fmt: skip
     rows = {row.column: row.description for row in propose([path], {}, tmp_path).columns}
     assert rows["theta_m [rad]"] == "not used: holds no number"
+
+
+def test_a_column_that_is_another_but_for_a_factor_is_no_second_sensor(tmp_path, logs):
+    screw = logs["screw"]
+    columns = {"t_s": logs["t"], "cmd_A": screw["I"], "LoadCell_raw": screw["F1"] / 0.31, "LoadCell_N": screw["F1"]}
+    proposal = propose([write_csv(tmp_path / "a.csv", columns)], {}, tmp_path)
+    rows = {row.column: row for row in proposal.columns}
+    assert rows["cmd_A"].role == "input" and rows["cmd_A"].unit == "A"
+    assert rows["LoadCell_N"].role == "F1"
+    assert rows["LoadCell_raw"].description == "not used: 3.226 times LoadCell_N"
 
 
 def test_wrong_roles_can_be_put_right(tmp_path, logs):

@@ -245,7 +245,7 @@ def _add_payload(
             "J_l", "Its inertia J_l about the joint", float(f"{INERTIA_OVER_POINT * mass * reach**2:.3g}"),
             "a third more than that of a point mass",
         )  # fmt: skip
-        lines.add("d_l", "0.1")
+        lines.known("d_l", "Damping d_l at the joint", 0.1, "a usual one")
         ranges["J_l"] = (WIDE[0] * inertia, WIDE[1] * inertia)
     plants["hanging"] = {"kind": "rotary", "link": _LINKS["hanging"], **options}
     return ranges

@@ -384,6 +384,8 @@ def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Inte
         name = next(one for one in _number_names(log.name) if one not in names)
         names.add(name)
         lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
+        if log is not logs[0]:
+            lines.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
         for table, roles in (("inputs", (log.roles.input,)), ("outputs", log.outputs)):
             channels = [_describe_channel(log, role, actuator, interview) for role in roles]
             lines += [f"[experiment.{table}]", *_align(channels)]

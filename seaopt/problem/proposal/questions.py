@@ -48,8 +48,9 @@ class Question:
 
     @property
     def label(self) -> str:
-        """The question in few words, for lists."""
-        return re.split(r" \(|, |\?$", self.text)[0 if not self.text.startswith("In ") else 1]
+        """The question in few words, for lists; of one log, with its name."""
+        first, *rest = re.split(r" \(|, |\?$", self.text)
+        return f"{rest[0]} in {first.removeprefix('In ')}" if first.startswith("In ") and rest else first
 
     def read(self, answer: str) -> str:
         """Return an answer as it counts.

@@ -17,6 +17,7 @@ from seaopt.records import record
 SLOW_HZ = 1.0
 ALIKE = 0.5  # of the correlation below SLOW_HZ, from which its sign means something
 ENOUGH = 64  # samples for a correlation
+SAME = 1.0 - 1e-6  # share of variance from which a column is another one, rounded
 TIME_STEPS = {"s": (2e-5, 0.2), "ms": (0.2, 200.0), "us": (200.0, 1e7)}  # of a clock without a unit, from and up to
 
 
@@ -127,6 +128,8 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     moving = [one for name, one in columns.items() if name != chosen and name not in times and one.swing > 0.0]
     if not moving:
         raise LogError(f"{path}: no column varies; record a log in which the actuator moves")
+    copies = _find_copies(moving)
+    moving = [one for one in moving if one.name not in copies]
     still = {
         name: "constant" if np.any(np.isfinite(one.values)) else "holds no number"
         for name, one in columns.items()
@@ -135,7 +138,7 @@ def survey_log(path: Path, clock: str | None = None) -> Survey:
     words = {field.name: "text" for field in held.fields if not field.numeric}
     return Survey(
         path=path, clock=columns[chosen] if chosen is not None else None, clocks=tuple(times or own),
-        columns=tuple(moving), left_out=words | still,
+        columns=tuple(moving), left_out=words | still | copies,
     )  # fmt: skip
 
 
@@ -156,6 +159,22 @@ def _runs_on(values: Float[np.ndarray, " n"]) -> bool:
     return bool(
         steps.size > 1 and np.all(steps > 0.0) and np.quantile(steps, 0.9) < 1.5 * np.median(steps) < 1e7 * steps[0]
     )
+
+
+def _find_copies(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
+    """Return the columns that are another one but for a factor, as raw counts beside newtons, and what they are."""
+    kept, copies = list[SurveyedColumn](), dict[str, str]()
+    for one in sorted(columns, key=lambda column: not column.header.unit):
+        for other in kept:
+            if one.header.quantity != other.header.quantity or one.values.size < ENOUGH:
+                continue
+            slope, share = regress(one.values, other.values)
+            if share > SAME:
+                copies[one.name] = f"{slope:.4g} times {other.name}"
+                break
+        else:
+            kept.append(one)
+    return copies
 
 
 def find_leader(columns: Sequence[SurveyedColumn]) -> SurveyedColumn:

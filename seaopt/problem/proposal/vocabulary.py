@@ -208,6 +208,8 @@ def _fits(unit: str, kinds: list[Quantity], words: list[str], *, place: bool) ->
         return True
     if measured in ("angle", "length"):
         return (place and "speed" not in kinds) or (not kinds and unit != "m")
+    if measured in ("current", "voltage", "force") and _matches(words, COMMAND_WORDS | MEASURED_WORDS):
+        return not kinds  # cmd_A, act_N: of a single letter alone nothing else could be meant
     return not kinds and len(unit) > 1 and bool(words)
 
 
