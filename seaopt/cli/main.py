@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -12,15 +13,16 @@ import typer
 from typer.core import TyperGroup
 
 from seaopt.cli.terminal import Amount, prepare_streams
-from seaopt.errors import ControlError, SeaoptError
+from seaopt.errors import ControlError, FileError, LogError, SeaoptError, UnitError
 from seaopt.formatting import printable
 
 INTERRUPTED = 130  # exit code, as a shell's
+TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]")  # a command, a line of TOML or an option stands in it
 
 
 ORDER = (  # of the commands in the help: as they are used
     "demo", "new", "inspect", "run", "fit", "tune", "certify", "report", "export", "validate", "fleet", "simulate",
-    "frf",
+    "frf", "schema",
 )  # fmt: skip
 
 
@@ -324,7 +326,7 @@ def certify(
 @app.command()
 def export(
     results: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with controller.json.", show_default=False)],
-    c: Annotated[Path, typer.Option("--c", metavar="OUT", help="Folder for the C code and the gains.")],
+    c: Annotated[Path, typer.Option("--c", "-o", metavar="OUT", help="Folder for the C code and the gains.")],
     precision: Annotated[str, typer.Option(metavar="double|float", help="Of the C code.")] = "double",
     name: Annotated[str, typer.Option(help="Begins every name in C.")] = "force_law",
     current_limit: Annotated[
@@ -430,7 +432,7 @@ def main() -> None:
         finally:
             sys.stdout.flush()
     except SeaoptError as error:
-        _end(str(error), _list_notes(error))
+        _end(_add_remedy(error), _list_notes(error))
     except BrokenPipeError:
         raise SystemExit(0) from None
     except MemoryError:
@@ -438,6 +440,18 @@ def main() -> None:
     except OSError as error:  # files are written with errors of our own: this is stdout
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more
         _end(f"stdout: cannot be written ({error.strerror or error}); free its disk, or write elsewhere")
+
+
+def _add_remedy(error: SeaoptError) -> str:
+    """Return an error's text, with where to look at its end where it names nothing to type itself."""
+    text, command = str(error), next((word for word in sys.argv[1:] if word in ORDER), "")
+    if TYPED.search(text):
+        return text
+    if isinstance(error, LogError) and command != "inspect":
+        return f"{text}; to see what is in the log type seaopt inspect LOG"
+    if isinstance(error, LogError | FileError | UnitError) or command in ("", "inspect", "new", "export", "schema"):
+        return f"{text}; for what may be given type seaopt {f'{command} ' if command else ''}--help"
+    return f"{text}; for every key and what it means type seaopt schema problem"
 
 
 def _list_notes(error: BaseException | None) -> list[str]:

@@ -127,10 +127,10 @@ def judge_fit(fit: Fit, again: str = "") -> StageVerdict:
     errors = [(one.text, one.where) for one in fit.errors]
     if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
         errors.insert(0, (fit.message, ""))
-    reasons = _group(errors)
+    reasons, cures = _group(errors), "; or ".join(_list_cures(fit.errors))
     return StageVerdict(
         met=False, text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met",
-        reasons=tuple(reasons), next=(*_list_cures(fit.errors), f"correct the file, then type {again}"),
+        reasons=tuple(reasons), next=(*([cures] if cures else []), f"correct the file, then type {again}"),
     )  # fmt: skip
 
 

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+import seaopt as so
+import seaopt.cli
 from tests.cli.conftest import run_process
 
 BASE = """schema = 1
@@ -294,3 +296,21 @@ def test_a_stale_fit_is_refused_with_the_command_that_makes_it_again(copied, sea
     result = seaopt("tune", "short.toml", "-o", "all")
     check_refused(result, words)
     assert REMEDY.search(result.stderr.strip()), result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text", "command"),
+    [
+        (["fit", "p.toml"], "sigma is odd", "seaopt schema problem"),
+        (["inspect", "a.csv"], "sigma is odd", "seaopt inspect --help"),
+        (["fit", "p.toml"], "give sigma = 2", ""),
+        (["fit", "p.toml"], "run seaopt fit first", ""),
+    ],
+)
+def test_a_refusal_without_a_remedy_says_where_to_look(monkeypatch, capsys, arguments, text, command):
+    command_line = sys.modules["seaopt.cli.main"]
+    monkeypatch.setattr(sys, "argv", ["seaopt", *arguments])
+    monkeypatch.setattr(command_line, "app", lambda **_: (_ for _ in ()).throw(so.SeaoptError(text)))
+    with pytest.raises(SystemExit):
+        command_line.main()
+    assert capsys.readouterr().err.rstrip().endswith(command or text)

@@ -177,7 +177,8 @@ def check_values(log, logs, name):
         ("JointAngle_deg", "angle", "link", "deg"), ("t_us", "time", "", "us"),
         ("motor_current", "current", "motor", ""),
         ("cell2_N", "force", "", "N"), ("vel_rad_s", "speed", "", "rad/s"), ("v_bus", "other", "", ""),
-        ("pwm_percent", "duty", "", "percent"), ("cmd_A", "current", "", "A"), ("phase_A", "", "", ""), ("enc_motor_counts", "angle", "motor", "counts"),
+        ("pwm_percent", "duty", "", "percent"), ("cmd_A", "current", "", "A"), ("phase_A", "", "", ""),
+        ("enc_motor_counts", "angle", "motor", "counts"),
         ("Sollposition", "angle", "", ""), ("/joint_states.position[0]", "angle", "link", ""), ("ch1", "", "", ""),
     ],
 )  # fmt: skip
