@@ -119,9 +119,10 @@ def _predict(controller: Controller, loop: Loop, play: _Play) -> list[LimitCycle
         part = (low - gains[at - 1]) / (gains[at] - gains[at - 1])
         deflection = float(DEFLECTIONS[at] * (DEFLECTIONS[at + 1] / DEFLECTIONS[at]) ** part)
         speed = abs(np.angle(find_pole(low))) / controller.sample_time_s
+        regulated = play.mix(low)[2][0]
         cycles.append(
             LimitCycle(
-                frequency_hz=float(speed / (2 * np.pi)), force_N=float(abs(play.mix(low)[2][play.state]) * deflection),
+                frequency_hz=float(speed / (2 * np.pi)), force_N=float(abs(regulated[play.state]) * deflection),
                 velocity=float(speed * deflection), stable=bool(growth[i] > 0.0),
                 state=tuple(float(value) for value in deflection * np.eye(loop.plant.b.size)[play.state]),
             )
