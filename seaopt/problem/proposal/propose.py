@@ -384,6 +384,7 @@ def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Inte
         name = next(one for one in _number_names(log.name) if one not in names)
         names.add(name)
         lines += ["", "[[experiment]]", *_align(_describe_experiment(log, name, interview))]
+        lines.append("# delay_s = { value = 0.002, free = true, max = 0.02 }  # where the input takes effect late")
         if log is not logs[0]:
             lines.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
         for table, roles in (("inputs", (log.roles.input,)), ("outputs", log.outputs)):
@@ -394,6 +395,7 @@ def _write(title: str, logs: Sequence[_Log], actuator: Proposed, interview: Inte
             "",
             "[fit]",
             _comment("holdout = 0.2", "the last fifth of each log is kept back, to judge the fit by"),
+            '# loss = "huber"  # where single samples are far off',
         ]
     if actuator.measured:
         lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
