@@ -17,7 +17,8 @@ from seaopt.errors import ControlError, FileError, LogError, SeaoptError, UnitEr
 from seaopt.formatting import printable
 
 INTERRUPTED = 130  # exit code, as a shell's
-TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]")  # a command, a line of TOML or an option stands in it
+# A command, a line of TOML, an option or the word that was meant stands in it.
+TYPED = re.compile(r"\bseaopt [a-z]|\w = |(?<!\w)--?[a-z]|did you mean \"")
 
 
 ORDER = (  # of the commands in the help: as they are used
