@@ -63,12 +63,16 @@ class CoherentShare:
 
 def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals) -> dict[str, CoherentShare]:
     """Return what the inputs account for, by output; empty where the log is too short to tell, or nothing moves."""
+    from scipy.fft import prev_fast_len  # deferred: scipy is slow to load
+
     inputs, outputs = _gather(experiment, residuals)
     if not inputs:
         return {}
     shares: dict[str, CoherentShare] = {}
     total = sum(len(rows) for rows in inputs)
-    lengths = sorted({_make_even(min(max(2 * total // count, SHORTEST), total)) for count in STRETCHES})
+    # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
+    longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
+    lengths = sorted({2 * prev_fast_len(samples // 2, real=True) for samples in longest})
     spectra = [one for length in lengths if (one := _make_spectra(inputs, outputs, length, experiment)) is not None]
     for o, name in enumerate(experiment.data.outputs):
         rows = [one.compare(o, len(lengths)) for one in spectra]
@@ -80,18 +84,6 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
             band_hz=best.band_hz, power=max(row.power for row in rows),
         )  # fmt: skip
     return shares
-
-
-def _make_even(samples: int) -> int:
-    """Return the next even number below that has no prime factor above 5, of which transforms are quick."""
-    for even in range(samples - samples % 2, 0, -2):
-        rest = even
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return even
-    return samples
 
 
 def _gather(
