@@ -72,7 +72,7 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
     total = sum(len(rows) for rows in inputs)
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
-    lengths = sorted({2 * prev_fast_len(samples // 2, real=True) for samples in longest})
+    lengths = sorted({2 * (prev_fast_len(samples // 2, real=True) or 0) for samples in longest})
     spectra = [one for length in lengths if (one := _make_spectra(inputs, outputs, length, experiment)) is not None]
     for o, name in enumerate(experiment.data.outputs):
         rows = [one.compare(o, len(lengths)) for one in spectra]
