@@ -17,7 +17,7 @@ from seaopt.problem.schema import ProblemTable, UnknownTable
 from seaopt.records import record
 
 VERSION = version("seaopt")
-_PARTS = {"version", "parameters", "plant", "fit"}  # of a problem, that a fit reads besides its experiment
+_PARTS = {"version", "guessed", "parameters", "plant", "fit"}  # of a problem, that a fit reads besides its experiment
 
 
 @record
@@ -66,11 +66,14 @@ class Columns:
     units : mapping of name to unit
         Of the parameters and figures, each of which has a column of its standard deviation, too.
     outputs : tuple of str
+    free : tuple of str
+        The parameters among the units that a fit estimates with their covariance.
 
     """
 
     units: Mapping[str, str]
     outputs: tuple[str, ...]
+    free: tuple[str, ...]
 
 
 def make_plan(problem: Problem, like: str | None, time_limit_s: float | None, client: str) -> Plan:
@@ -106,10 +109,23 @@ def list_columns(problem: Problem) -> Columns:
         if name in plant.parameters and name not in template.parameters
     }
     units |= {name: plant.parameter_unit(name) for name, given in template.parameters.items() if _is_free(given)}
+    free = tuple(units)
     units |= {"delay_s": "s"} if _is_free(template.delay_s) else {}
     units |= {f"gain_{name}": "-" for name, given in template.gain.items() if _is_free(given)}
     units |= {name: unit for name, (_, unit) in plant.derived_values().items() if name not in units}
-    return Columns(units=units, outputs=tuple(template.outputs))
+    return Columns(units=units, outputs=tuple(template.outputs), free=free)
+
+
+def name_correlation(one: str, other: str) -> str:
+    """Return the column with the correlation of two parameters' errors, whichever is named first.
+
+    Examples
+    --------
+    >>> name_correlation("b_r", "J"), name_correlation("J", "b_r")
+    ('J:b_r_corr', 'J:b_r_corr')
+
+    """
+    return ":".join(sorted((one, other))) + "_corr"  # no parameter's name has a colon
 
 
 def _is_free(given: Any) -> bool:

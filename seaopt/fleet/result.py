@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from jaxtyping import Float
 
+from seaopt.estimation.result.findings import GUESS
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
 from seaopt.formatting import format_count, format_number, format_table, html_text
 from seaopt.records import record
@@ -80,9 +81,16 @@ class Fleet:
         """What to say of it in one line."""
         counts = self.counts
         if self.met:
-            return f"{format_count(len(self.rows), 'log')}, all met"
+            guesses = f", {self.guesses}" if self.guesses else ""
+            return f"{format_count(len(self.rows), 'log')}, all met{guesses}"
         bad = [f"{counts[name]} {name}" for name in (NOT_MET, FAILED) if counts[name]]
         return f"{counts[NOT_MET] + counts[FAILED]} of {format_count(len(self.rows), 'log')} not met: {', '.join(bad)}"
+
+    @property
+    def guesses(self) -> str:
+        """What to say of the guesses that its fits rest on, "on 2 guesses: N_p, l"; empty where there are none."""
+        findings = (one for found in self.rows["findings"].drop_nulls() for one in found)
+        return next((one["where"] for one in findings if one["kind"] == GUESS), "")
 
     @property
     def reasons(self) -> tuple[tuple[str, int, str], ...]:
@@ -100,7 +108,8 @@ class Fleet:
     def to_dict(self) -> dict[str, Any]:
         """Return the content of fleet.json (schema seaopt/fleet/1)."""
         return {
-            "schema": FLEET_SCHEMA, "met": self.met, "logs": len(self.rows), "counts": self.counts,
+            "schema": FLEET_SCHEMA, "met": self.met, "guesses": self.guesses, "logs": len(self.rows),
+            "counts": self.counts,
             "reasons": [{"reason": text, "logs": count, "example": log} for text, count, log in self.reasons],
             "units": dict(self.units), "identity": list(self.identity),
             "spreads": {

@@ -14,6 +14,7 @@ import os
 import secrets
 import time
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import polars as pl
 from seaopt.errors import FileError
 from seaopt.files import describe_os_error, write_bytes
 from seaopt.fleet.logs import FleetLog
-from seaopt.fleet.plan import Columns, Plan
+from seaopt.fleet.plan import Columns, Plan, name_correlation
 from seaopt.fleet.worker import FAILED, Row
 
 PART_S, PART_ROWS = 2.0, 5000  # a part is written after so long, or so many rows
@@ -40,6 +41,7 @@ def make_schema(columns: Columns, identity: Sequence[str]) -> dict[str, Any]:
     schema |= {"status": pl.String, "reason": pl.String, "met": pl.Boolean}
     for name in columns.units:
         schema |= {name: pl.Float64, f"{name}_std": pl.Float64}
+    schema |= {name_correlation(*pair): pl.Float64 for pair in combinations(columns.free, 2)}
     for output in columns.outputs:
         schema |= {f"fit_percent_{output}": pl.Float64, f"rms_residual_{output}": pl.Float64}
     return schema | {

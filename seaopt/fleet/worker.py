@@ -17,14 +17,17 @@ import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from seaopt.errors import SeaoptError
-from seaopt.estimation import Fit, fit
+from seaopt.estimation import Fit
 from seaopt.fleet.logs import FleetLog, open_local
-from seaopt.fleet.plan import VERSION, Plan
-from seaopt.problem import Problem
+from seaopt.fleet.plan import VERSION, Plan, name_correlation
+from seaopt.problem import Problem, fit_problem
 
 Row = dict[str, Any]
 MET, NOT_MET, FAILED, UNCHANGED = "met", "not met", "failed", "unchanged"
@@ -106,9 +109,7 @@ def _describe_fit(plan: Plan, log: FleetLog, known: str | None) -> Row:
         row: Row = {"log_sha256": digest}
         try:
             experiment = problem.repeat_experiment(path)
-            fitted = fit(
-                [experiment], problem.parameters, alternatives=tuple(problem.plants.values()), **problem.fit_options
-            )
+            fitted = fit_problem(problem, [experiment])
         except SeaoptError as error:
             return row | {"status": FAILED, "reason": str(error)}
     return row | describe(fitted, experiment.name)
@@ -130,6 +131,7 @@ def describe(fitted: Fit, name: str) -> Row:
         if parameter.free:
             own = parameter.name.removeprefix(f"{name}.")
             row |= {own: parameter.value, f"{own}_std": parameter.std}
+    row |= _describe_correlations(fitted, name)
     nuisance = fitted.nuisance[name]
     for key, std in nuisance.std.items():
         value = nuisance.delay_s if key == "delay_s" else nuisance.gain[key.removeprefix("gain.")]
@@ -146,6 +148,18 @@ def describe(fitted: Fit, name: str) -> Row:
         "findings": findings, "fit_status": fitted.status, "samples": fitted.samples, "iterations": fitted.iterations,
         "fit_s": fitted.wall_s,
     }  # fmt: skip
+
+
+def _describe_correlations(fitted: Fit, name: str) -> Row:
+    """Return the correlations of the free parameters' errors, each pair once, in the order of the covariance."""
+    covariance = fitted.covariance
+    names = [one.removeprefix(f"{name}.") for one in covariance.names]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scales = np.sqrt(np.diag(covariance.matrix))
+        correlations = covariance.matrix / np.outer(scales, scales)
+    return {
+        name_correlation(names[i], names[j]): float(correlations[i, j]) for i, j in combinations(range(len(names)), 2)
+    }
 
 
 @contextmanager

@@ -1,0 +1,25 @@
+"""What a fleet's table says beside values and stds: how errors are correlated, and what a fit rests on."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+import seaopt as so
+from tests.fleet.conftest import PROBLEM
+
+
+def test_correlations_of_errors_are_those_of_the_fit_alone_and_guesses_are_named(stand: Path) -> None:
+    file = stand / "stand.toml"
+    file.write_text(PROBLEM.replace("schema = 1", 'schema = 1\nguessed = ["k"]'), encoding="utf-8")
+    with ThreadPoolExecutor(1) as executor:
+        fleet = so.fit_fleet(file, [stand / "logs/r1_j2.csv"], executor=executor)
+    problem = so.read_problem(file)
+    alone = so.fit([problem.repeat_experiment(stand / "logs/r1_j2.csv")], problem.parameters)
+    matrix = alone.covariance.matrix
+    correlation = matrix[0, 1] / (matrix[0, 0] * matrix[1, 1]) ** 0.5
+    assert fleet.rows["J:b_r_corr"][0] == pytest.approx(correlation, abs=1e-6) and abs(correlation) > 1e-4
+    assert [one["kind"] for one in fleet.rows["findings"][0]] == ["guess"]
+    assert fleet.verdict == "1 log, all met, on 1 guess: k" and fleet.to_dict()["guesses"] == "on 1 guess: k"
